@@ -1,0 +1,50 @@
+"""Ideal pinhole cameras: ``x_cam = R X + t``, ``lambda (u, v, 1) = K x_cam``; OpenCV axes, mm and pixels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """V cameras, with any leading dimensions: the views of a rig, or of each frame of a batch."""
+
+    K: Float[Tensor, "*B V 3 3"]
+    """Intrinsics, pixels; the centre of the first pixel is (0, 0)."""
+    R: Float[Tensor, "*B V 3 3"]
+    """World to camera rotation."""
+    t: Float[Tensor, "*B V 3"]
+    """World to camera translation, mm; not the centre."""
+
+    @property
+    def centre(self) -> Float[Tensor, "*B V 3"]:
+        """Camera centres in the world, ``-R^T t``."""
+        return -(self.R.mT @ self.t[..., None])[..., 0]
+
+    def index(self, item: Any) -> Cameras:
+        """Index the leading dimensions."""
+        return Cameras(self.K[item], self.R[item], self.t[item])
+
+    def to(self, *args: Any, **kwargs: Any) -> Cameras:
+        return Cameras(*(x.to(*args, **kwargs) for x in (self.K, self.R, self.t)))
+
+    def pin_memory(self) -> Cameras:
+        return Cameras(*(x.pin_memory() for x in (self.K, self.R, self.t)))
+
+
+def project(
+    cameras: Cameras, points: Float[Tensor, "*B J 3"]
+) -> tuple[Float[Tensor, "*B V J 2"], Float[Tensor, "*B V J"]]:
+    """Pixels and depths (mm) of world points in every view. Behind a camera (depth <= 0) pixels mean nothing,
+    and are finite except at depth 0 exactly, where they are 0."""
+    in_camera = points[..., None, :, :] @ cameras.R.mT + cameras.t[..., None, :]
+    depth = in_camera[..., 2]
+    homogeneous = in_camera @ cameras.K.mT
+    safe = torch.where(depth == 0, torch.ones_like(depth), depth)
+    pixels = torch.where((depth == 0)[..., None], 0.0, homogeneous[..., :2] / safe[..., None])
+    return pixels, depth

@@ -1,0 +1,86 @@
+"""What crosses the borders between the stages: a recording, and the batch drawn from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ghpt.geometry.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One take of one person by one rig: T frames, V views, J = 17 joints. Arrays may be memory maps.
+
+    All quirks of a data set end here: millimetres, ideal pinhole pixels (lens distortion is undone), world to
+    camera, joints in the order of ``ghpt.skeleton.JOINTS``. A value whose mask is False is finite but
+    meaningless.
+    """
+
+    name: str
+    """Unique in its data set, e.g. ``S9/Greeting-2``."""
+    subject: str
+    action: str
+    rate_hz: float
+    camera_names: tuple[str, ...]
+    cameras: Cameras
+    """K, R, t with leading dimension V, float64, on the CPU."""
+    key_points: Float[np.ndarray, "T V J 2"]
+    """Undistorted pixels, float32."""
+    confidence: Float[np.ndarray, "T V J"]
+    """The detector's own, in [0, 1]; 1 where the detector gives none."""
+    seen: Bool[np.ndarray, "T V J"]
+    truth: Float[np.ndarray, "T J 3"]
+    """World frame, mm."""
+    truth_seen: Bool[np.ndarray, "T J"]
+    """All False in a recording without ground truth."""
+    frame: Int[np.ndarray, "T"]
+    """The data set's own frame number."""
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+@dataclass(frozen=True)
+class KeyPointBatch:
+    """B frames, from any recordings of one camera arrangement."""
+
+    sample: Int[Tensor, "B"]
+    """Position in the data set: the key of the frame's random draws, whatever batch or process it is in."""
+    recording: Int[Tensor, "B"]
+    """Index of the frame's recording in the data set."""
+    cameras: Cameras
+    """K, R, t with leading dimensions B V, float64."""
+    key_points: Float[Tensor, "B V J 2"]
+    confidence: Float[Tensor, "B V J"]
+    seen: Bool[Tensor, "B V J"]
+    truth: Float[Tensor, "B J 3"]
+    truth_seen: Bool[Tensor, "B J"]
+
+    def __len__(self) -> int:
+        return len(self.sample)
+
+    def to(self, *args: Any, **kwargs: Any) -> KeyPointBatch:
+        """Move to a device."""
+        return KeyPointBatch(**{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})
+
+    def pin_memory(self) -> KeyPointBatch:
+        return KeyPointBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
+
+
+def joints_with_enough_views(seen: Bool[Tensor, "*B V J"], least: int = 2) -> Bool[Tensor, "*B J"]:
+    """Which joints are seen in at least ``least`` views, the fewest that triangulation needs."""
+    return seen.sum(dim=-2) >= least
+
+
+def empty_batch(like: KeyPointBatch) -> KeyPointBatch:
+    """A batch of no frames, for a process whose share of the last global batch is empty."""
+    return KeyPointBatch(
+        **{f.name: (v[:0] if isinstance(v := getattr(like, f.name), torch.Tensor) else v.index(slice(0, 0)))
+           for f in fields(like)}
+    )  # fmt: skip
