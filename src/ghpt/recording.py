@@ -73,6 +73,16 @@ class KeyPointBatch:
         return KeyPointBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
 
 
+@dataclass(frozen=True)
+class PoseEstimate:
+    """3D poses from any selection or classical estimator. A joint that is not ``estimated`` is finite but
+    meaningless: it had too few views, and nothing was invented for it."""
+
+    points: Float[Tensor, "*B J 3"]
+    """World frame, mm."""
+    estimated: Bool[Tensor, "*B J"]
+
+
 def joints_with_enough_views(seen: Bool[Tensor, "*B V J"], least: int = 2) -> Bool[Tensor, "*B J"]:
     """Which joints are seen in at least ``least`` views, the fewest that triangulation needs."""
     return seen.sum(dim=-2) >= least
