@@ -1,0 +1,1 @@
+"""The numbers of the paper: for each a stateless function, and a torchmetrics ``Metric`` that sums it up."""

@@ -1,0 +1,92 @@
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from ghpt.geometry.cameras import Cameras
+from ghpt.metrics.relative_pose import (
+    MeanError,
+    error_2d,
+    quaternion_error,
+    rotation_deg,
+    translation_deg,
+    translation_error,
+)
+
+
+def rotations(count: int, seed: int):
+    turns = Rotation.random(count, random_state=np.random.default_rng(seed))
+    return turns, torch.from_numpy(turns.as_matrix())
+
+
+def pair(target_turn_deg: float = 0.0, target_shift=(0.0, 0.0, 0.0)) -> Cameras:
+    """Two cameras 4 m from the origin, 60 degrees apart; the target's pose may be off."""
+    centre_deg = (0.0, 60.0)
+    turn = [Rotation.from_euler("y", angle, degrees=True).as_matrix() for angle in centre_deg]
+    t = np.array([[0.0, 0.0, 4000.0], [0.0, 0.0, 4000.0]])
+    turn[1] = Rotation.from_euler("xyz", [target_turn_deg] * 3, degrees=True).as_matrix() @ turn[1]
+    t[1] += np.array(target_shift)
+    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(2, 3, 3)
+    return Cameras(K, torch.from_numpy(np.stack(turn)), torch.from_numpy(t))
+
+
+POINTS = 500 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+
+
+def test_rotation_errors_equal_scipy():
+    (a, a_matrix), (b, b_matrix) = rotations(200, 0), rotations(200, 1)
+    qa, qb = a.as_quat(canonical=True), b.as_quat(canonical=True)
+    nearest = np.minimum(np.linalg.norm(qa - qb, axis=1), np.linalg.norm(qa + qb, axis=1))
+    np.testing.assert_allclose(quaternion_error(a_matrix, b_matrix), nearest, atol=1e-12)
+    np.testing.assert_allclose(
+        rotation_deg(a_matrix, b_matrix), np.rad2deg((a * b.inv()).magnitude()), atol=1e-9
+    )
+
+
+@pytest.mark.parametrize("degrees", [0.0, 1e-7, 1e-3, 90.0, 179.9999, 180.0])
+def test_rotation_angle_keeps_its_digits_at_both_ends(degrees):
+    base = rotations(20, 2)[0]
+    turned = Rotation.from_rotvec([0, np.deg2rad(degrees), 0]) * base
+    result = rotation_deg(torch.from_numpy(turned.as_matrix()), torch.from_numpy(base.as_matrix()))
+    np.testing.assert_allclose(result, degrees, atol=1e-10 if degrees < 1 else 1e-6)
+
+
+def test_small_rotation_near_180_degrees_is_small():
+    a = Rotation.from_rotvec([np.pi - 1e-3, 0, 0])
+    b = Rotation.from_rotvec([np.pi + 1e-3, 0, 0])
+    error = quaternion_error(*(torch.from_numpy(x.as_matrix())[None] for x in (a, b)))
+    assert error.item() == pytest.approx(1e-3, rel=1e-5)
+
+
+def test_translation_errors():
+    truth = torch.tensor([[100.0, 0, 0], [0, 3.0, 0], [1.0, 1.0, 0]])
+    estimate = torch.tensor([[100.0, 0, 30], [0, -3.0, 0], [2.0, 2.0, 0]])
+    np.testing.assert_allclose(translation_error(estimate, truth), [30, 6, 2**0.5])
+    np.testing.assert_allclose(
+        translation_deg(estimate, truth), [np.rad2deg(np.arctan(0.3)), 180, 0], atol=1e-9
+    )
+
+
+def test_error_2d_is_zero_at_the_truth_and_the_principal_shift_away():
+    assert error_2d(pair(), pair(), POINTS).item() == 0
+    shifted = pair()
+    K = shifted.K.clone()
+    K[1, 0, 2] += 3
+    K[1, 1, 2] += 4
+    assert error_2d(Cameras(K, shifted.R, shifted.t), pair(), POINTS).item() == pytest.approx(5, abs=1e-9)
+    K = shifted.K.clone()
+    K[0, 0, 2] += 3
+    assert error_2d(Cameras(K, shifted.R, shifted.t), pair(), POINTS).item() == 0  # the reference is given
+
+
+def test_mean_error_over_uneven_processes():
+    turns, truth = rotations(97, 3)[1], rotations(97, 4)[1]
+    whole, shares = MeanError(rotation_deg), [MeanError(rotation_deg) for _ in range(2)]
+    whole.update(turns, truth)
+    shares[0].update(turns[:90], truth[:90])
+    shares[1].update(turns[90:], truth[90:])
+    shares[0].merge_state(shares[1])
+    assert shares[0].compute().item() == pytest.approx(whole.compute().item(), rel=1e-13)
+    assert shares[0].count == 97
+    assert whole.compute().item() == pytest.approx(rotation_deg(turns, truth).mean().item(), rel=1e-13)
+    assert MeanError(rotation_deg)._reductions["count"].__name__ == "dim_zero_sum"
