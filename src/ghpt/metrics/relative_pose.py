@@ -63,7 +63,7 @@ def error_2d(estimate: Cameras, truth: Cameras, points: Float[Tensor, "*B N 3"])
 
 
 class MeanError(Metric):
-    """The mean of one of this module's errors over all it was updated with: a float64 sum and an exact count."""
+    """The mean of one of this module's errors over all that was added: a float64 sum and an exact count."""
 
     full_state_update = False
     error_sum: Tensor
