@@ -48,3 +48,14 @@ def project(
     safe = torch.where(depth == 0, torch.ones_like(depth), depth)
     pixels = torch.where((depth == 0)[..., None], 0.0, homogeneous[..., :2] / safe[..., None])
     return pixels, depth
+
+
+def reprojection_error(
+    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"], points: Float[Tensor, "*B J 3"]
+) -> Float[Tensor, "*B V J"]:
+    """Distance in pixels between key points and the projected points, float64; inf behind a camera and where
+    an input is not finite."""
+    double = cameras.to(torch.float64)
+    pixels, depth = project(double, points.to(torch.float64))
+    error = torch.linalg.vector_norm(pixels - key_points, dim=-1)
+    return torch.where((depth > 0) & torch.isfinite(error), error, torch.inf)
