@@ -28,9 +28,7 @@ def _sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def atomic_write(
-    path: str | Path, mode: str = "wb", verify: Callable[[Path], Any] | None = None
-) -> Iterator[IO[Any]]:
+def atomic_write(path: str | Path, mode: str = "wb", verify: Callable[[Path], Any] | None = None) -> Iterator[IO[Any]]:
     """Yield a file open for writing that takes ``path``'s place when the block ends without an error.
 
     ``verify`` gets the finished temporary file and raises if it is not right. On any failure (the block's,

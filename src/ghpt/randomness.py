@@ -62,6 +62,6 @@ def gumbel(keys: Int[Tensor, "*B"], shape: tuple[int, ...]) -> Float[Tensor, "..
     return -torch.log(-torch.log(uniform(keys, shape)))
 
 
-def permutation(seed: int, purpose: str, epoch: int, count: int) -> Int[Tensor, "N"]:
+def permutation(seed: int, purpose: str, epoch: int, count: int) -> Int[Tensor, " N"]:
     """A random order of ``count`` items, a pure function of its arguments."""
     return torch.argsort(bits(key(seed, purpose, epoch), (count,)), stable=True)

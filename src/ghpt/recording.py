@@ -39,7 +39,7 @@ class Recording:
     """World frame, mm."""
     truth_seen: Bool[np.ndarray, "T J"]
     """All False in a recording without ground truth."""
-    frame: Int[np.ndarray, "T"]
+    frame: Int[np.ndarray, " T"]
     """The data set's own frame number."""
 
     def __len__(self) -> int:
@@ -50,9 +50,9 @@ class Recording:
 class KeyPointBatch:
     """B frames, from any recordings of one camera arrangement."""
 
-    sample: Int[Tensor, "B"]
+    sample: Int[Tensor, " B"]
     """Position in the data set: the key of the frame's random draws, whatever batch or process it is in."""
-    recording: Int[Tensor, "B"]
+    recording: Int[Tensor, " B"]
     """Index of the frame's recording in the data set."""
     cameras: Cameras
     """K, R, t with leading dimensions B V, float64."""

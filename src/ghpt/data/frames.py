@@ -1,0 +1,109 @@
+"""Frames as a torch data set, and the order in which training sees them."""
+
+from bisect import bisect_right
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset, Sampler
+
+from ghpt import randomness
+from ghpt.geometry.cameras import Cameras
+from ghpt.recording import KeyPointBatch, Recording, joints_with_enough_views
+from ghpt.skeleton import PELVIS
+
+
+class Frames(Dataset[KeyPointBatch]):
+    """Chosen frames of recordings that share a number of views; one item is a whole batch.
+
+    ``frames`` are positions in the recordings laid end to end, in any order; sample i is ``frames[i]``.
+    """
+
+    def __init__(self, recordings: Sequence[Recording], frames: np.ndarray) -> None:
+        self.recordings = recordings
+        self.frames = np.asarray(frames, dtype=np.int64)
+        self.start = np.concatenate([[0], np.cumsum([len(r) for r in recordings])])
+        self.cameras = Cameras(
+            *(torch.stack([getattr(r.cameras, name).double() for r in recordings]) for name in ("K", "R", "t"))
+        )
+
+    def __len__(self) -> int:
+        return len(self.frames)
+
+    def locate(self, sample: int) -> tuple[int, int]:
+        """The recording's index and the frame's position in it."""
+        recording = bisect_right(self.start, self.frames[sample]) - 1
+        return recording, int(self.frames[sample] - self.start[recording])
+
+    def __getitem__(self, samples: Sequence[int]) -> KeyPointBatch:
+        places = [self.locate(sample) for sample in samples]
+        recording = torch.tensor([r for r, _ in places], dtype=torch.int64)
+
+        def gather(field: str) -> torch.Tensor:
+            like = getattr(self.recordings[0], field)
+            rows = np.empty((len(places), *like.shape[1:]), dtype=like.dtype)
+            for row, (r, t) in enumerate(places):
+                rows[row] = getattr(self.recordings[r], field)[t]
+            return torch.from_numpy(rows)
+
+        return KeyPointBatch(
+            sample=torch.tensor(list(samples), dtype=torch.int64),
+            recording=recording,
+            cameras=self.cameras.index(recording),
+            key_points=gather("key_points"),
+            confidence=gather("confidence"),
+            seen=gather("seen"),
+            truth=gather("truth"),
+            truth_seen=gather("truth_seen"),
+        )
+
+    def frame_numbers(self, samples: Sequence[int]) -> np.ndarray:
+        """The data set's own frame numbers."""
+        return np.array([self.recordings[r].frame[t] for r, t in map(self.locate, samples)], dtype=np.int64)
+
+
+def trainable(recordings: Sequence[Recording], frames: np.ndarray, joints: int) -> np.ndarray:
+    """Which frames have a truth, with the pelvis and at least ``joints`` joints both true and triangulable."""
+    data = Frames(recordings, frames)
+    batch = data[range(len(frames))]
+    usable = joints_with_enough_views(batch.seen) & batch.truth_seen
+    return (usable[:, PELVIS] & (usable.sum(dim=1) >= joints)).numpy()
+
+
+class BatchOrder(Sampler[list[int]]):
+    """The samples of each batch for one process: a pure function of the seed and the batches already done.
+
+    A global batch is ``batch_size`` samples in the same order on any number of processes; process ``rank`` takes
+    every ``world``-th of them, so its share of the last one can be empty. ``done()`` says how many global batches
+    training has finished, over all epochs, so that a resumed run goes on where it was stopped.
+    """
+
+    def __init__(
+        self, count: int, batch_size: int, rank: int, world: int, seed: int | None, done: Callable[[], int]
+    ) -> None:
+        self.count, self.batch_size, self.rank, self.world = count, batch_size, rank, world
+        self.seed, self.done = seed, done
+
+    def __len__(self) -> int:
+        return -(-self.count // self.batch_size)
+
+    def __iter__(self) -> Iterator[list[int]]:
+        epoch, first = divmod(self.done(), len(self))
+        order = (
+            torch.arange(self.count)
+            if self.seed is None
+            else randomness.permutation(self.seed, "order", epoch, self.count)
+        )
+        for batch in range(first, len(self)):
+            yield order[batch * self.batch_size : (batch + 1) * self.batch_size][self.rank :: self.world].tolist()
+
+
+def loader(frames: Frames, order: BatchOrder, workers: int) -> DataLoader[KeyPointBatch]:
+    return DataLoader(
+        frames,
+        sampler=order,
+        batch_size=None,
+        num_workers=workers,
+        pin_memory=torch.cuda.is_available(),
+        persistent_workers=False,
+    )

@@ -1,0 +1,62 @@
+"""When checkpoints are written."""
+
+import signal
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+
+from ghpt.errors import check
+from ghpt.models.checkpoint import FIELD
+
+
+class SaveLast(Callback):
+    """Keep ``last.ckpt`` up to date: every ``every`` steps, when training ends, and when it is interrupted.
+
+    An interrupt (Ctrl-C) takes effect after the running step, so that what is saved is whole; a second one at once.
+    ``identity`` is what every checkpoint says of itself.
+    """
+
+    def __init__(self, path: Path, every: int, identity: dict[str, Any]) -> None:
+        check(every >= 1, "save_every", f"is {every}", "It must be >= 1 step.")
+        self.path, self.every, self.identity = path, every, identity
+        self.interrupted = False
+        self._previous: Any = None
+
+    def on_save_checkpoint(self, trainer: L.Trainer, module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
+        checkpoint[FIELD] = self.identity
+
+    def on_fit_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        try:
+            self._previous = signal.signal(signal.SIGINT, self._interrupt)
+        except ValueError:  # not in the main thread: then nobody sends us SIGINT either
+            self._previous = None
+
+    def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        if self.interrupted:
+            raise KeyboardInterrupt
+        self.interrupted = True
+
+    def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        stop = self.interrupted or trainer.received_sigterm
+        if stop or trainer.global_step % self.every == 0:
+            trainer.save_checkpoint(self.path)
+        if self.interrupted:
+            raise KeyboardInterrupt
+
+    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        trainer.save_checkpoint(self.path)
+
+    def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
+        if self._previous is not None:
+            signal.signal(signal.SIGINT, self._previous)
+            self._previous = None
+
+
+def best_checkpoint(folder: Path) -> ModelCheckpoint:
+    """``best.ckpt``: the lowest validation error of the weighted selection."""
+    return ModelCheckpoint(
+        dirpath=folder, filename="best", monitor="validation/weight", mode="min", enable_version_counter=False
+    )

@@ -1,0 +1,48 @@
+"""Hypothesis selection (paper, sections 3 and 4): every selection is a vector of weights over the pool."""
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ghpt import randomness
+from ghpt.errors import GhptConfigError
+
+SELECTIONS = ("weight", "average", "most", "least", "stochastic", "random", "best", "worst")
+"""Names as in metrics.json; best and worst look at the truth and are not available in use."""
+
+
+def softmax_weights(
+    logits: Float[Tensor, "B H"], temperature: float, noise: Float[Tensor, "B H"] | None = None
+) -> Float[Tensor, "B H"]:
+    """The (Gumbel-)softmax of eq:gumbel-softmax; with ``noise`` from Gumbel(0, 1) in training, without it at test."""
+    return torch.softmax((logits if noise is None else logits + noise) / temperature, dim=-1)
+
+
+def selection_weights(
+    name: str,
+    logits: Float[Tensor, "B H"],
+    errors: Float[Tensor, "B H"],
+    temperature: float,
+    keys: Int[Tensor, " B"],
+) -> Float[Tensor, "B H"]:
+    """Weights that sum to 1 over the pool and, given to ``Problem.combine``, make the named selection.
+
+    ``errors`` is used by best and worst alone, ``keys`` by stochastic and random.
+    """
+    count = logits.shape[-1]
+    if name == "weight":
+        return softmax_weights(logits, temperature)
+    if name == "average":
+        return torch.full_like(logits, 1 / count)
+    if name == "stochastic":  # the largest of logits plus Gumbel noise is a draw from their softmax
+        noise = randomness.gumbel(randomness.key(0, "stochastic", keys), (count,))
+        index = (logits / temperature + noise).argmax(dim=-1)
+    elif name == "random":
+        index = (randomness.uniform(randomness.key(0, "random", keys), (1,)) * count).long()[:, 0]
+    elif name in ("most", "least", "best", "worst"):
+        scores = logits if name in ("most", "least") else -errors
+        index = scores.argmax(dim=-1) if name in ("most", "best") else scores.argmin(dim=-1)
+    else:
+        raise GhptConfigError("selection", f"{name!r} is unknown", f"Existing: {', '.join(SELECTIONS)}.")
+    return F.one_hot(index, count).to(logits.dtype)

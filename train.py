@@ -1,0 +1,9 @@
+"""Train: ``python train.py data=cmu2 model=pose``; ``python train.py --help`` says more."""
+
+from pathlib import Path
+
+from ghpt.app import run
+from ghpt.train import train
+
+if __name__ == "__main__":
+    run(Path(__file__).parent / "conf", "train", train)
