@@ -10,9 +10,7 @@ def frames(count: int, seed: int = 0):
     g = torch.Generator().manual_seed(seed)
     body = 300 * torch.randn(17, 3, generator=g)
     points = body + 20 * torch.randn(count, 17, 3, generator=g)
-    return PoseEstimate(points, torch.rand(count, 17, generator=g) > 0.1), torch.randint(
-        0, 2, (count,), generator=g
-    )
+    return PoseEstimate(points, torch.rand(count, 17, generator=g) > 0.1), torch.randint(0, 2, (count,), generator=g)
 
 
 def test_equals_numpy_variance():
@@ -44,9 +42,7 @@ def test_left_is_the_numerator():
 def test_mirroring_inverts_the_ratio():
     estimate, _ = frames(50)
     ratios, defined = length_ratios(estimate)
-    mirrored, mirrored_defined = length_ratios(
-        PoseEstimate(estimate.points[:, MIRROR], estimate.estimated[:, MIRROR])
-    )
+    mirrored, mirrored_defined = length_ratios(PoseEstimate(estimate.points[:, MIRROR], estimate.estimated[:, MIRROR]))
     assert torch.equal(defined, mirrored_defined)
     torch.testing.assert_close(mirrored, 1 / ratios)
 

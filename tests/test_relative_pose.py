@@ -7,6 +7,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.relative_pose import (
     MeanError,
     error_2d,
+    error_3d,
     quaternion_error,
     rotation_deg,
     translation_deg,
@@ -38,9 +39,7 @@ def test_rotation_errors_equal_scipy():
     qa, qb = a.as_quat(canonical=True), b.as_quat(canonical=True)
     nearest = np.minimum(np.linalg.norm(qa - qb, axis=1), np.linalg.norm(qa + qb, axis=1))
     np.testing.assert_allclose(quaternion_error(a_matrix, b_matrix), nearest, atol=1e-12)
-    np.testing.assert_allclose(
-        rotation_deg(a_matrix, b_matrix), np.rad2deg((a * b.inv()).magnitude()), atol=1e-9
-    )
+    np.testing.assert_allclose(rotation_deg(a_matrix, b_matrix), np.rad2deg((a * b.inv()).magnitude()), atol=1e-9)
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-7, 1e-3, 90.0, 179.9999, 180.0])
@@ -62,21 +61,52 @@ def test_translation_errors():
     truth = torch.tensor([[100.0, 0, 0], [0, 3.0, 0], [1.0, 1.0, 0]])
     estimate = torch.tensor([[100.0, 0, 30], [0, -3.0, 0], [2.0, 2.0, 0]])
     np.testing.assert_allclose(translation_error(estimate, truth), [30, 6, 2**0.5])
-    np.testing.assert_allclose(
-        translation_deg(estimate, truth), [np.rad2deg(np.arctan(0.3)), 180, 0], atol=1e-9
-    )
+    np.testing.assert_allclose(translation_deg(estimate, truth), [np.rad2deg(np.arctan(0.3)), 180, 0], atol=1e-9)
 
 
 def test_error_2d_is_zero_at_the_truth_and_the_principal_shift_away():
-    assert error_2d(pair(), pair(), POINTS).item() == 0
+    assert error_2d(pair(), pair(), POINTS)[0].max() == 0
     shifted = pair()
     K = shifted.K.clone()
     K[1, 0, 2] += 3
     K[1, 1, 2] += 4
-    assert error_2d(Cameras(K, shifted.R, shifted.t), pair(), POINTS).item() == pytest.approx(5, abs=1e-9)
+    errors, counted = error_2d(Cameras(K, shifted.R, shifted.t), pair(), POINTS)
+    assert counted.all()
+    np.testing.assert_allclose(errors, 5, atol=1e-9)
     K = shifted.K.clone()
     K[0, 0, 2] += 3
-    assert error_2d(Cameras(K, shifted.R, shifted.t), pair(), POINTS).item() == 0  # the reference is given
+    assert error_2d(Cameras(K, shifted.R, shifted.t), pair(), POINTS)[0].max() == 0  # the reference is given
+
+
+def test_error_3d_is_zero_at_the_truth_only():
+    assert error_3d(pair(), pair(), POINTS)[0].max() < 1e-6
+    errors = [error_3d(pair(degrees), pair(), POINTS)[0].mean().item() for degrees in (0.01, 0.1, 1.0)]
+    assert errors == sorted(errors)
+    assert errors[0] > 0.1
+
+
+def test_error_3d_of_a_longer_baseline_is_the_scale():
+    truth = pair()
+    # With the reference camera's centre as the origin, a baseline longer by 1 % scales the scene by 1 %.
+    centre = truth.centre
+    longer = centre[0] + 1.01 * (centre[1] - centre[0])
+    t = torch.stack((truth.t[0], -truth.R[1] @ longer))
+    errors, counted = error_3d(Cameras(truth.K, truth.R, t), truth, POINTS)
+    assert counted.all()
+    np.testing.assert_allclose(errors, 0.01 * torch.linalg.vector_norm(POINTS - centre[0], dim=-1), rtol=1e-6)
+
+
+def test_points_behind_do_not_count():
+    points = torch.cat((POINTS, torch.tensor([[0.0, 0.0, -9000.0]], dtype=torch.float64)))
+    for error in (error_2d, error_3d):
+        errors, counted = error(pair(0.1), pair(), points)
+        assert counted.sum() == 50
+        assert errors[-1] == 0
+        metric = MeanError(error)
+        metric.update(pair(0.1), pair(), points)
+        result = metric.compute()
+        assert result.mean.item() == pytest.approx(errors[:50].mean().item(), rel=1e-12)
+        assert result.coverage.item() == 50 / 51
 
 
 def test_mean_error_over_uneven_processes():
@@ -86,7 +116,6 @@ def test_mean_error_over_uneven_processes():
     shares[0].update(turns[:90], truth[:90])
     shares[1].update(turns[90:], truth[90:])
     shares[0].merge_state(shares[1])
-    assert shares[0].compute().item() == pytest.approx(whole.compute().item(), rel=1e-13)
-    assert shares[0].count == 97
-    assert whole.compute().item() == pytest.approx(rotation_deg(turns, truth).mean().item(), rel=1e-13)
-    assert MeanError(rotation_deg)._reductions["count"].__name__ == "dim_zero_sum"
+    assert shares[0].compute().mean.item() == pytest.approx(whole.compute().mean.item(), rel=1e-13)
+    assert shares[0].counted == 97
+    assert whole.compute().mean.item() == pytest.approx(rotation_deg(turns, truth).mean().item(), rel=1e-13)

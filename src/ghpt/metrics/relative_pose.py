@@ -4,13 +4,23 @@ A pose maps the reference camera's frame to the target's: ``x_target = R x_ref +
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torchmetrics import Metric
 
 from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.triangulation import triangulate
+
+
+class MeanAndCoverage(NamedTuple):
+    """What ``MeanError`` computes."""
+
+    mean: Float[Tensor, ""]
+    coverage: Float[Tensor, ""]
+    """Share of the values that could be measured, in [0, 1]."""
 
 
 def _angle(cross: Float[Tensor, "*B 3"], cosine: Float[Tensor, "*B"]) -> Float[Tensor, "*B"]:
@@ -30,9 +40,7 @@ def rotation_deg(estimate: Float[Tensor, "*B 3 3"], truth: Float[Tensor, "*B 3 3
     return torch.rad2deg(_rotation_angle(estimate, truth))
 
 
-def quaternion_error(
-    estimate: Float[Tensor, "*B 3 3"], truth: Float[Tensor, "*B 3 3"]
-) -> Float[Tensor, "*B"]:
+def quaternion_error(estimate: Float[Tensor, "*B 3 3"], truth: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B"]:
     """E_R = |quat(R) - quat(R*)|, with the signs of the quaternions chosen so that they are nearest.
 
     That equals the difference of the quaternions with w >= 0, except where both turn by almost 180 degrees:
@@ -53,34 +61,62 @@ def translation_deg(estimate: Float[Tensor, "*B 3"], truth: Float[Tensor, "*B 3"
     return torch.rad2deg(_angle(torch.linalg.cross(estimate, truth), (estimate * truth).sum(-1)))
 
 
-def error_2d(estimate: Cameras, truth: Cameras, points: Float[Tensor, "*B N 3"]) -> Float[Tensor, "*B"]:
-    """E_2D, pixels: mean distance of the points X* as the estimated and as the true target camera see them.
+def error_2d(
+    estimate: Cameras, truth: Cameras, points: Float[Tensor, "*B N 3"]
+) -> tuple[Float[Tensor, "*B N"], Bool[Tensor, "*B N"]]:
+    """E_2D, pixels: distance between a point X* as the estimated and as the true target camera see it.
 
-    ``estimate`` and ``truth`` are pairs (V = 2): the reference camera, then the target camera.
+    ``estimate`` and ``truth`` are pairs (V = 2): the reference camera, then the target camera. A point counts
+    if it is in front of both targets; one that does not has error 0.
     """
-    difference = project(estimate, points)[0][..., 1, :, :] - project(truth, points)[0][..., 1, :, :]
-    return torch.linalg.vector_norm(difference, dim=-1).mean(-1)
+    (pixels, depth), (true_pixels, true_depth) = project(estimate, points), project(truth, points)
+    counted = (depth[..., 1, :] > 0) & (true_depth[..., 1, :] > 0)
+    distance = torch.linalg.vector_norm((pixels - true_pixels)[..., 1, :, :], dim=-1)
+    return torch.where(counted, distance, 0.0), counted
+
+
+def error_3d(
+    estimate: Cameras, truth: Cameras, points: Float[Tensor, "*B N 3"]
+) -> tuple[Float[Tensor, "*B N"], Bool[Tensor, "*B N"]]:
+    """E_3D, mm (paper, eq. reprojection-3d-error): distance between a point X* and what the estimated
+    pair makes of its true images.
+
+    X* is projected by the *true* cameras and triangulated by the *estimated* ones. The paper's words project
+    with the estimated target camera and triangulate with the same one, which gives back X* whatever the estimate
+    is, so one of the two must be the true camera; this choice is what a user meets, whose key points come
+    from the real cameras and whose 3D comes from the estimate.
+
+    Pairs are as in ``error_2d``. A point counts if it is in front of the true cameras and the
+    estimated pair determines it (``triangulate``'s ``ok``); one that does not has error 0.
+    """
+    pixels, depth = project(truth, points)
+    result = triangulate(estimate, pixels, torch.ones_like(depth))
+    counted = (depth > 0).all(-2) & result.ok
+    return torch.where(counted, torch.linalg.vector_norm(result.points - points, dim=-1), 0.0), counted
 
 
 class MeanError(Metric):
-    """The mean of one of this module's errors over all that was added: a float64 sum and an exact count."""
+    """The mean of one of this module's errors over all that was added: a float64 sum and exact counts."""
 
     full_state_update = False
     error_sum: Tensor
-    count: Tensor
+    counted: Tensor
+    offered: Tensor
 
-    def __init__(self, error: Callable[..., Tensor]) -> None:
+    def __init__(self, error: Callable[..., Tensor | tuple[Tensor, Tensor]]) -> None:
         super().__init__()
         self.error = error
-        self.add_state("error_sum", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("count", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        for state in ("error_sum", "counted", "offered"):
+            self.add_state(state, torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
 
     def update(self, *arguments: Tensor | Cameras) -> None:
         """Add the errors of ``error(*arguments)``."""
-        errors = self.error(*arguments)
-        self.error_sum += errors.double().sum()
-        self.count += errors.numel()
+        result = self.error(*arguments)
+        errors, counted = result if isinstance(result, tuple) else (result, torch.ones_like(result, dtype=torch.bool))
+        self.error_sum += torch.where(counted, errors, 0.0).double().sum()
+        self.counted += counted.sum()
+        self.offered += counted.numel()
 
-    def compute(self) -> Float[Tensor, ""]:
+    def compute(self) -> MeanAndCoverage:
         """NaN when nothing was added."""
-        return self.error_sum / self.count
+        return MeanAndCoverage(self.error_sum / self.counted, self.counted / self.offered)
