@@ -38,7 +38,8 @@ class StochasticLoss(nn.Module):
         if self.relative_errors:
             errors = errors / errors.amax(dim=-1, keepdim=True).clamp_min(torch.finfo(errors.dtype).tiny)
         stochastic = (weights * errors).sum(dim=-1)
-        entropy = torch.special.entr(weights).sum(dim=-1)
+        # entr(0) is 0 but its gradient is infinite, and softmax turns that into NaN where a weight underflows.
+        entropy = torch.special.entr(weights.clamp_min(torch.finfo(weights.dtype).tiny)).sum(dim=-1)
         total = self.alpha * stochastic + self.beta * entropy + self.gamma * estimate_error
         return LossTerms(total, stochastic, entropy, estimate_error)
 
