@@ -1,0 +1,235 @@
+"""Classical estimators on the same key points as the learned one, and with the same output type.
+
+Thresholds and scales are fractions of the person's size in each view's image (the diagonal of the box of the
+seen key points), so that they mean the same at any resolution and distance. A robust estimator that finds
+nothing better falls back to the all-view linear one: it never gains by leaving hard joints out.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+import pycolmap
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghpt.errors import check
+from ghpt.geometry.cameras import Cameras, project, reprojection_error
+from ghpt.geometry.triangulation import Status, Triangulation, triangulate, triangulate_subsets, usable_views
+from ghpt.randomness import key, uniform
+from ghpt.recording import KeyPointBatch, PoseEstimate
+
+
+def person_size(key_points: Float[Tensor, "*B V J 2"], seen: Bool[Tensor, "*B V J"]) -> Float[Tensor, "*B V"]:
+    """Diagonal (pixels) of the box around the seen key points of each view; 0 where fewer than two are
+    seen."""
+    seen = (seen & torch.isfinite(key_points).all(-1))[..., None]
+    largest = torch.where(seen, key_points, -torch.inf).amax(-2)
+    smallest = torch.where(seen, key_points, torch.inf).amin(-2)
+    return torch.where(seen.any(-2), largest - smallest, 0.0).norm(dim=-1)
+
+
+def _otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
+    """``first`` where it is ok, ``second`` elsewhere."""
+    chosen = {}
+    for field in fields(Triangulation):
+        a, b = getattr(first, field.name), getattr(second, field.name)
+        chosen[field.name] = torch.where(first.ok[..., None] if a.ndim > first.ok.ndim else first.ok, a, b)
+    return Triangulation(**chosen)
+
+
+class Baseline(ABC):
+    """A classical estimator: ``baseline(batch)`` gives a PoseEstimate in the dtype of the key points."""
+
+    @abstractmethod
+    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+        """The batch's joints with their status."""
+
+    @torch.no_grad()
+    def __call__(self, batch: KeyPointBatch) -> PoseEstimate:
+        result = self.triangulate(batch)
+        estimated = result.ok | (result.status == Status.NOT_CONVERGED)
+        return PoseEstimate(result.points.to(batch.key_points.dtype), estimated)
+
+
+class Linear(Baseline):
+    """All seen views with equal weights."""
+
+    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+        return triangulate(batch.cameras, batch.key_points, batch.seen.to(batch.key_points.dtype))
+
+
+@dataclass(frozen=True)
+class WeightedLinear(Baseline):
+    """All seen views; the detector's confidence to the power ``power`` weights the squared residuals."""
+
+    power: float
+
+    def __post_init__(self) -> None:
+        check(self.power > 0, "power", f"{self.power} is not positive", "give a number above 0, such as 2")
+
+    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+        weights = torch.where(batch.seen, batch.confidence.clamp(min=0) ** self.power, 0.0)
+        return _otherwise(triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch))
+
+
+@dataclass(frozen=True)
+class Ransac(Baseline):
+    """For each joint the pair of views whose point has the most inliers (least residual among equals), then
+    the inliers together.
+
+    ``threshold``: an inlier's largest reprojection error, as a fraction of the person's size in that view.
+    ``pairs``: where the views make more pairs than this, so many random ones are tried for each joint, keyed
+    by ``seed`` and the sample.
+    """
+
+    threshold: float
+    pairs: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        check(self.threshold > 0, "threshold", f"{self.threshold} is not positive", "give a fraction such as
+        0.02") check(self.pairs >= 1, "pairs", f"{self.pairs} is not positive", "give a count such as 100")
+
+    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+        candidates = self._pairs(batch)
+        points, ok = triangulate_subsets(batch.cameras, batch.key_points, batch.seen, candidates)
+        rig = Cameras(*(x[:, None] for x in (batch.cameras.K, batch.cameras.R, batch.cameras.t)))
+        key_points = batch.key_points[:, None].expand(-1, points.shape[1], -1, -1, -1)
+        limit = self.threshold * person_size(batch.key_points, batch.seen)
+        error = reprojection_error(rig, key_points, points) / limit[:, None, :, None].clamp(min=1e-12)
+        inlier = (error <= 1) & batch.seen[:, None] & ok[:, :, None]
+        # the residuals sum up to less than one more inlier
+        rest = torch.where(inlier, error, 0.0).sum(-2) / (inlier.shape[-2] + 1)
+        best = (inlier.sum(-2) - rest).argmax(1)
+        inlier = inlier.gather(1, best[:, None, None].expand(-1, 1, inlier.shape[2], -1))[:, 0]
+        robust = triangulate(batch.cameras, batch.key_points, inlier.to(batch.key_points.dtype))
+        return _otherwise(robust, Linear().triangulate(batch))
+
+    def _pairs(self, batch: KeyPointBatch) -> Bool[Tensor, "B P J V"]:
+        """Pairs of seen views: each pair of the rig if they are few, else random ones."""
+        frames, views, joints = batch.seen.shape
+        device = batch.seen.device
+        if views * (views - 1) // 2 <= self.pairs:
+            one, other = torch.triu_indices(views, views, offset=1, device=device)
+            eye = torch.eye(views, dtype=torch.bool, device=device)
+            return (eye[one] | eye[other])[None, :, None].expand(frames, -1, joints, -1)
+        seen = batch.seen.mT[:, None]
+        count = seen.sum(-1)
+        draw = uniform(key(self.seed, "ransac", batch.sample, device=device), (self.pairs, joints, 2))
+        one = (draw[..., 0] * count).long()
+        other = (draw[..., 1] * (count - 1)).long()
+        other = other + (other >= one)
+        place = seen.cumsum(-1) - 1
+        return seen & ((place == one[..., None]) | (place == other[..., None]))
+
+
+@dataclass(frozen=True)
+class MEstimator(Baseline):
+    """Iteratively reweighted least squares on the reprojection error, from the linear estimate.
+
+    ``scale``: where the loss turns robust, as a fraction of the person's size in each view. Each view's
+    weight is that of its residual under ``loss`` over its squared depth, which turns the rows' residuals into
+    pixels. A joint whose last step is longer than ``tolerance`` (mm) has the status NOT_CONVERGED and its
+    last point.
+    """
+
+    loss: Literal["huber", "cauchy", "geman_mcclure"]
+    scale: float
+    iterations: int
+    tolerance: float
+
+    def __post_init__(self) -> None:
+        check(self.loss in _WEIGHTS, "loss", f"no loss {self.loss!r}", f"choose one of {', '.join(_WEIGHTS)}")
+        check(self.scale > 0, "scale", f"{self.scale} is not positive", "give a fraction such as 0.01")
+        check(self.iterations >= 1, "iterations", f"{self.iterations} is not positive", "give a count such as
+        20") check(self.tolerance > 0, "tolerance", f"{self.tolerance} is not positive", "give a length such
+        as 0.1")
+
+    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+        linear = result = Linear().triangulate(batch)
+        scale = (self.scale * person_size(batch.key_points, batch.seen))[..., None].clamp(min=1e-12)
+        step = torch.zeros_like(result.cond)
+        for _ in range(self.iterations):
+            depth = project(batch.cameras.to(torch.float64), result.points)[1]
+            residual = reprojection_error(batch.cameras, batch.key_points, result.points) / scale
+            weights = _WEIGHTS[self.loss](residual) / torch.where(depth > 0, depth, 1.0) ** 2
+            weights = torch.where(batch.seen & (depth > 0), weights, 0.0)
+            moved = triangulate(batch.cameras, batch.key_points, weights)
+            step = (moved.points - result.points).norm(dim=-1)
+            step = torch.where(moved.ok & result.ok, step, torch.inf)
+            result = _otherwise(moved, result)
+        last = torch.where(linear.ok & (step > self.tolerance), int(Status.NOT_CONVERGED), linear.status)
+        return Triangulation(result.points, last.to(torch.int8), result.angle, result.depth_min, result.cond)
+
+
+_WEIGHTS = {
+    "huber": lambda r: 1 / r.clamp(min=1),
+    "cauchy": lambda r: 1 / (1 + r**2),
+    "geman_mcclure": lambda r: 1 / (1 + r**2) ** 2,
+}
+"""Weight of a residual (in scales) in iteratively reweighted least squares: the loss's derivative over it."""
+
+
+@dataclass(frozen=True)
+class LoRansac(Baseline):
+    """pycolmap's LO-RANSAC over views for each joint, and its inliers triangulated together.
+
+    ``threshold``: an inlier's largest reprojection error, as a fraction of the person's size in that view.
+    ``seed`` fixes its draws. Runs on the CPU, joint by joint.
+    """
+
+    threshold: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        check(self.threshold > 0, "threshold", f"{self.threshold} is not positive", "give a fraction such as
+        0.02")
+
+    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+        usable = batch.seen & usable_views(batch.cameras, batch.key_points)
+        size = person_size(batch.key_points, usable).double()
+        usable &= (size > 0)[..., None]
+        # in units of the person's size one threshold holds for all views
+        K = batch.cameras.K.double() / torch.where(size > 0, size, 1.0)[..., None, None]
+        rays = (batch.key_points.double() / size.clamp(min=1e-12)[..., None, None]).cpu().numpy()
+        inliers = torch.zeros_like(batch.seen, device="cpu")
+        options = pycolmap.EstimateTriangulationOptions()
+        options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
+        options.ransac.max_error = self.threshold
+        options.ransac.random_seed = self.seed
+        rig = [x.double().cpu().numpy() for x in (K, batch.cameras.R, batch.cameras.t)]
+        mask = usable.cpu().numpy()
+        for frame in range(len(batch)):
+            cameras, poses = _pycolmap_cameras(*(x[frame] for x in rig), mask[frame].any(-1))
+            for joint in range(mask.shape[-1]):
+                views = np.flatnonzero(mask[frame, :, joint])
+                if len(views) < 2:
+                    continue
+                found = pycolmap.estimate_triangulation(
+                    rays[frame, views, joint], [poses[v] for v in views], [cameras[v] for v in views], options
+                )
+                if found is not None:
+                    inliers[frame, views[np.asarray(found["inliers"], dtype=bool)], joint] = True
+        weights = inliers.to(batch.key_points)
+        return _otherwise(triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch))
+
+
+def _pycolmap_cameras(
+    K: np.ndarray, R: np.ndarray, t: np.ndarray, valid: np.ndarray
+) -> tuple[list[pycolmap.Camera | None], list[pycolmap.Rigid3d | None]]:
+    cameras = [
+        pycolmap.Camera(
+            model="PINHOLE", width=1, height=1, params=[k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
+        ) if good else None
+        for k, good in zip(K, valid, strict=True)
+    ]  # fmt: skip
+    poses = [
+        pycolmap.Rigid3d(pycolmap.Rotation3d(r), x) if good else None for r, x, good in zip(R, t, valid,
+        strict=True)
+    ]
+    return cameras, poses
