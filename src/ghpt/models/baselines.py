@@ -42,6 +42,11 @@ def _otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
     return Triangulation(**chosen)
 
 
+def _check_positive(**values: float) -> None:
+    for name, value in values.items():
+        check(value > 0, name, f"{value} is not positive", "Give a number above 0")
+
+
 class Baseline(ABC):
     """A classical estimator: ``baseline(batch)`` gives a PoseEstimate in the dtype of the key points."""
 
@@ -70,7 +75,7 @@ class WeightedLinear(Baseline):
     power: float
 
     def __post_init__(self) -> None:
-        check(self.power > 0, "power", f"{self.power} is not positive", "give a number above 0, such as 2")
+        _check_positive(power=self.power)
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         weights = torch.where(batch.seen, batch.confidence.clamp(min=0) ** self.power, 0.0)
@@ -92,8 +97,7 @@ class Ransac(Baseline):
     seed: int
 
     def __post_init__(self) -> None:
-        check(self.threshold > 0, "threshold", f"{self.threshold} is not positive", "give a fraction such as
-        0.02") check(self.pairs >= 1, "pairs", f"{self.pairs} is not positive", "give a count such as 100")
+        _check_positive(threshold=self.threshold, pairs=self.pairs)
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         candidates = self._pairs(batch)
@@ -144,11 +148,8 @@ class MEstimator(Baseline):
     tolerance: float
 
     def __post_init__(self) -> None:
-        check(self.loss in _WEIGHTS, "loss", f"no loss {self.loss!r}", f"choose one of {', '.join(_WEIGHTS)}")
-        check(self.scale > 0, "scale", f"{self.scale} is not positive", "give a fraction such as 0.01")
-        check(self.iterations >= 1, "iterations", f"{self.iterations} is not positive", "give a count such as
-        20") check(self.tolerance > 0, "tolerance", f"{self.tolerance} is not positive", "give a length such
-        as 0.1")
+        check(self.loss in _WEIGHTS, "loss", f"no loss {self.loss!r}", f"Choose from {', '.join(_WEIGHTS)}")
+        _check_positive(scale=self.scale, iterations=self.iterations, tolerance=self.tolerance)
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         linear = result = Linear().triangulate(batch)
@@ -187,8 +188,7 @@ class LoRansac(Baseline):
     seed: int
 
     def __post_init__(self) -> None:
-        check(self.threshold > 0, "threshold", f"{self.threshold} is not positive", "give a fraction such as
-        0.02")
+        _check_positive(threshold=self.threshold)
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         usable = batch.seen & usable_views(batch.cameras, batch.key_points)
@@ -229,7 +229,6 @@ def _pycolmap_cameras(
         for k, good in zip(K, valid, strict=True)
     ]  # fmt: skip
     poses = [
-        pycolmap.Rigid3d(pycolmap.Rotation3d(r), x) if good else None for r, x, good in zip(R, t, valid,
-        strict=True)
+        pycolmap.Rigid3d(pycolmap.Rotation3d(r), x) if good else None for r, x, good in zip(R, t, valid, strict=True)
     ]
     return cameras, poses
