@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from ghpt.files import atomic_write
 from ghpt.metrics.pose_error import MPJPE
@@ -27,11 +29,10 @@ DAMAGED = frozenset({"S9/Greeting-2", "S9/SittingDown-2", "S9/Waiting-1"})
 _CHUNK = 2048
 
 
-class _Selection(torch.nn.Module):
-    """All metrics of one selection; on ``kept`` frames alone, the four means once more."""
+class _Selection:
+    """All metrics of one selection."""
 
     def __init__(self, actions: int, subjects: int) -> None:
-        super().__init__()
         self.absolute, self.relative, self.aligned = (
             MPJPE(kind, actions, len(JOINTS)) for kind in ("absolute", "relative", "aligned")
         )
@@ -46,13 +47,20 @@ class _Selection(torch.nn.Module):
             "mpjpe_6_joints": _number(relative.six_joints),
         }
 
-    def add(self, estimate: PoseEstimate, truth: Any, truth_seen: Any, action: Any, subject: Any) -> None:
+    def update(
+        self,
+        estimate: PoseEstimate,
+        truth: Float[Tensor, "B J 3"],
+        truth_seen: Bool[Tensor, "B J"],
+        action: Int[Tensor, " B"],
+        subject: Int[Tensor, " B"],
+    ) -> None:
         for metric in (self.absolute, self.relative, self.aligned):
             metric.update(estimate, truth, truth_seen, action)
         self.prior.update(estimate, subject)
 
 
-def _number(value: torch.Tensor) -> float | None:
+def _number(value: Float[Tensor, ""]) -> float | None:
     return None if math.isnan(value.item()) else value.item()
 
 
@@ -77,10 +85,10 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
         action, subject = action_of[chunk.recording], subject_of[chunk.recording]
         for name in names:
             estimate = chunk.estimates[name]
-            whole[name].add(estimate, chunk.truth, chunk.truth_seen, action, subject)
+            whole[name].update(estimate, chunk.truth, chunk.truth_seen, action, subject)
             if sound:
                 kept = PoseEstimate(estimate.points[keep], estimate.estimated[keep])
-                sound[name].add(kept, chunk.truth[keep], chunk.truth_seen[keep], action[keep], subject[keep])
+                sound[name].update(kept, chunk.truth[keep], chunk.truth_seen[keep], action[keep], subject[keep])
     selections = {name: _selection(whole[name], actions, subjects) for name in names}
     for name, metrics in sound.items():
         selections[name]["without_damaged"] = metrics.numbers()
