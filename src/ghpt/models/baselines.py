@@ -44,7 +44,7 @@ def _otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
 
 def _check_positive(**values: float) -> None:
     for name, value in values.items():
-        check(value > 0, name, f"{value} is not positive", "Give a number above 0")
+        check(value > 0, name, f"is {value}", "It must be > 0.")
 
 
 class Baseline(ABC):
@@ -148,7 +148,7 @@ class MEstimator(Baseline):
     tolerance: float
 
     def __post_init__(self) -> None:
-        check(self.loss in _WEIGHTS, "loss", f"no loss {self.loss!r}", f"Choose from {', '.join(_WEIGHTS)}")
+        check(self.loss in _WEIGHTS, "loss", f"is {self.loss!r}", f"Choose from {', '.join(_WEIGHTS)}.")
         _check_positive(scale=self.scale, iterations=self.iterations, tolerance=self.tolerance)
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
@@ -221,14 +221,11 @@ class LoRansac(Baseline):
 
 def _pycolmap_cameras(
     K: np.ndarray, R: np.ndarray, t: np.ndarray, valid: np.ndarray
-) -> tuple[list[pycolmap.Camera | None], list[pycolmap.Rigid3d | None]]:
-    cameras = [
-        pycolmap.Camera(
-            model="PINHOLE", width=1, height=1, params=[k[0, 0], k[1, 1], k[0, 2], k[1, 2]]
-        ) if good else None
-        for k, good in zip(K, valid, strict=True)
-    ]  # fmt: skip
-    poses = [
-        pycolmap.Rigid3d(pycolmap.Rotation3d(r), x) if good else None for r, x, good in zip(R, t, valid, strict=True)
-    ]
+) -> tuple[dict[int, pycolmap.Camera], dict[int, pycolmap.Rigid3d]]:
+    """The valid cameras by view: pycolmap refuses others."""
+    cameras, poses = {}, {}
+    for v in np.flatnonzero(valid).tolist():
+        pinhole = [K[v, 0, 0], K[v, 1, 1], K[v, 0, 2], K[v, 1, 2]]
+        cameras[v] = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=pinhole)
+        poses[v] = pycolmap.Rigid3d(pycolmap.Rotation3d(R[v]), t[v])
     return cameras, poses
