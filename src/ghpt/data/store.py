@@ -68,9 +68,13 @@ def prepared(
     return open_store(folder)
 
 
-def file_stamps(files: Iterable[Path], root: Path) -> list[list[str | int]]:
-    """Name, size and time of change (ns) of source files: the part of a key that notices a change."""
-    return [[str(f.relative_to(root)), f.stat().st_size, f.stat().st_mtime_ns] for f in sorted(files)]
+def file_stamps(files: Iterable[Path], root: Path) -> str:
+    """A digest of source files' names, sizes and times of change: the part of a key that notices a change."""
+    digest = hashlib.sha256()
+    for file in sorted(files):
+        status = file.stat()
+        digest.update(f"{file.relative_to(root)}\0{status.st_size}\0{status.st_mtime_ns}\n".encode())
+    return digest.hexdigest()
 
 
 def write_store(folder: str | Path, recordings: Iterable[Recording], provenance: dict[str, Any]) -> None:
@@ -94,9 +98,7 @@ def write_store(folder: str | Path, recordings: Iterable[Recording], provenance:
                 handle.close()
         frames = sum(e["length"] for e in entries)
         if frames == 0:
-            raise GhptDataError(
-                folder, "", "there are no frames to prepare", "Check the split and the data's files"
-            )
+            raise GhptDataError(folder, "", "there are no frames to prepare", "Check the split and the data's files")
         views = len(entries[0]["camera_names"])
         files = {
             field: {"dtype": dtype, "shape": _shape(field, frames, views), "unit": unit,
@@ -107,9 +109,7 @@ def write_store(folder: str | Path, recordings: Iterable[Recording], provenance:
                     "views": views, "camera_unit": "mm, pixels; world to camera", "files": files,
                     "recordings": entries, "provenance": provenance}  # fmt: skip
         manifest["digest"] = _digest(manifest)
-        (temporary / "manifest.json").write_text(
-            json.dumps(manifest, indent=1, allow_nan=False), encoding="utf-8"
-        )
+        (temporary / "manifest.json").write_text(json.dumps(manifest, indent=1, allow_nan=False), encoding="utf-8")
 
 
 def open_store(folder: str | Path) -> list[Recording]:
@@ -132,9 +132,7 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_bytes())
     except FileNotFoundError as error:
-        raise GhptDataError(
-            path, "", "there is no manifest, so this is no prepared recording", _MEND
-        ) from error
+        raise GhptDataError(path, "", "there is no manifest, so this is no prepared recording", _MEND) from error
     except (OSError, ValueError, RecursionError) as error:
         raise GhptDataError(path, "", f"cannot be read ({error})", _MEND) from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
@@ -143,14 +141,10 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
         problem = f"is {manifest.get('version')!r}; this ghpt reads {VERSION}"
         raise GhptDataError(path, "version", problem, _MEND)
     if manifest.pop("digest", None) != _digest(manifest):
-        raise GhptDataError(
-            path, "digest", "does not fit the rest: the manifest was changed or damaged", _MEND
-        )
+        raise GhptDataError(path, "digest", "does not fit the rest: the manifest was changed or damaged", _MEND)
     for field, (dtype, _, _) in FIELDS.items():
         file = Path(folder) / f"{field}.bin"
-        expected = (
-            int(np.prod(_shape(field, manifest["frames"], manifest["views"]))) * np.dtype(dtype).itemsize
-        )
+        expected = int(np.prod(_shape(field, manifest["frames"], manifest["views"]))) * np.dtype(dtype).itemsize
         found = file.stat().st_size if file.is_file() else None
         if found != expected:
             problem = "is missing" if found is None else f"has {found} bytes instead of {expected}"
@@ -204,9 +198,7 @@ def _chunks(recording: Recording) -> Iterator[tuple[str, np.ndarray]]:
         array = getattr(recording, field)
         expected = tuple(_shape(field, len(recording), len(recording.camera_names)))
         if array.shape != expected:
-            raise GhptDataError(
-                recording.name, field, f"has shape {array.shape} instead of {expected}", "Check it"
-            )
+            raise GhptDataError(recording.name, field, f"has shape {array.shape} instead of {expected}", "Check it")
         for start in range(0, len(recording), _CHUNK):
             chunk = np.ascontiguousarray(array[start : start + _CHUNK], dtype)
             if not np.isfinite(chunk).all():

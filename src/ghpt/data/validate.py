@@ -1,0 +1,195 @@
+"""Checks of users' cameras, arrays and files; each error names the file, the field, the problem and the mend.
+
+No reader here allocates what a file only claims to hold: sizes are compared with the file's own first.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import warnings
+import zipfile
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+import torch
+
+from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import Cameras
+
+Shape = tuple[int | None, ...]
+"""An expected shape; None stands for any size."""
+
+_MAX_HEADER = 10_000
+"""Bytes of an npy header; numpy's own limit."""
+_MAX_JSON = 64 << 20
+_MAX_MEMBER = 1 << 28
+"""Bytes of one array in an npz, unpacked."""
+
+
+def check_cameras(
+    where: object, names: Sequence[str], K: Any, R: Any, t: Any, distortion: Any
+) -> tuple[Cameras, np.ndarray]:
+    """V users' cameras (K [V 3 3] pixels, R [V 3 3] and t [V 3] world to camera in mm) and their distortion [V 5].
+
+    R that is off by rounding (1e-9 to 1e-3) becomes the nearest rotation. Raises GhptDataError for fewer than two
+    views, a camera listed twice, and values that are not finite or no pinhole camera.
+    """
+    check_names(where, names)
+    views = len(names)
+    expected = {"K": (views, 3, 3), "R": (views, 3, 3), "t": (views, 3), "distortion": (views, 5)}
+    arrays = {
+        field: check_array(where, field, np.asarray(value), expected[field], "fiu").astype(np.float64)
+        for field, value in zip(expected, (K, R, t, distortion), strict=True)
+    }
+    for index, name in enumerate(names):
+        for field, array in arrays.items():
+            if not np.isfinite(array[index]).all():
+                problem = "holds a value that is not finite"
+                raise GhptDataError(where, f"camera {name}, {field}", problem, "Calibrate this camera again.")
+        _check_intrinsics(where, name, arrays["K"][index])
+        arrays["R"][index] = _rotation(where, name, arrays["R"][index])
+    return Cameras(*(torch.from_numpy(arrays[field]) for field in ("K", "R", "t"))), arrays["distortion"]
+
+
+def _check_intrinsics(where: object, name: str, K: np.ndarray) -> None:
+    if not (K[0, 0] > 0 and K[1, 1] > 0):
+        problem = f"the focal lengths are {K[0, 0]:g} and {K[1, 1]:g} pixels; they must be positive"
+        raise GhptDataError(where, f"camera {name}, K", problem, "Calibrate this camera again.")
+    if K[1, 0] != 0 or not np.array_equal(K[2], (0, 0, 1)):
+        problem = "is not of the form [[fx s cx] [0 fy cy] [0 0 1]]"
+        raise GhptDataError(where, f"camera {name}, K", problem, "Check that K was not transposed.")
+
+
+def _rotation(where: object, name: str, R: np.ndarray) -> np.ndarray:
+    error, det = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
+    if error > 1e-3 or det < 0:
+        problem = f"R is not a rotation (|R R^T - I| = {error:.3g}, det = {det:.3g})"
+        mend = "R must be the 3x3 world-to-camera rotation: without scale, not mirrored, not a Rodrigues vector."
+        raise GhptDataError(where, f"camera {name}, R", problem, mend)
+    if error < 1e-9:
+        return R
+    U, _, Vh = np.linalg.svd(R)
+    return U @ Vh
+
+
+def check_names(where: object, names: Sequence[object], available: Sequence[object] | None = None) -> None:
+    """Raise GhptDataError for fewer than two cameras, a camera listed twice, or one that is not ``available``."""
+    for name in names:
+        if list(names).count(name) > 1:
+            problem = f"camera {name} is listed twice"
+            raise GhptDataError(where, "cameras", problem, "List each camera once.")
+        if available is not None and name not in available:
+            there = ", ".join(map(str, available))
+            raise GhptDataError(where, "cameras", f"there is no camera {name}", f"There are: {there}.")
+    if len(names) < 2:
+        problem = f"{len(names)} camera(s) listed; triangulation needs at least two"
+        raise GhptDataError(where, "cameras", problem, "List more cameras.")
+
+
+def check_array(where: object, field: str, array: np.ndarray, shape: Shape, kinds: str) -> np.ndarray:
+    """``array`` itself, if it has this shape and its dtype is of these numpy kinds; else GhptDataError."""
+    _check_form(where, field, array.shape, array.dtype, shape, kinds)
+    return array
+
+
+def read_npy(path: Path, shape: Shape, kinds: str) -> np.ndarray:
+    """A read-only memory map of an npy file that holds exactly an array of this form; else GhptDataError."""
+    with open_input(path) as handle:
+        found, order, dtype = npy_header(path, "", handle, path.stat().st_size)
+        offset = handle.tell()
+    _check_form(path, "", found, dtype, shape, kinds)
+    if math.prod(found) == 0:
+        return np.empty(found, dtype)
+    return np.asarray(np.memmap(path, dtype, "r", offset, found, order))
+
+
+def read_npz(path: Path, fields: dict[str, tuple[Shape, str]]) -> dict[str, np.ndarray]:
+    """The named arrays of an npz file, of these shapes and kinds; else GhptDataError."""
+    arrays = {}
+    try:
+        with open_input(path) as handle, zipfile.ZipFile(handle) as archive:
+            for field, (shape, kinds) in fields.items():
+                size = min(archive.getinfo(f"{field}.npy").file_size, _MAX_MEMBER)
+                with archive.open(f"{field}.npy") as member:
+                    found, order, dtype = npy_header(path, field, member, size)
+                    _check_form(path, field, found, dtype, shape, kinds)
+                    flat = np.frombuffer(member.read(), dtype)
+                    arrays[field] = flat.reshape(found, order=order)
+    except KeyError as error:
+        raise GhptDataError(path, "", f"lacks an array: {error}", f"It must hold {', '.join(fields)}.") from error
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+        raise GhptDataError(path, "", f"is not a whole npz file ({error})", "Write it again.") from error
+    return arrays
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file without NaN and Infinity; else GhptDataError."""
+    with open_input(path) as handle:
+        data = handle.read(_MAX_JSON + 1)
+    if len(data) > _MAX_JSON:
+        raise GhptDataError(path, "", f"has more than {_MAX_JSON >> 20} MiB", "Check that this is the right file.")
+
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is no JSON number")
+
+    try:
+        return json.loads(data, parse_constant=refuse)
+    except (ValueError, RecursionError) as error:
+        raise GhptDataError(path, "", f"is not valid JSON ({error})", "Get the file again.") from error
+
+
+def open_input(path: Path) -> IO[bytes]:
+    """Open a user's file for reading. Raises GhptDataError if there is none, or it cannot be read."""
+    try:
+        return open(path, "rb")
+    except FileNotFoundError as error:
+        raise GhptDataError(path, "", "there is no such file", "Check the path and the data's layout.") from error
+    except OSError as error:
+        raise GhptDataError(path, "", f"cannot be read ({error.strerror})", "Check its permissions.") from error
+
+
+def _check_form(where: object, field: str, found: tuple[int, ...], dtype: np.dtype, shape: Shape, kinds: str) -> None:
+    if len(found) != len(shape) or any(b not in (None, a) for a, b in zip(found, shape, strict=True)):
+        expected = " x ".join("any" if size is None else str(size) for size in shape)
+        problem = f"has shape {' x '.join(map(str, found))} instead of {expected}"
+        raise GhptDataError(where, field, problem, "Check how it was written.")
+    if dtype.kind not in kinds:
+        names = {"f": "floating-point numbers", "i": "integers", "u": "integers", "b": "booleans", "V": "records"}
+        expected = " or ".join(dict.fromkeys(names[kind] for kind in kinds))
+        raise GhptDataError(where, field, f"holds {dtype}, not {expected}", "Check how it was written.")
+
+
+def npy_header(
+    where: object, field: str, handle: IO[bytes], size: int, pickled: bool = False
+) -> tuple[tuple[int, ...], str, np.dtype]:
+    """Shape, order and dtype of the npy array in ``handle``, which then stands at its data.
+
+    Raises GhptDataError unless what follows is as long as the header claims (``size`` counts from the start).
+    """
+    mend = "Write it with numpy.save, or copy it again."
+    start = handle.read(12)
+    major = start[6] if start.startswith(b"\x93NUMPY") and len(start) == 12 else 0
+    if major not in (1, 2):
+        raise GhptDataError(where, field, "is not a numpy array file (npy 1.0 or 2.0)", mend)
+    if int.from_bytes(start[8 : 10 if major == 1 else 12], "little") > _MAX_HEADER:
+        raise GhptDataError(where, field, f"has a header of more than {_MAX_HEADER} bytes", mend)
+    handle.seek(8)
+    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            shape, fortran, dtype = read(handle)
+    except Exception as error:  # numpy lets through whatever Python's parser raises
+        raise GhptDataError(where, field, "has a damaged header", mend) from error
+    left = size - handle.tell()
+    if dtype.hasobject and not pickled:
+        raise GhptDataError(where, field, "holds Python objects, which can run code", mend)
+    if any(n < 0 for n in shape) or (not dtype.hasobject and math.prod(shape) * dtype.itemsize != left):
+        claimed = math.prod(shape) * dtype.itemsize
+        problem = f"claims {claimed} bytes of {dtype} and holds {left}: it is truncated or damaged"
+        raise GhptDataError(where, field, problem, mend)
+    return shape, "F" if fortran else "C", dtype
