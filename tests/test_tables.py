@@ -1,0 +1,118 @@
+import io
+
+import pytest
+from rich.console import Console
+
+from ghpt.metrics.pose_prior import PARTS
+from ghpt.report import paper
+from ghpt.report.evaluate import NAMES
+from ghpt.report.tables import COLUMNS, generalization_table, main_rows, max_difference, print_table, report, words
+
+MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
+
+
+def metrics(data="h36m", source="embedded", split="test", trained="h36m", value=30.0) -> dict:
+    numbers = {
+        "mpjpe_absolute": 1234.56, "mpjpe_relative": value, "mpjpe_aligned": 22.0, "mpjpe_6_joints": None,
+        "coverage": 0.99876,
+        "per_joint": {}, "per_action": {"Eating": 29.0, "WalkingTogether": None},
+        "pose_prior": {"S9": dict.fromkeys(PARTS, 0.00123), "S11": dict.fromkeys(PARTS)},
+        "without_damaged": dict.fromkeys(MEANS, 28.25),
+    }  # fmt: skip
+    provenance = {"ghpt": "0.1.0", "commit": "abc", "checkpoint": "last.ckpt",
+                  "training": {"data": trained, "source": source}}  # fmt: skip
+    return {
+        "data": data, "source": source, "split": split, "frames": 100, "seed": 0, "provenance": provenance,
+        "selections": dict.fromkeys(NAMES, numbers),
+    }  # fmt: skip
+
+
+def cells(values: dict) -> dict[str, dict[str, str]]:
+    return {row[0]: dict(zip(COLUMNS, row, strict=True)) for row in main_rows(values)}
+
+
+def test_the_papers_own_table_gives_its_last_column():
+    for test, printed in paper.GENERALIZATION_MAX_DIFFERENCE.items():
+        row = [paper.GENERALIZATION[train, test] for train in paper.ARRANGEMENTS]
+        assert printed == pytest.approx(max_difference(row), abs=0.1)
+        assert printed <= round(max_difference(row), 1)  # cut or rounded
+    # Of the obvious definitions only division by the smallest fits the row with the widest spread.
+    row = [paper.GENERALIZATION[train, "h36m"] for train in paper.ARRANGEMENTS]
+    assert round(100 * (max(row) - min(row)) / max(row), 1) != 15.1
+
+
+def test_papers_tables_agree_with_each_other():
+    assert paper.GENERALIZATION["h36m", "h36m"] == paper.QUANTITATIVE_HYPOTHESES["h36m"]["weight"]
+    assert paper.QUANTITATIVE_MEAN == paper.QUANTITATIVE_HYPOTHESES["h36m"]["weight"] == paper.LIMITATION["test"]
+    assert sum(paper.QUANTITATIVE.values()) / 15 == pytest.approx(29.6, abs=0.1)  # by frames, not by actions: 29.1
+    others = [v for (train, test), v in paper.GENERALIZATION.items() if train != test and "h36m" not in (train, test)]
+    assert sum(others) / 12 == pytest.approx(25.42, abs=0.005)  # tab:sota-comparison
+
+
+def test_paper_values_only_where_the_paper_has_them():
+    h36m = cells(metrics())
+    assert h36m["weight"]["paper"] == "29.1"
+    assert h36m["weight"]["difference"] == "+3.1 %"
+    assert h36m["RANSAC"]["paper"] == "27.4"
+    assert h36m["linear"]["paper"] == h36m["linear"]["difference"] == "–"
+    across = cells(metrics(trained="cmu3"))
+    assert across["weight"]["paper"] == "31.0"
+    assert across["most"]["paper"] == "–"  # printed for training on Human3.6M only
+    assert across["random"]["paper"] == "45.0"  # needs no training
+    panoptic = cells(metrics(data="cmu3", trained="cmu1"))
+    assert panoptic["weight"]["paper"] == "24.9"
+    assert panoptic["most"]["paper"] == "25.0"
+    assert all(row["paper"] == "–" for row in cells(metrics(split="validation")).values())
+    assert all(row["paper"] == "–" for row in cells(metrics(data="mine", trained=None)).values())
+
+
+def test_embedded_is_never_mistaken_for_real():
+    assert words("h36m", "embedded") == "embedded (synthetic) Human3.6M"
+    assert words("cmu2", "/data/panoptic") == "Panoptic CMU2 from /data/panoptic"
+    text = report(metrics())
+    assert text.startswith(
+        "# Test on embedded (synthetic) Human3.6M, test split, trained on embedded (synthetic) Human"
+    )
+    assert "These data are synthetic" in text
+    real = report(metrics(source="/data/h36m"))
+    assert "synthetic" not in real
+    assert "/data/h36m" in real.splitlines()[0]
+
+
+def test_report_fits_100_columns_and_every_row_has_every_column():
+    tables = [line for line in report(metrics()).splitlines() if line.startswith("|")]
+    assert max(map(len, tables)) <= 100
+    blocks = report(metrics()).split("\n\n")
+    for block in (block for block in blocks if block.startswith("|")):
+        assert len({line.count("|") for line in block.splitlines()}) == 1
+    assert sum(line.startswith("| weight ") for line in tables) == 2  # the main table and the one without damaged
+    assert "28.2" in report(metrics())
+
+
+def test_terminal_table_fits_100_columns():
+    buffer = io.StringIO()
+    print_table(metrics(data="cmu4", trained="cmu2"), Console(file=buffer, width=100, color_system=None))
+    lines = buffer.getvalue().splitlines()
+    assert "embedded (synthetic) Panoptic CMU4" in " ".join(lines)
+    assert max(map(len, lines)) <= 100
+    assert not any("…" in line for line in lines)
+    for name in ("weight", "worst", "LO-RANSAC"):
+        assert any(name in line for line in lines)
+
+
+def test_generalization_table_has_test_sets_as_rows():
+    results = {pair: value + 1 for pair, value in paper.GENERALIZATION.items() if pair != ("cmu2", "cmu4")}
+    lines = generalization_table(results).splitlines()
+    assert max(map(len, lines)) <= 100
+    h36m = [cell.strip() for cell in lines[-1].strip("|").split("|")]
+    assert h36m == [
+        "H36M",
+        "34.5 (33.5)",
+        "34.4 (33.4)",
+        "32.0 (31.0)",
+        "33.5 (32.5)",
+        "30.1 (29.1)",
+        "14.6 (15.1)",
+    ]
+    assert "– (25.6)" in lines[-2]
+    assert "– (2.0)" in lines[-2]
