@@ -12,3 +12,9 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"the developers' real data is not at {folder}")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prepared recordings go to a folder of the test session, shared by its tests, never to the user's cache."""
+    monkeypatch.setenv("GHPT_CACHE", str(tmp_path_factory.getbasetemp() / "cache"))

@@ -1,7 +1,9 @@
 """What train.py and test.py share: compose the configuration, run, and say errors in one line."""
 
+import logging
 import os
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -23,6 +25,11 @@ def run(conf: Path, config_name: str, task: Callable[[dict[str, Any], Path], Any
     """
 
     def job(config: DictConfig) -> Any:
+        logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+        # Lightning's own use of torch, and an advice that memory-mapped reading has no need of
+        warnings.filterwarnings("ignore", r".*treespec, LeafSpec.* is deprecated")
+        warnings.filterwarnings("ignore", r".*does not have many workers")
+        warnings.filterwarnings("ignore", r"Checkpoint directory .* exists and is not empty")
         output = Path(HydraConfig.get().runtime.output_dir)
         try:
             return task(plain(config), output)

@@ -12,7 +12,7 @@ from ghpt.files import sweep_temporaries
 from ghpt.models.callbacks import SaveLast, best_checkpoint
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO, read_checkpoint
 from ghpt.provenance import provenance
-from ghpt.report.tensorboard import ForgivingTensorBoard
+from ghpt.report.logger import ForgivingTensorBoard
 
 
 def train(config: dict[str, Any], output: Path) -> dict[str, float]:
@@ -44,6 +44,7 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
             best_checkpoint(output),
             *progress(config),
         ],
+        enable_progress_bar=config["progress_bar"],
         use_distributed_sampler=False,
         num_sanity_val_steps=0,
     )

@@ -11,7 +11,7 @@ import numpy as np
 from torch.utils.data import DataLoader
 
 from ghpt import randomness
-from ghpt.data.frames import BatchOrder, Frames, loader, trainable
+from ghpt.data.frames import BatchOrder, FrameLoader, Frames, trainable
 from ghpt.data.store import prepared
 from ghpt.errors import GhptDataError, check
 from ghpt.recording import KeyPointBatch, Recording
@@ -125,7 +125,7 @@ class KeyPointDataModule(L.LightningDataModule):
     def _loader(self, role: str, seed: int | None = None, done: Any = lambda: 0) -> DataLoader[KeyPointBatch]:
         rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         order = BatchOrder(len(self.frames[role]), self.batch_size, rank, world, seed, done)
-        return loader(self.frames[role], order, self.workers)
+        return FrameLoader(self.frames[role], order, self.workers)
 
     def all_training_batches(self) -> Iterator[KeyPointBatch]:
         """Every training sample once, in order, the same on every process: for the feature statistics."""

@@ -2,6 +2,7 @@
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
+from typing import Any
 
 import numpy as np
 import torch
@@ -98,12 +99,16 @@ class BatchOrder(Sampler[list[int]]):
             yield order[batch * self.batch_size : (batch + 1) * self.batch_size][self.rank :: self.world].tolist()
 
 
-def loader(frames: Frames, order: BatchOrder, workers: int) -> DataLoader[KeyPointBatch]:
-    return DataLoader(
-        frames,
-        sampler=order,
-        batch_size=None,
-        num_workers=workers,
-        pin_memory=torch.cuda.is_available(),
-        persistent_workers=False,
-    )
+class FrameLoader(DataLoader[KeyPointBatch]):
+    """Loads batches in a ``BatchOrder``. It has no state to save, since the order knows where to go on."""
+
+    def __init__(self, frames: Frames, order: BatchOrder, workers: int) -> None:
+        pin = torch.cuda.is_available()
+        super().__init__(frames, sampler=order, batch_size=None, num_workers=workers, pin_memory=pin)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Empty; its being there tells Lightning that a run can be resumed within an epoch."""
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Nothing to do: see ``BatchOrder.done``."""

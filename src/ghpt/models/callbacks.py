@@ -13,7 +13,7 @@ from ghpt.models.checkpoint import FIELD
 
 
 class SaveLast(Callback):
-    """Keep ``last.ckpt`` up to date: every ``every`` steps, when training ends, and when it is interrupted.
+    """Keep ``last.ckpt`` up to date: every ``every`` steps, after each epoch, and when interrupted.
 
     An interrupt (Ctrl-C) takes effect after the running step, so that what is saved is whole; a second one at once.
     ``identity`` is what every checkpoint says of itself.
@@ -40,14 +40,18 @@ class SaveLast(Callback):
         self.interrupted = True
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
-        stop = self.interrupted or trainer.received_sigterm
-        if stop or trainer.global_step % self.every == 0:
-            trainer.save_checkpoint(self.path)
+        # Not between an epoch's last step and its validation: resumed there, Lightning would skip the validation.
+        if not trainer.is_last_batch:
+            self._save(trainer, due=trainer.global_step % self.every == 0)
+
+    def on_train_epoch_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        self._save(trainer, due=True)
+
+    def _save(self, trainer: L.Trainer, due: bool) -> None:
+        if due or self.interrupted or trainer.received_sigterm:
+            trainer.save_checkpoint(self.path, weights_only=False)
         if self.interrupted:
             raise KeyboardInterrupt
-
-    def on_train_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        trainer.save_checkpoint(self.path)
 
     def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
         if self._previous is not None:

@@ -61,7 +61,9 @@ class StochasticEstimator(L.LightningModule):
             "Existing: weight, stochastic.",
         )
         self.problem, self.loss, self.optimizer = problem, loss, optimizer
-        self.scorer = scorer(problem.feature_size)
+        with torch.random.fork_rng(devices=[]):  # the initial weights too are a function of the seed alone
+            torch.manual_seed(seed)
+            self.scorer = scorer(problem.feature_size)
         self.hypotheses, self.temperature, self.gumbel = hypotheses, temperature, gumbel
         self.selection, self.seed = selection, seed
         self.validation = torch.nn.ModuleDict({name: _mean() for name in ("weight", "average", "random")})

@@ -14,12 +14,13 @@ A third problem is one file with a class like this and one yaml::
         def error(self, estimate, batch): ...            # distance to the true line -> [B], counted [B]
 """
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
+@runtime_checkable
 class Problem(Protocol):
     """Hypotheses and estimates are the problem's own types; only the problem looks inside."""
 

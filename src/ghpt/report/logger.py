@@ -1,0 +1,38 @@
+"""A TensorBoard logger that cannot stop training."""
+
+import functools
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from lightning.pytorch.loggers import TensorBoardLogger
+
+_log = logging.getLogger(__name__)
+
+
+def _forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
+    @functools.wraps(method)
+    def wrapped(self: "ForgivingTensorBoard", *args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(self, *args, **kwargs)
+        except Exception as error:  # a full disk, a lost mount: the numbers matter less than the run
+            self.failures += 1
+            if self.failures == 1:
+                _log.warning("TensorBoard logging fails (%s); training goes on without it", error)
+            return None
+
+    return wrapped
+
+
+class ForgivingTensorBoard(TensorBoardLogger):
+    """Event files directly in ``folder``. A failure is counted in ``failures`` and said once."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(save_dir=folder, name="", version="", default_hp_metric=False)
+        self.failures = 0
+
+    log_metrics = _forgiving(TensorBoardLogger.log_metrics)
+    log_hyperparams = _forgiving(TensorBoardLogger.log_hyperparams)
+    save = _forgiving(TensorBoardLogger.save)
+    finalize = _forgiving(TensorBoardLogger.finalize)

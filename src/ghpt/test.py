@@ -1,0 +1,58 @@
+"""Testing: predictions first, then every number, table and figure from the predictions."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+
+from ghpt.config import build
+from ghpt.errors import GhptCheckpointError
+from ghpt.files import sweep_temporaries
+from ghpt.models.checkpoint import load_model
+from ghpt.provenance import provenance
+from ghpt.report.collect import CollectPredictions
+from ghpt.report.evaluate import evaluate, write_metrics
+from ghpt.report.predictions import open_predictions
+from ghpt.report.tables import print_table, write_report
+from ghpt.report.tensorboard import write_events
+from ghpt.train import progress
+
+
+def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
+    """Test ``config["ckpt"]`` on ``config["data"]``; returns what metrics.json holds.
+
+    Writes predictions.npz, metrics.json, report.md and TensorBoard events into ``output`` and prints the table.
+    """
+    if not config["ckpt"]:
+        raise GhptCheckpointError("ckpt", "is missing", "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m")
+    model, trained = load_model(config["ckpt"], hypotheses=config["hypotheses"], seed=config["seed"])
+    data = build(config["data"], "data")
+    origin = provenance(config["seed"]) | {"checkpoint": str(config["ckpt"]), "training": trained["provenance"]}
+    meta = {
+        "data": data.name, "source": data.source, "split": data.evaluate, "seed": config["seed"],
+        "hypotheses": model.hypotheses, "provenance": origin,
+    }  # fmt: skip
+    sweep_temporaries(output)
+    shutil.rmtree(output / ".predictions", ignore_errors=True)  # what an interrupted test left
+    trainer = L.Trainer(
+        **build(config["trainer"], "trainer"),
+        default_root_dir=output,
+        logger=False,
+        callbacks=[CollectPredictions(output, build(config["baselines"], "baselines"), meta), *progress(config)],
+        enable_progress_bar=config["progress_bar"],
+        use_distributed_sampler=False,
+    )
+    trainer.test(model, datamodule=data, verbose=False)
+    if not trainer.is_global_zero:
+        return {}
+    predictions = open_predictions(output / "predictions.npz")
+    metrics = evaluate(predictions)
+    write_metrics(output / "metrics.json", metrics)
+    write_report(output / "report.md", metrics)
+    write_events(output, predictions, metrics)
+    print_table(metrics)
+    return metrics
+
+
+test.__test__ = False  # not one for pytest
