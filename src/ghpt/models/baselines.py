@@ -42,7 +42,7 @@ def _otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
     return Triangulation(**chosen)
 
 
-def _check_positive(**values: float) -> None:
+def _check_positive(**values: float | int) -> None:
     for name, value in values.items():
         check(value > 0, name, f"is {value}", "It must be > 0.")
 
