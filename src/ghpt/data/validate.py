@@ -5,6 +5,7 @@ No reader here allocates what a file only claims to hold: sizes are compared wit
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import warnings
@@ -12,7 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -142,7 +143,7 @@ def read_json(path: Path) -> Any:
         raise GhptDataError(path, "", f"is not valid JSON ({error})", "Get the file again.") from error
 
 
-def open_input(path: Path) -> IO[bytes]:
+def open_input(path: Path) -> io.BufferedReader:
     """Open a user's file for reading. Raises GhptDataError if there is none, or it cannot be read."""
     try:
         return open(path, "rb")
@@ -164,7 +165,7 @@ def _check_form(where: object, field: str, found: tuple[int, ...], dtype: np.dty
 
 
 def npy_header(
-    where: object, field: str, handle: IO[bytes], size: int, pickled: bool = False
+    where: object, field: str, handle: io.BufferedIOBase, size: int, pickled: bool = False
 ) -> tuple[tuple[int, ...], str, np.dtype]:
     """Shape, order and dtype of the npy array in ``handle``, which then stands at its data.
 
