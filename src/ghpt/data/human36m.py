@@ -137,7 +137,7 @@ def _takes(
 def _same(labels: Labels, rows: Int[np.ndarray, " T"], truth: list[np.ndarray]) -> bool:
     starts = np.cumsum([0, *map(len, truth)])
     return all(
-        np.allclose(labels.key_points[rows[start : start + len(chunk)]], chunk, rtol=0, atol=_SAME_MM)
+        not (np.abs(labels.key_points[rows[start : start + len(chunk)]] - chunk) > _SAME_MM).any()
         for start, chunk in zip(starts, truth, strict=False)
     )
 
