@@ -41,7 +41,8 @@ class PoseErrors(NamedTuple):
     six_joints: Float[Tensor, ""]
     """On elbows, wrists and knees only."""
     per_joint: Float[Tensor, " J"]
-    per_group: Float[Tensor, " G"]
+    per_group: Float[Tensor, " G"] | Float[Tensor, ""]
+    """torchmetrics takes the dimension away when there is one group."""
     coverage: Float[Tensor, ""]
     """Counted joint-frames / joint-frames with a truth, in [0, 1]."""
 

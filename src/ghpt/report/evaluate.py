@@ -108,7 +108,7 @@ def _selection(metrics: _Selection, actions: list[str], subjects: list[str]) -> 
         **metrics.numbers(),
         "coverage": _number(metrics.absolute.compute().coverage),
         "per_joint": dict(zip(JOINTS, map(_number, relative.per_joint), strict=True)),
-        "per_action": dict(zip(actions, map(_number, relative.per_group), strict=True)),
+        "per_action": dict(zip(actions, map(_number, torch.atleast_1d(relative.per_group)), strict=True)),
         "pose_prior": {
             subject: dict(zip(PARTS, map(_number, row), strict=True))
             for subject, row in zip(subjects, prior, strict=True)

@@ -175,7 +175,7 @@ def _about_the_paper(metrics: Mapping[str, Any]) -> str:
         return ""
     note = (
         "Paper: relative MPJPE on the real data set, tab:quantitative-hypotheses and tab:generalization-evaluation. "
-        "Its RANSAC is quoted from Iskakov et al., who used another detector."
+        "Its RANSAC is quoted from Iskakov et al., on their own detections."
     )
     if metrics["source"] == "embedded":
         fitted = "random, average, best, worst" + (" and RANSAC" if metrics["data"] == "h36m" else "")

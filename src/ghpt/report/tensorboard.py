@@ -1,0 +1,133 @@
+"""A test run in TensorBoard. It shows what metrics.json holds; it can fail without costing the run anything."""
+
+import logging
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
+
+from ghpt.metrics.pose_error import joint_errors
+from ghpt.recording import PoseEstimate
+from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
+from ghpt.report.predictions import WEIGHTS, PredictionChunk, Predictions
+from ghpt.report.tables import title, trained_on
+
+SHOWN = ("weight", "most", "least", "random")
+"""The poses beside the truth in the figure of a frame."""
+_SCALARS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints", "coverage")
+_SAMPLE = 50
+"""Blocks of `_BLOCK` frames, evenly over the run, that histograms and the figure are made of."""
+_BLOCK = 1000
+_log = logging.getLogger(__name__)
+
+
+class _Failures:
+    """Keeps a failing part from stopping the next; counts them and says so once."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    @contextmanager
+    def caught(self, part: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:
+            self.count += 1
+            if self.count == 1:
+                _log.warning("TensorBoard: %s cannot be written (%s); the test's files are complete", part, error)
+
+
+def write_events(folder: str | Path, predictions: Predictions, metrics: Mapping[str, Any]) -> int:
+    """Write a test run's scalars, histograms, figures and hyper-parameters as events in ``folder``.
+
+    Never raises: the number of parts that failed is returned, and the first is said as a logged warning.
+    """
+    failures = _Failures()
+    with failures.caught("the event file"):
+        writer = SummaryWriter(str(folder))
+        with failures.caught("scalars"):
+            _scalars(writer, metrics)
+        with failures.caught("the weights"):
+            _weights(writer, predictions)
+        with failures.caught("the skeletons"):
+            _skeletons(writer, predictions, metrics)
+        with failures.caught("the pose prior"):
+            _pose_prior(writer, metrics)
+        with failures.caught("the hyper-parameters"):
+            _hyperparameters(writer, predictions, metrics)
+        writer.close()
+    return failures.count
+
+
+def _scalars(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
+    for name, numbers in metrics["selections"].items():
+        for scalar in _SCALARS:
+            if numbers[scalar] is not None:
+                writer.add_scalar(f"{scalar}/{name}", numbers[scalar], 0)
+
+
+def _weights(writer: SummaryWriter, predictions: Predictions) -> None:
+    for summary in WEIGHTS:
+        values = torch.cat([chunk.weights[summary] for _, chunk in _sample(predictions)])
+        writer.add_scalar(f"weights/{summary}", values.mean().item(), 0)
+        writer.add_histogram(f"weights/{summary}", values.numpy(), 0)
+
+
+def _skeletons(writer: SummaryWriter, predictions: Predictions, metrics: Mapping[str, Any]) -> None:
+    """The whole frame whose error under ``weight`` is the median: neither a good nor a bad one."""
+    rows, errors, truth = [], [], []
+    for start, chunk in _sample(predictions):
+        error, whole = _relative_error(chunk)
+        rows.append(start + whole.nonzero()[:, 0])
+        errors.append(error[whole])
+        truth.append(chunk.truth[whole][::10])
+    if not len(torch.cat(rows)):
+        return
+    row = int(torch.cat(rows)[torch.cat(errors).median(dim=0).indices])
+    chunk = predictions.read(row, row + 1)
+    poses = {name: _with_nan(chunk.estimates[name]) for name in SHOWN if name in predictions.names}
+    take = predictions.recording_name[int(chunk.recording)]
+    heading = f"{title(metrics)}\n{take}, frame {int(chunk.frame)}: the median of the errors under {SHOWN[0]}"
+    up = up_axis(torch.cat(truth).double().numpy())
+    figure = skeletons(chunk.truth[0].double().numpy(), poses, up, heading)
+    writer.add_image("skeletons", image(figure), 0, dataformats="HWC")
+
+
+def _pose_prior(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
+    for subject in next(iter(metrics["selections"].values()))["pose_prior"]:
+        writer.add_image(f"pose_prior/{subject}", image(pose_prior_bars(metrics, subject)), 0, dataformats="HWC")
+
+
+def _hyperparameters(writer: SummaryWriter, predictions: Predictions, metrics: Mapping[str, Any]) -> None:
+    trained, source = trained_on(metrics)
+    values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
+    values |= {"trained_on": trained, "trained_on_source": source, "hypotheses": predictions.meta.get("hypotheses")}
+    numbers = {
+        f"final/{name}": numbers["mpjpe_relative"]
+        for name, numbers in metrics["selections"].items()
+        if numbers["mpjpe_relative"] is not None
+    }
+    writer.add_hparams({k: v for k, v in values.items() if v is not None}, numbers, run_name=".")
+
+
+def _sample(predictions: Predictions) -> Iterator[tuple[int, PredictionChunk]]:
+    """At most ``_SAMPLE`` blocks with their first row, so that memory does not grow with the frames."""
+    starts = range(0, len(predictions), _BLOCK)
+    chosen = sorted({round(i) for i in np.linspace(0, len(starts) - 1, min(len(starts), _SAMPLE))})
+    return ((starts[i], predictions.read(starts[i], min(starts[i] + _BLOCK, len(predictions)))) for i in chosen)
+
+
+def _relative_error(chunk: PredictionChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
+    """Each frame's error under the first shown selection, mm, and which frames are whole."""
+    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], chunk.truth, chunk.truth_seen, "relative")
+    return errors.mean(-1), counted.all(-1)
+
+
+def _with_nan(estimate: PoseEstimate) -> Float[np.ndarray, "J 3"]:
+    return estimate.points[0].double().masked_fill(~estimate.estimated[0, :, None], torch.nan).numpy()
