@@ -34,7 +34,8 @@ def undistort(
     safe = torch.where(given[..., None], pixels.to(torch.float64), 0.0)
     lens = _eight(coefficients)
     seen = _normalise(safe, K)
-    limit = _largest_radius(lens)[..., None]
+    # just inside: on the limit itself the Jacobian is singular or the model has its pole
+    limit = _largest_radius(lens)[..., None] * (1 - 1e-9)
     point = _within(seen, limit)
     done = torch.zeros_like(given)
     for _ in range(_STEPS):
@@ -50,7 +51,7 @@ def undistort(
         # those that are done stay: the digits of a point must not depend on the points beside it
         point = torch.where(done[..., None], point, _within(point - step, limit))
     xx, xy, yx, yy = _lens(point, lens)[1]
-    exists = given & done & (xx * yy - xy * yx > 0) & (torch.linalg.vector_norm(point, dim=-1) < limit)
+    exists = given & done & (xx * yy - xy * yx > 0) & (torch.linalg.vector_norm(point, dim=-1) <= limit)
     return torch.where(exists[..., None], _to_pixels(point, K), safe), exists
 
 

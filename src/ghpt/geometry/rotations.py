@@ -91,7 +91,7 @@ def rotation_between(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Floa
     other = torch.nn.functional.one_hot(a.abs().argmin(-1), 3).to(a.dtype)
     other = other - (other * a).sum(-1, keepdim=True) * a
     length = torch.linalg.vector_norm(aside, dim=-1, keepdim=True)
-    sided = length > torch.finfo(a.dtype).eps
+    sided = length > 16 * torch.finfo(a.dtype).eps
     n = _directions(torch.where(sided, aside, other))
     n = _directions(n - (n * a).sum(-1, keepdim=True) * a)
     sine = torch.where(sided, length, 0.0)

@@ -1,0 +1,56 @@
+import numpy as np
+import torch
+from scenes import random_scene
+
+from ghpt.geometry.cameras import project, reprojection_error
+
+
+def test_projection_is_the_textbook_formula_one_point_at_a_time():
+    scene = random_scene(0, frames=2, views=3)
+    pixels, depth = project(scene.cameras, scene.points)
+    K, R, t, points = (x.numpy() for x in (scene.cameras.K, scene.cameras.R, scene.cameras.t, scene.points))
+    for b, v, j in np.ndindex(2, 3, 17):
+        u, w, z = K[b, v] @ (R[b, v] @ points[b, j] + t[b, v])
+        np.testing.assert_allclose(pixels[b, v, j].numpy(), [u / z, w / z], rtol=1e-12)
+        np.testing.assert_allclose(depth[b, v, j].numpy(), z, rtol=1e-12)
+
+
+def test_a_camera_s_centre_has_depth_0_in_it_and_a_pixel_that_is_no_nan():
+    scene = random_scene(1, frames=3, views=4)
+    pixels, depth = project(scene.cameras, scene.cameras.centre)
+    own = torch.eye(4, dtype=torch.bool)
+    assert depth[:, own].abs().max() < 1e-9
+    assert not pixels.isnan().any()
+
+
+def test_pixels_do_not_depend_on_the_unit_or_the_world_frame():
+    metres, millimetres = random_scene(2, scale=1e-3), random_scene(2)
+    torch.testing.assert_close(metres.key_points, millimetres.key_points, rtol=1e-12, atol=1e-9)
+    far = random_scene(2, place=1e6)
+    torch.testing.assert_close(far.key_points, millimetres.key_points, rtol=0, atol=1e-6)
+
+
+def test_reprojection_error_is_0_at_the_truth_and_the_distance_beside_it():
+    scene = random_scene(3)
+    assert reprojection_error(scene.cameras, scene.key_points, scene.points).max() < 1e-9
+    moved = scene.key_points + torch.tensor([3.0, 4.0], dtype=torch.float64)
+    error = reprojection_error(scene.cameras, moved, scene.points)
+    torch.testing.assert_close(error, torch.full_like(error, 5.0))
+
+
+def test_reprojection_error_is_inf_behind_a_camera_and_where_an_input_is_not_finite():
+    scene = random_scene(4)
+    behind = scene.cameras.centre[:, :1] * 2  # the rig looks at the origin
+    error = reprojection_error(scene.cameras, scene.key_points[:, :, :1], behind)
+    assert torch.isinf(error[:, 0]).all()
+    key_points = scene.key_points.clone()
+    key_points[0, 1, 2] = torch.nan
+    error = reprojection_error(scene.cameras, key_points, scene.points)
+    assert torch.isinf(error[0, 1, 2])
+    assert torch.isinf(error).sum() == 1
+
+
+def test_moving_and_indexing_keep_the_cameras():
+    cameras = random_scene(5, frames=3).cameras
+    assert cameras.to(torch.float32).K.dtype == torch.float32
+    torch.testing.assert_close(cameras.index(1).centre, cameras.centre[1])
