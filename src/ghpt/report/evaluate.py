@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ghpt.data.human36m import DAMAGED
 from ghpt.files import atomic_write
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.metrics.pose_prior import PARTS, PosePrior
@@ -22,9 +23,6 @@ NAMES = (
     "linear", "weighted_linear", "ransac", "m_estimator", "lo_ransac",
 )  # fmt: skip
 """The order of every table: the selections, then the baselines."""
-
-DAMAGED = frozenset({"S9/Greeting-2", "S9/SittingDown-2", "S9/Waiting-1"})
-"""Human3.6M's takes with damaged ground truth: the numbers are given with and without them."""
 
 _CHUNK = 2048
 

@@ -1,5 +1,6 @@
 """Figures of a test run, drawn without pyplot, so that nothing is shared with a user's own plots."""
 
+import textwrap
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -66,7 +67,7 @@ def skeletons(
     if poses:
         handles.append(Line2D([], [], color=TRUTH, linewidth=4, label="truth"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(heading, fontsize=10)
+    figure.suptitle(_wrapped(heading, 55 * len(shown) // 2), fontsize=10)
     return figure
 
 
@@ -84,7 +85,8 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
     axes.set_yscale("log")
     axes.set_xticks(range(len(PARTS)), [part.replace("_", " ") for part in PARTS])
     axes.set_ylabel("S²: variance of left / right length")
-    axes.set_title(f"Pose prior of {subject} (lower is better)\n{title(metrics)}", fontsize=10)
+    heading = f"Pose prior of {subject} (lower is better)\n{title(metrics)}"
+    axes.set_title(_wrapped(heading, 110), fontsize=10)
     axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -105,6 +107,11 @@ def up_axis(truth: Float[np.ndarray, "N 17 3"]) -> Float[np.ndarray, "3"]:
     trunk = np.nanmean(truth[:, THORAX] - truth[:, PELVIS], axis=0, dtype=np.float64)
     axis = int(np.abs(trunk).argmax())
     return np.sign(trunk[axis]) * np.eye(3)[axis]
+
+
+def _wrapped(text: str, width: int) -> str:
+    """Paths in a title may be long."""
+    return "\n".join(textwrap.fill(line, width) for line in text.splitlines())
 
 
 def _view(truth: Float[np.ndarray, "17 3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
