@@ -2,13 +2,13 @@ from dataclasses import replace
 
 import pytest
 import torch
-from scenes import random_scene
 
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import Status
 from ghpt.models.baselines import Linear, LoRansac, MEstimator, Ransac, WeightedLinear, person_size
 from ghpt.recording import empty_batch
+from scenes import random_scene
 
 ROBUST = {
     "ransac": Ransac(threshold=0.02, pairs=100, seed=0),

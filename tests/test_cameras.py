@@ -1,8 +1,8 @@
 import numpy as np
 import torch
-from scenes import random_scene
 
 from ghpt.geometry.cameras import project, reprojection_error
+from scenes import random_scene
 
 
 def test_projection_is_the_textbook_formula_one_point_at_a_time():

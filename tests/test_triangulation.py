@@ -3,11 +3,11 @@ from itertools import combinations
 import numpy as np
 import pytest
 import torch
-from scenes import random_scene
 
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.geometry.triangulation import Status, solve_symmetric, triangulate, triangulate_subsets
+from scenes import random_scene
 
 
 def every_subset(views, frames=1, joints=17, least=2):
