@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from ghpt.data.detections import in_image, undistorted
-from ghpt.data.validate import check_array, check_cameras, check_names, read_json, read_npy, read_npz
+from ghpt.data.detections import undistorted
+from ghpt.data.panoptic_detections import detection_files, detections, hd_name
+from ghpt.data.validate import check_array, check_cameras, check_names, read_json
 from ghpt.errors import GhptDataError, check
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
@@ -41,7 +42,6 @@ _PARTS = {name: (name,) for name in JOINT if name in COCO19} | {
 _RATE_HZ = 29.97
 _MM = 10.0
 """Millimetres in Panoptic's unit."""
-_HD_CAMERAS = 31
 _SCENES = "hdPose3d_stage1_coco19"
 _GET = "Get the file again from the Panoptic Studio tool box."
 
@@ -50,7 +50,7 @@ def panoptic_files(root: Path, numbers: Sequence[int]) -> list[Path]:
     """The files that the recordings of these HD cameras are made of. Raises GhptDataError if one is missing."""
     files = []
     for folder in _sequences(root):
-        files += [_calibration(folder), *_scenes(folder).values(), *_detection_files(folder, numbers)]
+        files += [_calibration(folder), *_scenes(folder).values(), *detection_files(folder, numbers)]
     return files
 
 
@@ -71,11 +71,11 @@ def panoptic_recordings(root: Path, numbers: Sequence[int], split: str) -> Itera
         shape = (len(frame), len(numbers), len(JOINT))
         key_points, seen = np.zeros((*shape, 2), np.float32), np.zeros(shape, np.bool_)
         confidence = np.zeros(shape, np.float32)
-        for view, detections in enumerate(_detections(folder, numbers, list(scenes))):
-            found, place = _match(frame, detections["frame"])
-            confidence[found, view] = detections["confidence"][place]
-            key_points[found, view], seen[found, view] = undistorted(
-                detections["key_points"][place], detections["seen"][place], cameras.K[view].numpy(), distortion[view]
+        for view, found in enumerate(detections(folder, numbers, list(scenes))):
+            _, here, there = np.intersect1d(frame, found["frame"], return_indices=True)
+            confidence[here, view] = found["confidence"][there]
+            key_points[here, view], seen[here, view] = undistorted(
+                found["key_points"][there], found["seen"][there], cameras.K[view].numpy(), distortion[view]
             )
         yield Recording(
             name=folder.name, subject=folder.name, action=_action(folder.name), rate_hz=_RATE_HZ,
@@ -133,8 +133,8 @@ def _cameras(folder: Path, numbers: Sequence[int]) -> tuple[tuple[str, ...], Cam
         if [entry.get("name") for entry in high].count(name) > 1:
             raise GhptDataError(path, "cameras", f"camera {name} is listed twice", _GET)
     by_name = {str(entry.get("name")): entry for entry in high}
-    names = tuple(_name(number) for number in numbers)
-    check_names(path, names, list(by_name))
+    names = tuple(hd_name(number) for number in numbers)
+    check_names(path, names, sorted(by_name))
     values = {
         field: np.stack([_numbers(path, name, by_name[name], field, shape) for name in names])
         for field, shape in {"K": (3, 3), "R": (3, 3), "t": (3, 1), "distCoef": (5,)}.items()
@@ -142,10 +142,6 @@ def _cameras(folder: Path, numbers: Sequence[int]) -> tuple[tuple[str, ...], Cam
     t = values["t"][..., 0] * _MM
     cameras, distortion = check_cameras(path, names, values["K"], values["R"], t, values["distCoef"])
     return names, cameras, distortion
-
-
-def _name(number: int) -> str:
-    return f"00_{number:02d}"
 
 
 def _numbers(path: Path, where: str, entry: dict[str, Any], field: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -183,76 +179,3 @@ def _bodies(path: Path) -> dict[int, Float[np.ndarray, "19 4"]]:
         if not (np.abs(found[number]) < 1e6).all():
             raise GhptDataError(path, f"body {number}, joints19", "is not finite, or beyond 10 km", _GET)
     return found
-
-
-def _detection_files(folder: Path, numbers: Sequence[int]) -> list[Path]:
-    """Of this sequence: one file per camera, or the authors' array with what lies beside it."""
-    files = [folder / "keypoints" / f"{_name(number)}.npz" for number in numbers]
-    if (folder / "keypoints").is_dir():
-        for file in files:
-            if not file.is_file():
-                raise GhptDataError(file, "", "there is no such file", "Each camera of the arrangement needs one.")
-        return files
-    if (folder / "all_2d_preds.npy").is_file():
-        names = ("all_2d_preds.npy", "all_bboxes.npy", "all_frames.npy", "all_cameras.json")
-        return [folder / name for name in names if (folder / name).is_file()]
-    problem = "there are neither keypoints/00_<camera>.npz nor all_2d_preds.npy"
-    raise GhptDataError(folder, "", problem, "Run a 2D detector on the HD videos and put its key points there.")
-
-
-def _detections(folder: Path, numbers: Sequence[int], frames: list[int]) -> Iterator[dict[str, np.ndarray]]:
-    """For each camera: frame [N], key_points [N 17 2] in raw pixels, confidence [N 17], seen [N 17]."""
-    files = _detection_files(folder, numbers)
-    if files[0].name == "all_2d_preds.npy":
-        yield from _authors_detections(folder, numbers, frames)
-        return
-    joints = len(JOINT)
-    fields = {"frame": ((None,), "iu"), "key_points": ((None, joints, 2), "f"),
-              "confidence": ((None, joints), "f"), "seen": ((None, joints), "b")}  # fmt: skip
-    for file in files:
-        arrays = read_npz(file, fields)
-        for field, array in arrays.items():
-            check_array(file, field, array, (len(arrays["frame"]), *fields[field][0][1:]), fields[field][1])
-        confidence = arrays["confidence"]
-        bad = arrays["seen"] & ~((confidence >= 0) & (confidence <= 1))
-        if bad.any():
-            raise GhptDataError(file, "confidence", "is not between 0 and 1", "Scale it.")
-        yield arrays
-
-
-def _authors_detections(folder: Path, numbers: Sequence[int], frames: list[int]) -> Iterator[dict[str, np.ndarray]]:
-    path = folder / "all_2d_preds.npy"
-    names = [_name(number) for number in range(_HD_CAMERAS)]
-    if (folder / "all_cameras.json").is_file():
-        names = read_json(folder / "all_cameras.json")
-        if not isinstance(names, list):
-            raise GhptDataError(folder / "all_cameras.json", "", "is not a list", 'Write ["00_03", "00_06", ...].')
-    wanted = [_name(number) for number in numbers]
-    check_names(path, wanted, names)
-    predictions = read_npy(path, (None, len(names), len(JOINT), 2), "f")
-    if (folder / "all_frames.npy").is_file():
-        frame = read_npy(folder / "all_frames.npy", (len(predictions),), "iu")
-    elif len(predictions) == len(frames):
-        frame = np.array(frames)
-    else:
-        problem = f"has {len(predictions)} frames, and there are {len(frames)} body3DScene files"
-        raise GhptDataError(path, "", problem, "Put the frame numbers beside it, as all_frames.npy.")
-    boxes = None
-    if (folder / "all_bboxes.npy").is_file():
-        boxes = read_npy(folder / "all_bboxes.npy", (len(predictions), len(names), 2, 2), "fiu")
-    for name in wanted:
-        view = slice(names.index(name), names.index(name) + 1)
-        pixels = predictions[:, view].astype(np.float64)
-        there = np.ones(pixels.shape[:-1], np.bool_)
-        if boxes is not None:
-            pixels, there = in_image(pixels, boxes[:, view].astype(np.float64))
-        yield {"frame": frame, "key_points": pixels[:, 0], "seen": there[:, 0],
-               "confidence": np.ones(there.shape[::2], np.float32)}  # fmt: skip
-
-
-def _match(
-    frame: Int[np.ndarray, " T"], detected: Int[np.ndarray, " N"]
-) -> tuple[Int[np.ndarray, " M"], Int[np.ndarray, " M"]]:
-    """Places in ``frame`` and in ``detected`` of the frame numbers that are in both."""
-    _, here, there = np.intersect1d(frame, detected, return_indices=True)
-    return here, there
