@@ -60,7 +60,7 @@ CAPSULES = tuple(
         ("right_shoulder", "right_elbow", 0.027), ("left_shoulder", "left_elbow", 0.027),
         ("right_elbow", "right_wrist", 0.021), ("left_elbow", "left_wrist", 0.021),
         ("right_hip", "right_shoulder", 0.055), ("left_hip", "left_shoulder", 0.055),
-        ("pelvis", "thorax", 0.062), ("nose", "head_top", 0.050),
+        ("pelvis", "thorax", 0.062), ("thorax", "head_top", 0.048),
     )
 )  # fmt: skip
 """The volume of the body: segments between two joints, with their radius in statures."""

@@ -50,9 +50,7 @@ def human36m_rig(subject: str) -> Rig:
     names = tuple(table["intrinsics"])
     if f"{subject}/{names[0]}" not in table["extrinsics"]:
         known = sorted({key.split("/")[0] for key in table["extrinsics"]}, key=lambda name: int(name[1:]))
-        raise GhptDataError(
-            "Human3.6M", "subject", f"no subject {subject!r}", f"There are {', '.join(known)}."
-        )
+        raise GhptDataError("Human3.6M", "subject", f"no subject {subject!r}", f"There are {', '.join(known)}.")
     return _rig(
         names,
         [table["intrinsics"][name] | table["extrinsics"][f"{subject}/{name}"] for name in names],
@@ -73,9 +71,7 @@ def panoptic_rig(numbers: Sequence[int]) -> Rig:
         )
     twice = [number for number, count in Counter(numbers).items() if count > 1]
     if twice:
-        raise GhptDataError(
-            "Panoptic", "cameras", f"camera {twice[0]} is listed twice", "List each camera once."
-        )
+        raise GhptDataError("Panoptic", "cameras", f"camera {twice[0]} is listed twice", "List each camera once.")
     if len(numbers) < 2:
         raise GhptDataError(
             "Panoptic",
@@ -83,9 +79,7 @@ def panoptic_rig(numbers: Sequence[int]) -> Rig:
             f"{len(numbers)} listed: {list(numbers)}",
             "Triangulation needs at least two.",
         )
-    return _rig(
-        tuple(f"00_{number:02d}" for number in numbers), [table[str(n)] for n in numbers], mm_per_unit=10.0
-    )
+    return _rig(tuple(f"00_{number:02d}" for number in numbers), [table[str(n)] for n in numbers], mm_per_unit=10.0)
 
 
 @cache

@@ -1,0 +1,195 @@
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from ghpt.data import lens
+from ghpt.data.body import random_body
+from ghpt.data.detector import KINDS, Detector, generator, occlusion, process, stature, trunk_frame
+from ghpt.data.motion import move
+from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.geometry.cameras import project
+from ghpt.skeleton import JOINT, JOINTS, MIRROR
+
+CONF = Path(__file__).parents[1] / "conf" / "detector"
+RIG = human36m_rig("S9")
+PERFECT = {
+    "noise": 1e-9, "noise_seconds": 0.2, "noise_white": 0.5, "joints": dict.fromkeys(KINDS, 1.0),
+    "bias": 0.0, "bias_seed": 0, "bias_of_subject": 0.3, "drift": 0.0, "drift_seconds": 1.0,
+    "occluded_noise": 1.0, "outlier_rate": 0.0, "outlier_rate_occluded": 0.0, "outlier_size": 0.03,
+    "outlier_seconds": 0.5, "swap_rate": 0.0, "swap_seconds": 0.4, "miss_rate": 0.0, "miss_rate_occluded": 0.0,
+    "miss_seconds": 0.3, "confidence_typical": 1.0, "confidence_slope": 0.5, "confidence_knowledge": 0.5,
+    "familiar": 0.5,
+}  # fmt: skip
+
+
+def take(action: str = "Greeting", frames: int = 600) -> np.ndarray:
+    rng = np.random.default_rng(11)
+    return move(random_body(rng), action, frames, 50.0, rng)
+
+
+def detect(points: np.ndarray, rig: Rig = RIG, seed: int = 0, familiar: bool = False, **numbers):
+    return Detector(**PERFECT | numbers)(points, rig, 50.0, seed, "S9", "S9/Greeting-1", familiar)
+
+
+def residual(points: np.ndarray, found) -> np.ndarray:
+    """Pixel error relative to the person's size in the image, T V J 2; NaN where not seen."""
+    ideal, depth = project(RIG.cameras, torch.from_numpy(points))
+    size = 1145.0 * stature(points) / depth[:, :, JOINT["pelvis"], None, None].numpy()
+    return np.where(found.seen[..., None], (found.key_points - ideal.numpy()) / size, np.nan)
+
+
+def test_a_perfect_detector_sees_the_ideal_projection():
+    points = take()
+    found = detect(points)
+    ideal, _ = project(RIG.cameras, torch.from_numpy(points))
+    raw = lens.distort(ideal.transpose(0, 1).flatten(1, 2), RIG.cameras.K, RIG.distortion)
+    raw = raw.unflatten(1, (len(points), len(JOINTS))).transpose(0, 1)
+    inside = ((raw >= 0) & (raw <= RIG.size[:, None] - 1)).all(dim=-1).numpy()
+    assert found.seen[inside].all()
+    np.testing.assert_allclose(found.key_points[found.seen], ideal.numpy()[found.seen], atol=0.02)
+
+
+def test_what_is_outside_the_image_is_missed():
+    found = detect(take() + np.array([0.0, 0.0, 2500.0]))
+    assert not found.seen[:, :, JOINT["head_top"]].any()
+    assert (found.key_points[~found.seen] == 0).all()
+    assert (found.confidence[~found.seen] == 0).all()
+    assert not detect(take() + np.array([0.0, 0.0, 30_000.0])).seen.any()
+
+
+def test_noise_has_the_size_asked_for_in_statures():
+    points = take()
+    kinds = dict.fromkeys(KINDS, 1.0) | {"wrist": 2.0}
+    error = residual(points, detect(points, noise=0.005, joints=kinds))
+    for joint, scale in (("nose", 1.0), ("left_wrist", 2.0)):
+        assert np.nanstd(error[:, :, JOINT[joint]]) == pytest.approx(0.005 * scale, rel=0.2)
+    assert np.abs(np.nanmean(error)) < 5e-4
+
+
+def test_familiar_people_are_found_better():
+    points = take()
+    error = [
+        np.nanmean(np.linalg.norm(residual(points, detect(points, noise=0.005, bias=0.01, familiar=f)), axis=-1))
+        for f in (False, True)
+    ]
+    assert error[1] == pytest.approx(0.5 * error[0], rel=0.02)
+
+
+def test_bias_turns_with_the_body_and_is_the_same_in_all_views():
+    points = take("Walking")
+    detector = Detector(**PERFECT | {"bias": 0.01})
+    error = detector.body_error(len(points), 50.0, 0, "S9", "take")
+    offset = detector.shown(points, error, False) - points
+    in_trunk = (trunk_frame(points).mT @ offset[:, JOINT["spine"], :, None])[..., 0]
+    np.testing.assert_allclose(in_trunk, np.broadcast_to(in_trunk[0], in_trunk.shape), atol=1e-6)
+    limb = points[:, JOINT["left_wrist"]] - points[:, JOINT["left_elbow"]]
+    assert np.ptp((offset[:, JOINT["left_wrist"]] * limb).sum(axis=-1) / np.linalg.norm(limb, axis=-1)) < 40
+    seen = residual(points, detect(points, bias=0.01))
+    expected, _ = project(RIG.cameras, torch.from_numpy(detector.shown(
+        points, detector.body_error(len(points), 50.0, 0, "S9", "S9/Greeting-1"), False)))  # fmt: skip
+    ideal, depth = project(RIG.cameras, torch.from_numpy(points))
+    size = 1145.0 * stature(points) / depth[:, :, JOINT["pelvis"], None, None]
+    difference = seen - ((expected - ideal) / size).numpy()
+    assert np.nanmax(np.abs(difference)) < 1e-4
+
+
+def test_the_definition_is_mirrored_between_the_sides():
+    detector = Detector(**PERFECT | {"bias": 0.01, "bias_of_subject": 0.0})
+    bias, _ = detector.body_error(10, 50.0, 0, "S9", "take")
+    np.testing.assert_allclose(bias[list(MIRROR)], bias * [1, 1, -1, 1], atol=1e-12)
+    np.testing.assert_array_equal(bias, detector.body_error(10, 50.0, 5, "S1", "other")[0])
+
+
+def facing_joints(yaw: float) -> np.ndarray:
+    """A standing person in camera coordinates, 4 m away; yaw 0 faces the camera."""
+    standing = move(random_body(np.random.default_rng(0)), "Waiting", 2, 50.0, np.random.default_rng(1))
+    standing = (standing - standing[:, [JOINT["pelvis"]]])[:1]
+    local = (trunk_frame(standing).mT @ standing.mT).mT
+    c, s = np.cos(yaw), np.sin(yaw)
+    x, y, z = np.moveaxis(local, -1, 0)
+    return np.stack([c * y - s * x, -z, 4000.0 - (c * x + s * y)], axis=-1).astype(np.float32)
+
+
+def test_the_body_hides_the_nose_from_behind_and_the_far_side_from_the_side():
+    front, side, back = (occlusion(facing_joints(yaw), 1730.0)[0] for yaw in (0.0, np.pi / 2, np.pi))
+    assert front[JOINT["nose"]] == 0
+    assert front.mean() < 0.3
+    near, far = ("right", "left") if facing_joints(np.pi / 2)[0, JOINT["left_hip"], 2] > 4000 else ("left", "right")
+    assert side[JOINT[f"{far}_hip"]] + side[JOINT[f"{far}_shoulder"]] > side[JOINT[f"{near}_hip"]]
+    assert side[JOINT[f"{near}_shoulder"]] == 0
+    assert back[JOINT["nose"]] > 0.3
+    for hidden in (front, side, back):
+        assert ((hidden >= 0) & (hidden <= 1)).all()
+
+
+def test_outliers_are_as_frequent_and_large_as_asked_for_and_last():
+    points = take(frames=4000)
+    found = detect(points, outlier_rate=0.05, outlier_rate_occluded=0.05, outlier_size=0.05)
+    length = np.linalg.norm(residual(points, found), axis=-1)
+    out = length > 1e-4
+    assert np.mean(out) == pytest.approx(0.05, rel=0.2)
+    assert length[out].mean() == pytest.approx(0.05, rel=0.25)
+    assert np.mean(out[1:][out[:-1]]) > 0.8
+    assert np.nanmax(np.abs(np.diff(length, axis=0))) < 0.2
+
+
+def test_swaps_exchange_the_sides_of_legs_or_arms():
+    points = take(frames=3000)
+    found = detect(points, swap_rate=0.05)
+    ideal = project(RIG.cameras, torch.from_numpy(points))[0].numpy()
+    wrong = np.linalg.norm(found.key_points - ideal, axis=-1) > 0.5
+    legs = [JOINT[f"{side}_{part}"] for side in ("right", "left") for part in ("hip", "knee", "ankle")]
+    mirrored = np.linalg.norm(found.key_points - ideal[:, :, list(MIRROR)], axis=-1) < 0.5
+    swapped = wrong[..., legs].any(axis=-1) & found.seen[..., legs].all(axis=-1)
+    assert 0.005 < swapped.mean() < 0.15
+    assert mirrored[swapped][:, legs].all()
+    assert not wrong[..., JOINT["nose"]][found.seen[..., JOINT["nose"]]].any()
+
+
+def test_confidence_knows_something_of_the_error_and_not_everything():
+    points = take(frames=2000)
+    from scipy.stats import spearmanr
+
+    correlation = []
+    for knowledge in (0.3, 0.9):
+        found = detect(points, noise=0.005, confidence_knowledge=knowledge)
+        error = np.linalg.norm(residual(points, found), axis=-1)[found.seen]
+        assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
+        correlation.append(-spearmanr(error, found.confidence[found.seen]).statistic)
+    assert 0.15 < correlation[0] < 0.45
+    assert 0.75 < correlation[1] < 0.97
+
+
+def test_a_view_does_not_depend_on_the_other_views():
+    points = take(frames=100)
+    numbers = {"noise": 0.005, "outlier_rate": 0.1, "swap_rate": 0.01, "miss_rate": 0.05, "bias": 0.01, "drift": 0.01}
+    every = detect(points, **numbers)
+    two = Rig(RIG.names[2:0:-1], RIG.cameras.index([2, 1]), RIG.distortion[[2, 1]], RIG.size[[2, 1]])
+    some = detect(points, rig=two, **numbers)
+    np.testing.assert_array_equal(some.key_points, every.key_points[:, [2, 1]])
+    np.testing.assert_array_equal(some.confidence, every.confidence[:, [2, 1]])
+    assert (detect(points, seed=1, **numbers).key_points != every.key_points).any()
+
+
+@pytest.mark.parametrize("persistence", [0.5, 5.0, 40.0])
+def test_processes_are_stationary_unit_gaussians(persistence):
+    values = process(generator(0, "test"), (3000,), 100, persistence)
+    np.testing.assert_allclose(values.std(axis=1), 1.0, atol=0.06)
+    np.testing.assert_allclose(values.mean(axis=1), 0.0, atol=0.08)
+    lag = max(round(6 * persistence), 1)
+    if lag < 90:
+        assert abs(np.corrcoef(values[0], values[lag])[0, 1]) < 0.1
+
+
+@pytest.mark.parametrize("name", ["human36m", "panoptic"])
+def test_the_fitted_numbers_make_a_detector(name):
+    detector = Detector(**yaml.safe_load((CONF / f"{name}.yaml").read_text()))
+    found = detector(take(), RIG, 50.0, 0, "S9", "S9/Greeting-1")
+    assert 0.9 < found.seen.mean() <= 1.0
+    assert np.isfinite(found.key_points).all()
+    assert 0.4 < found.confidence[found.seen].mean() < 0.95
+    assert replace(detector, bias=0.0) != detector
