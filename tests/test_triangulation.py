@@ -5,8 +5,9 @@ import pytest
 import torch
 
 from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.normal_equations import solve_symmetric
 from ghpt.geometry.rotations import vector_to_matrix
-from ghpt.geometry.triangulation import Status, solve_symmetric, triangulate, triangulate_subsets
+from ghpt.geometry.triangulation import Status, triangulate, triangulate_subsets
 from scenes import random_scene
 
 

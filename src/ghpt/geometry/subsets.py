@@ -10,9 +10,7 @@ _WORD = 62
 """Views that one random word decides on: ranks of subsets stay within int64."""
 
 
-def random_subsets(
-    seen: Bool[Tensor, "B V J"], count: int, keys: Int[Tensor, " B"]
-) -> Bool[Tensor, "B H J V"]:
+def random_subsets(seen: Bool[Tensor, "B V J"], count: int, keys: Int[Tensor, " B"]) -> Bool[Tensor, "B H J V"]:
     """For each hypothesis and joint a subset of the seen views, uniform over all those of two views or more.
 
     ``count`` is H. A frame's subsets depend on its key and its own ``seen`` alone. A joint seen in fewer than

@@ -1,9 +1,7 @@
-"""Linear triangulation by normal equations: batched, unit-invariant, and never spoilt by one bad joint.
+"""Linear triangulation: batched, unit-invariant, and never spoilt by one bad joint.
 
-A view that sees the joint at pixel (u, v) gives two rows, ``a = (u - c_x) r_3 - f_x r_1 - s r_2`` and
-``b = (v - c_y) r_3 - f_y r_2`` (r_i the rows of R), whose residuals are depth x pixel error. The views' 3x3
-normal equations ``a a^T + b b^T`` are free of the unit of length, so the conditioning is too, and they only
-have to be summed over the views of a subset: a matrix product, whatever the number of subsets.
+The views' normal equations only have to be summed over the views of a subset, which is a matrix product, whatever
+the number of subsets; then each joint is a 3x3 solve.
 """
 
 from __future__ import annotations
@@ -16,14 +14,15 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
-from ghpt.geometry.rotations import is_rotation
+from ghpt.geometry.normal_equations import (
+    local_cameras,
+    minors,
+    solve_symmetric,
+    usable_views,
+    view_equations,
+    view_rows,
+)
 
-LARGEST = 1e12
-"""A pixel or millimetre beyond this is no measurement; its square would spoil float64's precision or
-range."""
-LARGEST_CONDITION = 1e13
-"""Of tr(M) tr(M^-1). Two equal cameras reach it at rays 1e-6 rad apart; rounding alone gives 1e15 and
-more."""
 NO_DEPTH = 1e-9
 """A depth below this fraction of |t| is rounding: the rays met in the camera's own centre."""
 
@@ -48,8 +47,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Points and what is known of them; every field is finite but ``cond``, which is inf for no unique
-    point."""
+    """Points and what is known of them; every field is finite but ``cond``, which is inf for no unique point."""
 
     points: Float[Tensor, "*B J 3"]
     """World frame, mm, float64; 0 where not ``ok``."""
@@ -67,100 +65,6 @@ class Triangulation:
         return self.status == Status.OK
 
 
-def valid_cameras(cameras: Cameras) -> Bool[Tensor, "*B V"]:
-    """Which cameras are cameras: finite and not absurd, R a rotation within 1e-3, positive focal lengths,
-    last row of K (0, 0, 1)."""
-    K, R, t = cameras.K, cameras.R, cameras.t
-    values = torch.cat((K.flatten(-2), R.flatten(-2), t), dim=-1)
-    focal = torch.stack((K[..., 0, 0], K[..., 1, 1]), dim=-1)
-    last_row = K[..., 2, :] - K.new_tensor([0.0, 0.0, 1.0])
-    return (
-        (values.abs() <= LARGEST).all(-1)
-        & (focal >= 1 / LARGEST).all(-1)
-        & (last_row.abs() <= 1e-6).all(-1)
-        & is_rotation(R, 1e-3)
-    )
-
-
-def usable_views(cameras: Cameras, key_points: Float[Tensor, "*B V J 2"]) -> Bool[Tensor, "*B V J"]:
-    """Which key points can be triangulated from: finite, not absurd, and of a valid camera."""
-    return (key_points.abs() <= LARGEST).all(-1) & valid_cameras(cameras)[..., None]
-
-
-def _local(cameras: Cameras) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
-    """Float64 cameras in a world whose origin is the rig's (component-wise median) centre, and that origin.
-
-    Far from the world's origin the squares of coordinates would cost digits, and a median is not moved by one
-    camera with absurd numbers. Invalid cameras are replaced by one at the origin.
-    """
-    valid = valid_cameras(cameras)
-    K, R, t = (x.to(torch.float64) for x in (cameras.K, cameras.R, cameras.t))
-    identity = torch.eye(3, dtype=torch.float64, device=K.device)
-    K = torch.where(valid[..., None, None], K, identity)
-    R = torch.where(valid[..., None, None], R, identity)
-    t = torch.where(valid[..., None], t, 0.0)
-    centre = torch.where(valid[..., None], Cameras(K, R, t).centre, torch.nan)
-    origin = centre.nanmedian(dim=-2).values.nan_to_num(0.0)
-    return Cameras(K, R, t + (R @ origin[..., None, :, None])[..., 0]), origin
-
-
-def _rows(
-    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"]
-) -> tuple[Float[Tensor, "*B V J 2 3"], Float[Tensor, "*B V J 2"]]:
-    """The two rows of each view and joint and their right-hand sides; residuals are depth x pixel error."""
-    K, R, t = cameras.K, cameras.R, cameras.t
-    offset = key_points - K[..., None, :2, 2]
-    rows = offset[..., None] * R[..., None, 2:, :] - (K[..., :2, :2] @ R[..., :2, :])[..., None, :, :]
-    right = (K[..., :2, :2] @ t[..., :2, None])[..., None, :, 0] - offset * t[..., None, 2:]
-    return rows, right
-
-
-def _normal(
-    rows: Float[Tensor, "*B 2 3"], right: Float[Tensor, "*B 2"]
-) -> tuple[Float[Tensor, "*B 6"], Float[Tensor, "*B 3"]]:
-    x, y, z = rows.unbind(-1)
-    matrix = torch.stack((x * x, x * y, x * z, y * y, y * z, z * z), dim=-1).sum(-2)
-    return matrix, (rows * right[..., None]).sum(-2)
-
-
-def view_equations(
-    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"], usable: Bool[Tensor, "*B V J"]
-) -> Float[Tensor, "*B V J 9"]:
-    """Normal equations of each view alone, float64: the matrix (xx xy xz yy yz zz) and its right-hand side
-    (3); all 0 where the view is not usable. ``cameras`` are used as they are: pass valid ones near the
-    origin."""
-    safe = torch.where(usable[..., None], key_points.to(torch.float64), 0.0)
-    matrix, right = _normal(*_rows(cameras, safe))
-    return torch.where(usable[..., None], torch.cat((matrix, right), dim=-1), 0.0)
-
-
-def _minors(m: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Cofactors (xx xy xz yy yz zz) of symmetric 3x3 matrices."""
-    xx, xy, xz, yy, yz, zz = m
-    return (
-        yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
-        xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy,
-    )  # fmt: skip
-
-
-def solve_symmetric(equations: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Solve batched symmetric 3x3 systems by cofactors.
-
-    ``equations``: nine equal shapes, the matrix (xx xy xz yy yz zz) and the right-hand side (x y z). Returns
-    x, y, z and tr(M) tr(M^-1); where that exceeds ``LARGEST_CONDITION`` it is inf and the solution 0.
-    """
-    matrix, (p, q, r) = equations[:6], equations[6:]
-    cxx, cxy, cxz, cyy, cyz, czz = _minors(matrix)
-    determinant = matrix[0] * cxx + matrix[1] * cxy + matrix[2] * cxz
-    numerator = (matrix[0] + matrix[3] + matrix[5]) * (cxx + cyy + czz)
-    good = numerator < LARGEST_CONDITION * determinant
-    safe = torch.where(good, determinant, 1.0)
-    x = torch.where(good, (cxx * p + cxy * q + cxz * r) / safe, 0.0)
-    y = torch.where(good, (cxy * p + cyy * q + cyz * r) / safe, 0.0)
-    z = torch.where(good, (cxz * p + cyz * q + czz * r) / safe, 0.0)
-    return x, y, z, torch.where(good, numerator / safe, torch.inf)
-
-
 def _ray_angle(cameras: Cameras, key_points: Tensor, used: Bool[Tensor, "*B V J"]) -> Float[Tensor, "*B J"]:
     """``Triangulation.angle``: the sum of |d_i x d_j|^2 over pairs is the sum of the principal minors of
     the sum of d d^T (Cauchy-Binet)."""
@@ -168,17 +72,16 @@ def _ray_angle(cameras: Cameras, key_points: Tensor, used: Bool[Tensor, "*B V J"
     rays = rays @ (torch.linalg.inv_ex(cameras.K).inverse.mT @ cameras.R)
     rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
     x, y, z = torch.where(used[..., None], rays, 0.0).unbind(-1)
-    minors = _minors(tuple(product.sum(-2) for product in (x * x, x * y, x * z, y * y, y * z, z * z)))
+    areas = minors(tuple(product.sum(-2) for product in (x * x, x * y, x * z, y * y, y * z, z * z)))
     count = used.sum(-2)
     pairs = (count * (count - 1) / 2).clamp(min=1)
-    return ((minors[0] + minors[3] + minors[5]) / pairs).clamp(0, 1).sqrt().asin()
+    return ((areas[0] + areas[3] + areas[5]) / pairs).clamp(0, 1).sqrt().asin()
 
 
 def _one_centre(
     cameras: Cameras, distance: Float[Tensor, "*B V"], used: Bool[Tensor, "*B V J"]
 ) -> Bool[Tensor, "*B J"]:
-    """Whether the used cameras have one and the same centre, within the rounding of their world's
-    distances."""
+    """Whether the used cameras have one and the same centre, within the rounding of their world's distances."""
     centre = cameras.centre[..., None, :]
     spread = torch.where(used[..., None], centre, -torch.inf).amax(-3)
     spread = spread - torch.where(used[..., None], centre, torch.inf).amin(-3)
@@ -196,20 +99,16 @@ def triangulate(
     chosen = ~(weights <= 0)
     used = chosen & usable_views(cameras, key_points) & (weights < torch.inf)
     spoilt = (chosen & ~used).any(-2)
-    local, origin = _local(cameras)
+    local, origin = local_cameras(cameras)
     safe = torch.where(used[..., None], key_points.to(torch.float64), 0.0)
     weight = torch.where(used, weights.to(torch.float64), 0.0)
     largest = weight.amax(dim=-2, keepdim=True)
     weight = weight / torch.where(largest > 0, largest, 1.0)
 
-    rows, right = _rows(local, safe)
+    rows, right = view_rows(local, safe)
     scaled = rows * weight[..., None, None]
-    matrix = torch.stack(
-        [(scaled[..., i] * rows[..., j]).sum((-3, -1)) for i in range(3) for j in range(i, 3)]
-    )
-    solution = torch.zeros(
-        (*weight.shape[:-2], weight.shape[-1], 3), dtype=torch.float64, device=weight.device
-    )
+    matrix = torch.stack([(scaled[..., i] * rows[..., j]).sum((-3, -1)) for i in range(3) for j in range(i, 3)])
+    solution = torch.zeros((*weight.shape[:-2], weight.shape[-1], 3), dtype=torch.float64, device=weight.device)
     for _ in range(2):  # once more from the residuals of the rows: the digits that squaring has cost
         residual = right - (rows * solution[..., None, :, None, :]).sum(-1)
         toward = (scaled * residual[..., None]).sum((-4, -2))
@@ -252,18 +151,18 @@ def triangulate_subsets(
     """
     views, hypotheses = subsets.shape[-1], subsets.shape[1]
     usable = seen & usable_views(cameras, key_points)
-    local, origin = _local(cameras)
+    local, origin = local_cameras(cameras)
     equations = view_equations(local, key_points, usable).transpose(1, 2)
     floor = NO_DEPTH * torch.linalg.vector_norm(cameras.t.to(torch.float64), dim=-1).nan_to_num(0.0)
-    view_rows = torch.cat((local.R[..., 2, :], (local.t[..., 2] - floor)[..., None]), dim=-1)
+    depth_rows = torch.cat((local.R[..., 2, :], (local.t[..., 2] - floor)[..., None]), dim=-1)
     usable = usable.transpose(1, 2)
     if 2**views > hypotheses:
-        points, ok = _solve_subsets(equations, view_rows, usable, subsets.permute(0, 2, 1, 3))
+        points, ok = _solve_subsets(equations, depth_rows, usable, subsets.permute(0, 2, 1, 3))
         points, ok = points.permute(0, 3, 1, 2), ok.transpose(1, 2)
     else:
         bit = 1 << torch.arange(views, device=subsets.device)
         every = (torch.arange(2**views, device=subsets.device)[:, None] & bit) != 0
-        points, ok = _solve_subsets(equations, view_rows, usable, every.expand(*usable.shape[:2], -1, -1))
+        points, ok = _solve_subsets(equations, depth_rows, usable, every.expand(*usable.shape[:2], -1, -1))
         code = (subsets * bit).sum(-1)
         ok = ok.transpose(1, 2).gather(1, code)
         points = points.permute(0, 3, 1, 2).gather(1, code[..., None].expand(-1, -1, -1, 3))

@@ -19,7 +19,8 @@ from torch import Tensor
 
 from ghpt.errors import check
 from ghpt.geometry.cameras import Cameras, project, reprojection_error
-from ghpt.geometry.triangulation import Status, Triangulation, triangulate, triangulate_subsets, usable_views
+from ghpt.geometry.normal_equations import usable_views
+from ghpt.geometry.triangulation import Status, Triangulation, triangulate, triangulate_subsets
 from ghpt.randomness import key, uniform
 from ghpt.recording import KeyPointBatch, PoseEstimate
 
