@@ -10,6 +10,7 @@ import pytest
 import real_layout as layout
 from ghpt.data.panoptic import COCO19, joints17, panoptic_files, panoptic_recordings
 from ghpt.data.rigs import panoptic_rig
+from ghpt.data.store import write_store
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINT, JOINTS
@@ -293,6 +294,15 @@ def test_bad_cameras_are_named(root: Path, numbers: tuple[int, ...], message: st
         read(root, "train", numbers)
     with pytest.raises(GhptDataError, match=message):
         panoptic_files(root, numbers)
+
+
+def test_empty_split_is_named(tmp_path: Path, poses: np.ndarray) -> None:
+    rig = panoptic_rig((3, 6))
+    layout.write_panoptic_layout(tmp_path, NAME, layout.panoptic_calibration(rig), rig, [0], poses[:1], layout.perfect)
+    with pytest.raises(GhptDataError, match="here: train: there are no frames"):
+        recordings = panoptic_recordings(tmp_path, (3, 6), "train")
+        write_store(tmp_path / "store", recordings, {"source": "here", "split": "train"})
+    assert len(read(tmp_path, "test", (3, 6))) == 1
 
 
 def test_bad_split(root: Path) -> None:

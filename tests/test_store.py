@@ -45,9 +45,7 @@ def assert_same(a: Recording, b: Recording) -> None:
             assert x == y
 
 
-def test_round_trip_is_exact_with_takes_longer_than_a_chunk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_round_trip_is_exact_with_takes_longer_than_a_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(store, "_CHUNK", 4)
     takes = [recording(0), recording(1, frames=1), recording(2, frames=13)]
     store.write_store(tmp_path / "s", iter(takes), {"source": "test", 3: [1, 2]})
@@ -121,18 +119,41 @@ def test_a_killed_preparation_is_swept_and_made_anew(tmp_path: Path) -> None:
     assert len(list(root.iterdir())) == 1
 
 
-def test_another_process_that_finished_first_is_no_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    write = store.write_store
+def _prepare(root: Path, start, results) -> None:
+    start.wait()
+    takes = store.prepared(root, {"name": "x"}, lambda: [recording(0, frames=3000)], {})
+    results.put(int(takes[0].frame.sum()))
 
-    def lose_the_race(folder: Path, *args: object) -> None:
-        write(folder, *args)
-        raise OSError("not empty")
 
-    monkeypatch.setattr(store, "write_store", lose_the_race)
-    (take,) = store.prepared(tmp_path, {"name": "x"}, lambda: [recording(0)], {})
+def test_processes_that_prepare_the_same_at_once(tmp_path: Path) -> None:
+    fork = multiprocessing.get_context("fork")
+    start, results = fork.Event(), fork.Queue()
+    children = [fork.Process(target=_prepare, args=(tmp_path, start, results)) for _ in range(4)]
+    for child in children:
+        child.start()
+    start.set()
+    assert [results.get(timeout=60) for _ in children] == [int(recording(0, frames=3000).frame.sum())] * 4
+    for child in children:
+        child.join()
+    assert len(list(tmp_path.iterdir())) == 1
+
+
+def test_a_folder_that_another_process_made_meanwhile_stays(tmp_path: Path) -> None:
+    """Its readers have it mapped; ours goes away."""
+    seen = []
+
+    def make() -> list[Recording]:
+        if not seen:
+            seen.append(store.prepared(tmp_path, {"name": "x"}, make_other, {})[0])
+        return [recording(1)]
+
+    def make_other() -> list[Recording]:
+        return [recording(0)]
+
+    (take,) = store.prepared(tmp_path, {"name": "x"}, make, {})
     assert_same(take, recording(0))
+    assert_same(seen[0], recording(0))
+    assert len(list(tmp_path.iterdir())) == 1
 
 
 @pytest.mark.parametrize("name", [*(f"{f}.bin" for f in store.FIELDS), "manifest.json"])

@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shutil
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 import torch
 
 from ghpt.errors import GhptDataError
-from ghpt.files import atomic_folder, sweep_temporaries
+from ghpt.files import _temporary, atomic_folder, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINTS
@@ -35,6 +36,8 @@ FIELDS: dict[str, tuple[str, tuple[str | int, ...], str]] = {
 
 _CHUNK = 4096
 """Frames that are in memory at once while a store is written."""
+_READERS = 1
+"""To be raised when the real sources make something else of the same files."""
 _MEND = "Delete this folder; it will be prepared anew"
 
 
@@ -60,17 +63,18 @@ def prepared(
     folder = root / f"{key['name']}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     if not folder.exists():
         sweep_temporaries(root)
+        own = _temporary(folder)
+        write_store(own, make(), provenance | {"key": key})
         try:
-            write_store(folder, make(), provenance | {"key": key})
-        except OSError:
-            if not folder.exists():  # else another process has finished it meanwhile
-                raise
+            own.rename(folder)
+        except OSError:  # another process has finished it meanwhile; others may be reading that one
+            shutil.rmtree(own, ignore_errors=True)
     return open_store(folder)
 
 
 def file_stamps(files: Iterable[Path], root: Path) -> str:
     """A digest of source files' names, sizes and times of change: the part of a key that notices a change."""
-    digest = hashlib.sha256()
+    digest = hashlib.sha256(f"readers {_READERS}".encode())
     for file in sorted(files):
         status = file.stat()
         digest.update(f"{file.relative_to(root)}\0{status.st_size}\0{status.st_mtime_ns}\n".encode())
@@ -98,7 +102,8 @@ def write_store(folder: str | Path, recordings: Iterable[Recording], provenance:
                 handle.close()
         frames = sum(e["length"] for e in entries)
         if frames == 0:
-            raise GhptDataError(folder, "", "there are no frames to prepare", "Check the split and the data's files")
+            where, split = provenance.get("source", folder), provenance.get("split", "")
+            raise GhptDataError(where, split, "there are no frames to prepare", "Check the split and the files.")
         views = len(entries[0]["camera_names"])
         files = {
             field: {"dtype": dtype, "shape": _shape(field, frames, views), "unit": unit,
