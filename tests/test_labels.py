@@ -117,7 +117,18 @@ def forged_dtype(*state: object) -> Fake:
     return Fake(np.dtype, ("V8", False, True), state)
 
 
+def laughs(levels: int, width: int) -> Fake:
+    """A dtype of dtypes of dtypes ..., which is small in the file and huge when built."""
+    inner: object = np.dtype("u1")
+    for _ in range(levels):
+        names = tuple(f"a{n}" for n in range(width))
+        inner = forged_dtype(3, "|", None, names, dict.fromkeys(names, (inner, 0)), 8, 1, 0)
+    return forged(inner, (1,), b"1" * 8)
+
+
 FORGED = {
+    "a million laughs": laughs(5, 500),
+    "nested dtypes": laughs(50, 1),
     "1e9 elements": forged(np.dtype("f4"), (10**9,), b"1234"),
     "1e12-byte element": forged(
         forged_dtype(3, "|", None, ("a",), {"a": (np.dtype("f4"), 0)}, 10**12, 1, 0), (1,), b"1"

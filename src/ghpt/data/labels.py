@@ -26,6 +26,7 @@ LABELS_FILE = "human36m-multiview-labels-GTbboxes.npy"
 _MEND = "Get the file again, or prepare it anew with karfly/learnable-triangulation-pytorch."
 _MAX_OPCODES = 10_000
 """The real file needs a few hundred; its bulk is in arrays."""
+_MAX_FIELDS = 32
 _MAX_ITEM = 1 << 16
 """Bytes of one array element (a row of the table has 240)."""
 
@@ -88,8 +89,8 @@ class _Dtype:
     def build(self, depth: int = 0) -> np.dtype:
         """Raises ValueError, TypeError or KeyError if it makes no sense."""
         _, order, base, names, fields, size, *_ = self.state
-        if depth > 4:
-            raise ValueError("a dtype is nested too deep")
+        if depth > 3 or len(names or ()) > _MAX_FIELDS:
+            raise ValueError("a dtype is nested too deep, or has too many fields")
         if base is not None:
             built = np.dtype((base[0].build(depth + 1), base[1]))
         elif names is not None:
