@@ -127,7 +127,7 @@ def laughs(levels: int, width: int) -> Fake:
 
 
 FORGED = {
-    "a million laughs": laughs(5, 500),
+    "a million laughs": laughs(4, 100),
     "nested dtypes": laughs(50, 1),
     "1e9 elements": forged(np.dtype("f4"), (10**9,), b"1234"),
     "1e12-byte element": forged(
@@ -188,14 +188,14 @@ def test_every_changed_byte_gives_labels_or_the_named_error(tmp_path: Path) -> N
     data = (tmp_path / "l.npy").read_bytes()
     rng = np.random.default_rng(1)
     refused = 0
-    for place in range(0, len(data), 2):
+    for place in range(0, len(data), 4):
         changed = data[:place] + bytes([data[place] ^ (1 << rng.integers(8))]) + data[place + 1 :]
         (tmp_path / "l.npy").write_bytes(changed)
         try:
             read_labels(tmp_path / "l.npy")
         except GhptDataError:
             refused += 1
-    assert refused > 300
+    assert refused > 150
 
 
 def test_a_plain_array_is_no_labels_file(tmp_path: Path) -> None:
