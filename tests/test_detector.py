@@ -17,7 +17,8 @@ from ghpt.skeleton import JOINT, JOINTS, MIRROR
 CONF = Path(__file__).parents[1] / "conf" / "detector"
 RIG = human36m_rig("S9")
 PERFECT = {
-    "noise": 1e-9, "noise_seconds": 0.2, "noise_white": 0.5, "joints": dict.fromkeys(KINDS, 1.0),
+    "noise": 1e-9, "noise_seconds": 0.2, "noise_white": 0.3, "noise_slow": 0.3,
+    "noise_slow_seconds": 1.0, "joints": dict.fromkeys(KINDS, 1.0),
     "bias": 0.0, "bias_seed": 0, "bias_of_subject": 0.3, "drift": 0.0, "drift_seconds": 1.0,
     "occluded_noise": 1.0, "outlier_rate": 0.0, "outlier_rate_occluded": 0.0, "outlier_size": 0.03,
     "outlier_seconds": 0.5, "swap_rate": 0.0, "swap_seconds": 0.4, "miss_rate": 0.0, "miss_rate_occluded": 0.0,

@@ -80,6 +80,9 @@ class Detector:
     noise_seconds: float
     noise_white: float
     """Share of the noise's variance that is new in every frame."""
+    noise_slow: float
+    """Share of the noise's variance that lasts for ``noise_slow_seconds`` instead of ``noise_seconds``."""
+    noise_slow_seconds: float
     joints: Mapping[str, float]
     """Noise and outlier rate of ``ankle``, ``knee``, ... relative to the average joint's."""
     bias: float
@@ -147,9 +150,12 @@ class Detector:
         """Draw what one camera's errors of a take are made of."""
         joints = len(JOINTS)
         white = rng.standard_normal((frames, joints, 2), dtype=np.float32)
-        slow = process(rng, (joints, 2), frames, self.noise_seconds * rate_hz)
+        quick = process(rng, (joints, 2), frames, self.noise_seconds * rate_hz)
+        slow = process(rng, (joints, 2), frames, self.noise_slow_seconds * rate_hz)
+        shares = np.array([self.noise_white, 1.0 - self.noise_white - self.noise_slow, self.noise_slow])
+        shares = np.sqrt(shares).astype(np.float32)
         return Processes(
-            noise=np.sqrt(self.noise_white) * white + np.sqrt(1.0 - self.noise_white) * slow,
+            noise=shares[0] * white + shares[1] * quick + shares[2] * slow,
             outlier=process(rng, (joints,), frames, self.outlier_seconds * rate_hz),
             direction=process(rng, (joints, 2), frames, self.outlier_seconds * rate_hz),
             swap=process(rng, (len(SWAPS),), frames, self.swap_seconds * rate_hz),

@@ -45,7 +45,7 @@ def move(
     time = np.arange(frames) / rate_hz
     legs, seat = _legs(spec, time, rng)
     angles = np.zeros((frames, len(SEGMENTS), 3))
-    angles += np.deg2rad(_restless(rng, frames, rate_hz, angles.shape[1:], seconds=0.5) * 1.6 * spec["energy"])
+    angles += np.deg2rad(_restless(rng, frames, rate_hz, angles.shape[1:], seconds=0.7) * 1.3 * spec["energy"])
     angles[:, SEGMENT["pelvis"], :2] *= 0.5
     _set_legs(angles, legs)
     for side, habit in (("right", "other" if left_handed else "hand"), ("left", "hand" if left_handed else "other")):
@@ -58,6 +58,8 @@ def move(
     walking = _share_of_time(spec["walk"], time, rng)
     speed = walking * spec["speed"] * 1000.0 * (1.0 + 0.06 * _restless(rng, frames, rate_hz, (), seconds=1.5))
     path, heading = _path(np.cumsum(speed) / rate_hz, rng)
+    if spec["walk"] == 0:
+        path = 0.3 * path  # who does not walk stands near the middle
     if spec["walk"] > 0:
         # Slower walking is slower steps and shorter ones in equal parts, so that feet and path agree.
         swing = np.sqrt(walking)
