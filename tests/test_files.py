@@ -78,8 +78,8 @@ def test_nothing_else_in_the_package_writes_files():
         r"""np\.savez?|torch\.save\(|\.to_csv\(|write_text\(|write_bytes\(|open\([^)]*["'][wax]b?\+?["']"""
     )
     package = Path(files.__file__).parent
-    # the writer itself; torch.save into its handle; a folder's files, inside atomic_folder
-    allowed = {"files.py": 1, "models/checkpoint.py": 1, "data/store.py": 2}
+    # the writer; torch.save into memory; the files of an atomic_folder; rows that finish() zips through atomic_write
+    allowed = {"files.py": 1, "models/checkpoint.py": 1, "data/store.py": 2, "report/predictions.py": 2}
     for path in sorted(package.rglob("*.py")):
         found = [line for line in path.read_text().splitlines() if banned.search(line)]
         assert len(found) <= allowed.get(str(path.relative_to(package)), 0), (path, found)

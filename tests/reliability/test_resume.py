@@ -3,9 +3,9 @@
 import copy
 
 import pytest
-import toys
 import torch
 
+import toys
 from ghpt.errors import GhptCheckpointError
 from ghpt.models.callbacks import SaveLast
 from ghpt.models.module import StochasticEstimator

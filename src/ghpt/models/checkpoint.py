@@ -1,5 +1,6 @@
 """Checkpoints: written whole or not at all, read without running code, and refused with a reason."""
 
+import io
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +25,10 @@ class AtomicCheckpointIO(CheckpointIO):
     """
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        content = io.BytesIO()  # torch.save hides the cause when writing to a file fails
+        torch.save(checkpoint, content)
         with atomic_write(path, verify=_read) as handle:
-            torch.save(checkpoint, handle)
+            handle.write(content.getbuffer())
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
         return read_checkpoint(path, map_location or "cpu")

@@ -1,0 +1,183 @@
+"""B1 and B4: checkpoints survive kills at any instant and a failure of any system call."""
+
+import errno
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+import torch
+
+from ghpt import files
+from ghpt.files import sweep_temporaries
+from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO, read_checkpoint
+
+SCRIPT = Path(__file__).with_name("run_toy.py")
+
+SAVER = """
+import os, sys, torch
+from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO
+for line in sys.stdin:  # one fork for each kill: torch is imported once
+    child = os.fork()
+    if child:
+        print("pid", child, flush=True)
+        os.waitpid(child, 0)
+        print("killed", flush=True)
+        continue
+    for number in range(int(line), 10**9):
+        state = {"x": torch.full((6_000_000,), float(number)), "y": torch.tensor(number)}
+        checkpoint = {"state_dict": state, FIELD: {"format_version": FORMAT_VERSION}}
+        AtomicCheckpointIO().save_checkpoint(checkpoint, sys.argv[1])
+        print("saved", number, flush=True)
+"""
+
+
+def kill_while_saving(saver, number, delay):
+    """Let the saver save on and on, kill it ``delay`` seconds after its first save; the last number it saved."""
+    print(number, file=saver.stdin, flush=True)
+    pid = int(saver.stdout.readline().split()[1])
+    saved = saver.stdout.readline()
+    time.sleep(delay)
+    os.kill(pid, signal.SIGKILL)
+    while (line := saver.stdout.readline()) != "killed\n":
+        saved = line
+    return int(saved.split()[1])
+
+
+def test_b1_kill_while_saving(tmp_path, nightly, record_row):
+    """24 MB checkpoints, saved without a pause, the system's temporary folder on another file system."""
+    other = Path("/dev/shm") if Path("/dev/shm").is_dir() else tmp_path
+    environment = os.environ | {"TMPDIR": str(other), "OMP_NUM_THREADS": "1"}
+    path, kills, number = tmp_path / "last.ckpt", 300 if nightly else 20, 0
+    command = [sys.executable, "-c", SAVER, str(path)]
+    rng = random.Random(0)
+    bad = left_over = 0
+    with subprocess.Popen(
+        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+    ) as saver:
+        for _ in range(kills):
+            saved = kill_while_saving(saver, number, rng.uniform(0, 0.2))
+            try:
+                state = read_checkpoint(path)["state_dict"]
+                bad += not (state["y"] >= saved and (state["x"] == state["y"]).all())
+            except ValueError:
+                bad += 1
+            sweep_temporaries(tmp_path)
+            left_over += len(list(tmp_path.iterdir())) - 1
+            number = saved + 1
+        saver.stdin.close()
+    record_row("B1", f"{kills} kills while saving: {bad} unreadable or lost, {left_over} left over", kills - bad, kills)
+    assert (bad, left_over) == (0, 0)
+
+
+def test_b1_and_b2_kill_training_and_resume(tmp_path, nightly, record_row):
+    """A real training run, killed, resumed by the same command, ends with the same weights."""
+    changes = {"trainer": {"max_epochs": 20}, "train": {"save_every": 2}}
+    environment = os.environ | {"PYTHONPATH": str(SCRIPT.parents[1]), "OMP_NUM_THREADS": "1"}
+    rng = random.Random(1)
+
+    def start(folder, resume):
+        wanted = {**changes, "train": changes["train"] | {"resume": resume}}
+        command = [sys.executable, str(SCRIPT), str(folder), json.dumps(wanted)]
+        return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    assert start(tmp_path / "whole", False).wait(timeout=200) == 0
+    expected = read_checkpoint(tmp_path / "whole" / "last.ckpt")["state_dict"]
+    runs = 10 if nightly else 2
+    same = 0
+    for number in range(runs):
+        folder = tmp_path / str(number)
+        child = start(folder, False)
+        while not (folder / "last.ckpt").exists():
+            assert child.poll() is None, "training ended before its first save"
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0, 0.8))
+        child.kill()
+        child.wait()
+        assert start(folder, True).wait(timeout=200) == 0
+        found = read_checkpoint(folder / "last.ckpt")["state_dict"]
+        same += all(torch.equal(found[k], v) for k, v in expected.items())
+        assert not [p for p in folder.iterdir() if p.name.endswith(".tmp")]
+    record_row("B2", f"{runs} killed and resumed training runs: {same} end with identical weights", same, runs)
+    assert same == runs
+
+
+class Failing:
+    """Stands for the ``os`` module and for ``open`` in ghpt.files; the ``fail``-th call of interest raises."""
+
+    def __init__(self, fail, code):
+        self.calls, self.fail, self.code = [], fail, code
+
+    def __getattr__(self, name):
+        original = getattr(os, name)
+        return self.counted(name, original) if name in ("fsync", "replace", "open") else original
+
+    def counted(self, name, function):
+        def call(*args, **kwargs):
+            self.calls.append(name)
+            if len(self.calls) == self.fail:
+                raise OSError(self.code, os.strerror(self.code))
+            return function(*args, **kwargs)
+
+        return call
+
+    def open_file(self, path, mode="r", **kwargs):
+        handle = self.counted("create", open)(path, mode, **kwargs)
+        outer = self
+
+        class Handle:
+            def __getattr__(self, name):
+                method = getattr(handle, name)
+                return outer.counted(name, method) if name in ("write", "flush") else method
+
+            def __enter__(self):
+                return self
+
+            def __exit__(self, *args):
+                handle.close()
+
+        return Handle()
+
+
+def failure(call):
+    try:
+        call()
+    except OSError as error:
+        return error
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EACCES, errno.EROFS, errno.EINTR])
+def test_b4_any_call_of_a_save_may_fail(tmp_path, monkeypatch, code, record_row):
+    path = tmp_path / "last.ckpt"
+
+    def save(number):
+        state = {"x": torch.full((2000,), float(number))}
+        AtomicCheckpointIO().save_checkpoint({"state_dict": state, FIELD: {"format_version": FORMAT_VERSION}}, path)
+
+    save(1)
+    fail = done = 0
+    while True:
+        fail += 1
+        failing = Failing(fail, code)
+        with monkeypatch.context() as patch:
+            patch.setattr(files, "os", failing)
+            patch.setattr(files, "open", failing.open_file, raising=False)
+            error = failure(lambda: save(2))
+        if error is None:
+            break
+        assert error.errno == code
+        assert str(tmp_path) in str(error)
+        value = read_checkpoint(path)["state_dict"]["x"][0].item()
+        replaced = "replace" in failing.calls[: fail - 1]
+        assert value == (2 if replaced else 1)
+        assert os.listdir(tmp_path) == ["last.ckpt"]
+        save(1)
+        done += 1
+    kinds = set(failing.calls)
+    assert {"create", "write", "flush", "fsync", "replace", "open"} <= kinds
+    record_row("B4", f"{os.strerror(code)}: each of the {done} calls of a save failed in turn", done, done)
