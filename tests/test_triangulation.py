@@ -198,3 +198,33 @@ def test_31_views_and_many_subsets_stay_small():
     points, ok = triangulate_subsets(scene.cameras, scene.key_points, seen, subsets)
     assert torch.equal(ok, subsets.sum(-1) >= 2)
     assert (points - scene.points[:, None]).abs().amax(-1)[ok].max() < 1e-5
+
+
+def test_far_from_the_world_s_origin_no_digits_are_lost_but_those_of_t():
+    scene = random_scene(13, frames=20, views=3, place=1e10)
+    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    points, ok = triangulate_subsets(scene.cameras, scene.key_points, seen, every_subset(3, frames=20))
+    assert ok.all()
+    rounding = scene.cameras.t.abs().max() * torch.finfo(torch.float64).eps
+    assert (points - scene.points[:, None]).norm(dim=-1).median() < 10 * rounding
+
+
+def test_a_camera_on_the_moon_costs_the_others_no_digits():
+    scene = random_scene(14, views=4)
+    away = scene.cameras.t.clone()
+    away[:, 3] = 4e11
+    cameras = Cameras(scene.cameras.K, scene.cameras.R, away)
+    weights = ones(scene)
+    weights[:, 3] = 0
+    assert (triangulate(cameras, scene.key_points, weights).points - scene.points).abs().max() < 1e-8
+
+
+def test_a_narrow_baseline_keeps_the_digits_that_squaring_would_cost():
+    scene = random_scene(15, frames=20, views=2)
+    K, R = (x[:, :1].expand(-1, 2, -1, -1) for x in (scene.cameras.K, scene.cameras.R))
+    t = scene.cameras.t[:, :1] - torch.tensor([[0.0, 0, 0], [1, 0, 0]], dtype=torch.float64)  # 1 mm apart
+    cameras = Cameras(K, R, t)
+    result = triangulate(cameras, project(cameras, scene.points)[0], ones(scene))
+    assert result.ok.all()
+    assert (result.points - scene.points).norm(dim=-1).median() < 1e-7
+    assert (result.points - scene.points).norm(dim=-1).max() < 1e-4

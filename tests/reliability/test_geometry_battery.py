@@ -299,6 +299,24 @@ def test_d2_degenerate_frames_have_the_right_status_and_spoil_no_other(thousand,
     assert not wrong
 
 
+def test_d2_no_point_is_found_in_a_camera_s_own_centre(record_row):
+    """Where rays meet in a camera's centre the depth is rounding, of either sign: many times, never ok."""
+    scene = random_scene(1, 300, 2, place=1e4)
+    doubled = scene.cameras.index((slice(None), [0, 0]))
+    noise = np.random.default_rng(1).normal(0, 5, tuple(scene.key_points.shape))
+    inside = project(scene.cameras, scene.cameras.centre[:, :1].expand(-1, 17, -1))[0]
+    inside[:, 0] = scene.key_points[:, 0]
+    twice = scene.key_points[:, [0, 0]] + torch.from_numpy(noise)
+    accepted = 0
+    for cameras, key_points in ((doubled, twice), (scene.cameras, inside)):
+        accepted += int(triangulate(cameras, key_points, ones(scene)).ok.sum())
+        seen = torch.ones(key_points.shape[:-1], dtype=torch.bool)
+        accepted += int(triangulate_subsets(cameras, key_points, seen, seen.mT[:, None])[1].sum())
+    total = 4 * 300 * 17
+    record_row("D2", "points in a camera's own centre", total - accepted, total)
+    assert accepted == 0
+
+
 def test_d2_subsets_refuse_degenerate_frames_and_spoil_no_other(record_row):
     large = cut(random_scene(0, 100, 4), 3).noisy(2, 0)
     wrong = []
