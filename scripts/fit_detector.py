@@ -25,8 +25,9 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import least_squares
 
-from ghpt.data.detector import Detector, Processes, generator
+from ghpt.data.detector import Detector, Processes
 from ghpt.data.embedded import Take, takes
+from ghpt.data.processes import generator
 from ghpt.data.rigs import ARRANGEMENTS
 from ghpt.files import atomic_write
 from ghpt.geometry.cameras import Cameras
@@ -235,9 +236,10 @@ def main() -> None:
         drawn = {seed: draws(detector, data, "test", seed) for seed in arguments.seeds}
         threshold = best_threshold(detector, data, arguments.seeds[0])
         if not arguments.check:
-            for _ in range(2):  # the best threshold depends on the numbers a little
+            detector = fit(detector, data, drawn, threshold)
+            before, threshold = threshold, best_threshold(detector, data, arguments.seeds[0])
+            if threshold != before:
                 detector = fit(detector, data, drawn, threshold)
-                threshold = best_threshold(detector, data, arguments.seeds[0])
             write(path, detector, data)
         report(console, detector, data, drawn, threshold)
         console.print({name: getattr(detector, name) for name in (*FREE[data], *TIED)})

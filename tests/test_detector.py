@@ -7,9 +7,10 @@ import torch
 import yaml
 
 from ghpt.data import lens
-from ghpt.data.body import random_body
-from ghpt.data.detector import KINDS, Detector, generator, occlusion, process, stature, trunk_frame
+from ghpt.data.body import occlusion, random_body, stature, trunk_frame
+from ghpt.data.detector import KINDS, Detector
 from ghpt.data.motion import move
+from ghpt.data.processes import generator, process
 from ghpt.data.rigs import Rig, human36m_rig
 from ghpt.geometry.cameras import project
 from ghpt.skeleton import JOINT, JOINTS, MIRROR
@@ -194,3 +195,15 @@ def test_the_fitted_numbers_make_a_detector(name):
     assert np.isfinite(found.key_points).all()
     assert 0.4 < found.confidence[found.seen].mean() < 0.95
     assert replace(detector, bias=0.0) != detector
+
+
+def test_every_64th_frame_can_be_detected_alone():
+    """What the fit relies on: errors depend on other frames only through the processes."""
+    points = take(frames=400)
+    numbers = {"noise": 0.005, "outlier_rate": 0.1, "swap_rate": 0.02, "miss_rate": 0.05}
+    detector = Detector(**PERFECT | numbers)
+    processes = detector.processes(len(points), 50.0, generator(0, "camera"))
+    whole = detector.view(points, points, RIG, 1, processes, False)
+    some = detector.view(points[::64], points[::64], RIG, 1, processes.every(64), False)
+    np.testing.assert_allclose(some[0], whole[0][::64], atol=1e-3)
+    np.testing.assert_array_equal(some[2], whole[2][::64])

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from ghpt.skeleton import JOINT, JOINTS
+from ghpt.skeleton import JOINT, JOINTS, PELVIS, THORAX
 
 SEGMENTS = (
     "pelvis", "lumbar", "thorax", "neck",
@@ -65,6 +65,12 @@ CAPSULES = tuple(
 )  # fmt: skip
 """The volume of the body: segments between two joints, with their radius in statures."""
 
+_LEGS = tuple(
+    (JOINT[f"{side}_{lower}"], JOINT[f"{side}_{upper}"])
+    for lower, upper in (("ankle", "knee"), ("knee", "hip"))
+    for side in ("right", "left")
+)
+
 
 @dataclass(frozen=True)
 class Body:
@@ -108,6 +114,43 @@ def pose(body: Body, angles: Float[np.ndarray, "T S 3"]) -> Float[np.ndarray, "T
     for joint, (base, segment) in _JOINT_TREE.items():
         joints[:, JOINT[joint]] = joints[:, JOINT[base]] + world[:, SEGMENT[segment]] @ body.offsets[JOINT[joint]]
     return joints
+
+
+def stature(points: Float[np.ndarray, "T J 3"]) -> float:
+    """The person's stature (mm) from the legs, which are 0.491 of it of ``_PROPORTIONS``."""
+    length = [np.linalg.norm(points[:, a] - points[:, b], axis=-1) for a, b in _LEGS]
+    return float(np.median(np.sum(length, axis=0)) / 2.0 / 0.491)
+
+
+def trunk_frame(points: Float[np.ndarray, "T J 3"]) -> Float[np.ndarray, "T 3 3"]:
+    """Columns: forward, left and up of the trunk, in the world."""
+    up = points[:, THORAX] - points[:, PELVIS]
+    up = up / np.linalg.norm(up, axis=-1, keepdims=True).clip(min=1e-9)
+    across = points[:, JOINT["left_hip"]] - points[:, JOINT["right_hip"]]
+    forward = np.cross(across, up)
+    forward /= np.linalg.norm(forward, axis=-1, keepdims=True).clip(min=1e-9)
+    return np.stack([forward, np.cross(up, forward), up], axis=-1)
+
+
+def occlusion(in_camera: Float[np.ndarray, "T J 3"], person: float) -> Float[np.ndarray, "T J"]:
+    """How far the body hides each joint from a camera, 0 to 1: its image lies within a capsule that is nearer."""
+    ends = np.array([capsule[:2] for capsule in CAPSULES])
+    radii = np.array([capsule[2] * person for capsule in CAPSULES], dtype=np.float32)
+    x, y, depth = np.moveaxis(in_camera, -1, 0)
+    depth = depth.clip(min=1.0)
+    x, y = x / depth, y / depth
+    (ax, bx), (ay, by), (near_a, near_b) = ((v[:, ends[:, 0]], v[:, ends[:, 1]]) for v in (x, y, depth))
+    # one by one: reductions over a last axis of two numbers would take most of the time
+    axis_x, axis_y, axis_depth = (v[:, None] for v in (bx - ax, by - ay, near_b - near_a))
+    off_x, off_y = x[..., None] - ax[:, None], y[..., None] - ay[:, None]
+    along = (off_x * axis_x + off_y * axis_y) / (axis_x**2 + axis_y**2).clip(min=1e-12)
+    along = along.clip(0.0, 1.0)
+    nearest = near_a[:, None] + along * axis_depth
+    distance = np.sqrt((off_x - along * axis_x) ** 2 + (off_y - along * axis_y) ** 2) * nearest
+    inside = ((1.15 - distance / radii) * np.float32(2.5)).clip(0.0, 1.0)
+    behind = ((depth[..., None] - nearest - np.float32(0.5) * radii) * np.float32(50.0 / person)).clip(0.0, 1.0)
+    own = (ends == np.arange(len(JOINTS))[:, None, None]).any(axis=-1)
+    return np.where(own, np.float32(0.0), inside * behind).max(axis=-1)
 
 
 def _segment_signs() -> Float[np.ndarray, "S 3"]:

@@ -7,21 +7,20 @@ jump away or are missed for a while. All lengths are fractions of the person's s
 
 from __future__ import annotations
 
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
-from scipy.signal import lfilter
 from scipy.special import expit, ndtr
 from torch import Tensor
 
 from ghpt.data import lens
-from ghpt.data.body import CAPSULES
+from ghpt.data.body import occlusion, stature, trunk_frame
+from ghpt.data.processes import generator, process
 from ghpt.data.rigs import Rig
-from ghpt.skeleton import BONES, JOINT, JOINTS, MIRROR, PELVIS, THORAX
+from ghpt.skeleton import BONES, JOINT, JOINTS, MIRROR, PELVIS
 
 SWAPS = tuple(
     tuple((JOINT[f"right_{part}"], JOINT[f"left_{part}"]) for part in parts)
@@ -33,16 +32,9 @@ _ON = {a: b for a, b in BONES if JOINTS[a].split("_")[-1] in ("ankle", "knee", "
 _ON |= {b: a for a, b in BONES if JOINTS[b].split("_")[-1] in ("elbow", "wrist", "shoulder")}
 _LIMBS = list(_ON), list(_ON.values())
 """Limb joints, and the joint that each hangs on."""
-_LEG_BONES = [(a, b) for a, b in _ON.items() if JOINTS[a].endswith(("ankle", "knee"))]
 
 KINDS = tuple(name.removeprefix("right_").removeprefix("left_") for name in JOINTS)
 """The joints without their sides."""
-
-
-def generator(seed: int, *names: str) -> np.random.Generator:
-    """Random numbers that depend on what they are for and on nothing else."""
-    keys = [seed, *(zlib.crc32(name.encode()) for name in names)]
-    return np.random.Generator(np.random.Philox(np.random.SeedSequence(keys)))
 
 
 @dataclass(frozen=True)
@@ -254,55 +246,6 @@ class Detector:
         # 0.8: the spread of the logarithm of an error's size, which chance must be compared with
         by_chance = 0.8 * np.sqrt(1.0 / self.confidence_knowledge**2 - 1.0) * processes.confidence
         return expit(self.confidence_typical - self.confidence_slope * (known + by_chance))
-
-
-def process(
-    rng: np.random.Generator, shape: tuple[int, ...], frames: int, persistence: float
-) -> Float[np.ndarray, "T ..."]:
-    """Stationary unit Gaussian processes, smooth (second order), that forget within ``persistence`` frames."""
-    warm = int(np.ceil(6.0 * persistence))
-    pole = np.exp(-2.0 / max(persistence, 1e-3))
-    gain = np.sqrt((1.0 - pole**2) ** 3 / (1.0 + pole**2))
-    white = rng.standard_normal((*shape, frames + warm), dtype=np.float32)
-    smooth = lfilter([gain], [1.0, -2.0 * pole, pole**2], white, axis=-1)[..., warm:]
-    return np.moveaxis(smooth, -1, 0).astype(np.float32)
-
-
-def stature(points: Float[np.ndarray, "T J 3"]) -> float:
-    """The person's stature (mm) from the legs, which are 0.491 of it (as in ``body``)."""
-    length = [np.linalg.norm(points[:, a] - points[:, b], axis=-1) for a, b in _LEG_BONES]
-    return float(np.median(np.sum(length, axis=0)) / 2.0 / 0.491)
-
-
-def trunk_frame(points: Float[np.ndarray, "T J 3"]) -> Float[np.ndarray, "T 3 3"]:
-    """Columns: forward, left and up of the trunk, in the world."""
-    up = points[:, THORAX] - points[:, PELVIS]
-    up = up / np.linalg.norm(up, axis=-1, keepdims=True).clip(min=1e-9)
-    across = points[:, JOINT["left_hip"]] - points[:, JOINT["right_hip"]]
-    forward = np.cross(across, up)
-    forward /= np.linalg.norm(forward, axis=-1, keepdims=True).clip(min=1e-9)
-    return np.stack([forward, np.cross(up, forward), up], axis=-1)
-
-
-def occlusion(in_camera: Float[np.ndarray, "T J 3"], person: float) -> Float[np.ndarray, "T J"]:
-    """How far the body hides each joint from a camera, 0 to 1: its image lies within a capsule that is nearer."""
-    ends = np.array([capsule[:2] for capsule in CAPSULES])
-    radii = np.array([capsule[2] * person for capsule in CAPSULES], dtype=np.float32)
-    x, y, depth = np.moveaxis(in_camera, -1, 0)
-    depth = depth.clip(min=1.0)
-    x, y = x / depth, y / depth
-    (ax, bx), (ay, by), (near_a, near_b) = ((v[:, ends[:, 0]], v[:, ends[:, 1]]) for v in (x, y, depth))
-    # one by one: reductions over a last axis of two numbers would take most of the time
-    axis_x, axis_y, axis_depth = (v[:, None] for v in (bx - ax, by - ay, near_b - near_a))
-    off_x, off_y = x[..., None] - ax[:, None], y[..., None] - ay[:, None]
-    along = (off_x * axis_x + off_y * axis_y) / (axis_x**2 + axis_y**2).clip(min=1e-12)
-    along = along.clip(0.0, 1.0)
-    nearest = near_a[:, None] + along * axis_depth
-    distance = np.sqrt((off_x - along * axis_x) ** 2 + (off_y - along * axis_y) ** 2) * nearest
-    inside = ((1.15 - distance / radii) * np.float32(2.5)).clip(0.0, 1.0)
-    behind = ((depth[..., None] - nearest - np.float32(0.5) * radii) * np.float32(50.0 / person)).clip(0.0, 1.0)
-    own = (ends == np.arange(len(JOINTS))[:, None, None]).any(axis=-1)
-    return np.where(own, np.float32(0.0), inside * behind).max(axis=-1)
 
 
 def _symmetric(bias: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:

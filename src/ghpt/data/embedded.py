@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ghpt.data.body import random_body
-from ghpt.data.detector import Detector, generator
+from ghpt.data.detector import Detector
 from ghpt.data.motion import actions, move
+from ghpt.data.processes import generator
 from ghpt.data.rigs import ARRANGEMENTS, Rig, human36m_rig, panoptic_rig
 from ghpt.errors import check
 from ghpt.recording import Recording
