@@ -45,9 +45,11 @@ TARGETS = {
     "panoptic": {"random": 26.1, "average": 25.9, "best": 24.4, "worst": 31.0},
 }
 FREE = {
-    "human36m": ("noise", "bias", "outlier_rate", "outlier_size"),
+    "human36m": ("noise", "bias", "outlier_rate"),
     "panoptic": ("bias", "outlier_rate", "outlier_size"),
 }
+"""The outliers' size on Human3.6M and the noise on Panoptic are held: with them free too, rarer and larger outliers, or
+less noise and more outliers, fit as well, and those are unlike real detectors (docs/embedded.md)."""
 TIED = {"drift": ("bias", 0.3), "outlier_rate_occluded": ("outlier_rate", 4.0)}
 """Numbers that are kept in proportion to a free one."""
 SETS = {"human36m": ("h36m",), "panoptic": ("cmu1", "cmu2", "cmu3", "cmu4")}
@@ -176,7 +178,7 @@ def fit(detector: Detector, data: str, drawn: dict[int, list[Draw]], threshold: 
         found = mean([table(tried, data, drawn[seed], threshold, seed) for seed in drawn])
         return np.array([np.log(found[name] / target) for name, target in targets.items()])
 
-    solution = least_squares(residuals, start, diff_step=0.02, x_scale=0.3, xtol=1e-3, ftol=1e-3, max_nfev=12)
+    solution = least_squares(residuals, start, diff_step=0.02, x_scale=0.3, xtol=1e-3, ftol=1e-3, max_nfev=5)
     rounded = [float(f"{value:.3g}") for value in np.exp(solution.x)]
     return with_numbers(detector, dict(zip(free, rounded, strict=True)))
 
