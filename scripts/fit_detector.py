@@ -164,7 +164,7 @@ def mean(tables: list[dict[str, dict[str, float]]]) -> dict[str, float]:
 
 def with_numbers(detector: Detector, numbers: Mapping[str, float]) -> Detector:
     """Replace free numbers, and those that are tied to them."""
-    tied = {name: numbers[of] * ratio for name, (of, ratio) in TIED.items() if of in numbers}
+    tied = {name: float(f"{numbers[of] * ratio:.3g}") for name, (of, ratio) in TIED.items() if of in numbers}
     return replace(detector, **numbers, **tied)
 
 

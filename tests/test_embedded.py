@@ -1,3 +1,5 @@
+import importlib.util
+import sys
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -108,3 +110,16 @@ def test_people_stand_on_panoptics_floor_with_y_down():
 def test_bad_choices_are_named_at_once(data, split, cameras, error, word):
     with pytest.raises(error, match=word):
         embedded_recordings(data, split, 0, DETECTOR["panoptic"], cameras)
+
+
+def test_the_learning_free_rows_of_the_paper_come_out():
+    """The fit holds for the motion and the detector as they are now (scripts/fit_detector.py --check)."""
+    path = Path(__file__).parents[1] / "scripts" / "fit_detector.py"
+    spec = importlib.util.spec_from_file_location("fit_detector", path)
+    fit = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = fit
+    spec.loader.exec_module(fit)
+    drawn = fit.draws(DETECTOR["human36m"], "human36m", "test", 0)
+    found = fit.table(DETECTOR["human36m"], "human36m", drawn, 0.02, 0)["h36m"]
+    for row, target in fit.TARGETS["human36m"].items():
+        assert found[row] == pytest.approx(target, rel=0.07), row
