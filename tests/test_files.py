@@ -50,22 +50,22 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
         (folder / "x").write_text("2")
         raise OSError("full")
     assert (path / "x").read_text() == "1"
-    with atomic_folder(path) as folder:
+    with atomic_folder(path) as folder:  # someone else was first, and may be reading
         (folder / "y").write_text("3")
-    assert os.listdir(path) == ["y"]
+    assert os.listdir(path) == ["x"]
     assert os.listdir(tmp_path) == ["set"]
 
 
 def test_only_what_dead_writers_left_is_swept(tmp_path):
     child = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
-    dead = tmp_path / f".a.{int(child.stdout)}-00000000.tmp"
-    alive = tmp_path / f".a.{os.getpid()}-00000000.tmp"
+    dead = tmp_path / f".a.{files._HOST}-{int(child.stdout)}-00000000.tmp"
+    alive = tmp_path / f".a.{files._HOST}-{os.getpid()}-00000000.tmp"
+    elsewhere = tmp_path / f".a.other-machine-{int(child.stdout)}-00000000.tmp"
     other = tmp_path / ".a.tmp"
-    for path in (dead, alive, other):
+    for path in (dead, alive, elsewhere, other):
         path.write_text("x")
     assert sweep_temporaries(tmp_path) == [dead]
-    assert alive.exists()
-    assert other.exists()
+    assert all(path.exists() for path in (alive, elsewhere, other))
     assert sweep_temporaries(tmp_path / "missing") == []
 
 

@@ -4,6 +4,7 @@ A reader therefore never sees half a file, and a crash at any instant leaves the
 """
 
 import os
+import platform
 import re
 import secrets
 import shutil
@@ -12,11 +13,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-_TEMPORARY = re.compile(r"^\..+\.(?P<pid>\d+)-[0-9a-f]{8}\.tmp$")
+_HOST = re.sub(r"[^\w-]", "_", platform.node())[:32] or "host"
+_TEMPORARY = re.compile(rf"^\..+\.{_HOST}-(?P<pid>\d+)-[0-9a-f]{{8}}\.tmp$")
+"""What this machine's writers call their files; another machine's, on a shared disk, may be alive."""
 
 
 def _temporary(path: Path) -> Path:
-    return path.parent / f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp"
+    return path.parent / f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
 
 
 def _sync_folder(folder: Path) -> None:
@@ -62,7 +65,7 @@ def atomic_write(path: str | Path, mode: str = "wb", verify: Callable[[Path], An
 def atomic_folder(path: str | Path) -> Iterator[Path]:
     """Yield a new empty folder that becomes ``path`` when the block ends without an error.
 
-    An existing ``path`` is replaced. If another process has made the same folder meanwhile, the last one wins.
+    A ``path`` that exists by then is kept and the new folder dropped: others may be reading it.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -74,11 +77,12 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             if file.is_file():
                 with open(file, "rb") as handle:
                     os.fsync(handle.fileno())
-        if path.exists():
-            old = _temporary(path)
-            os.replace(path, old)
-            shutil.rmtree(old, ignore_errors=True)
-        os.replace(temporary, path)
+        try:
+            os.rename(temporary, path)
+        except OSError:
+            if not path.is_dir():
+                raise
+            shutil.rmtree(temporary)
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise

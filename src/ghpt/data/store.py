@@ -9,7 +9,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ import numpy as np
 import torch
 
 from ghpt.errors import GhptDataError
-from ghpt.files import _temporary, atomic_folder, sweep_temporaries
+from ghpt.files import atomic_folder, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINTS
@@ -63,12 +62,7 @@ def prepared(
     folder = root / f"{key['name']}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
     if not folder.exists():
         sweep_temporaries(root)
-        own = _temporary(folder)
-        write_store(own, make(), provenance | {"key": key})
-        try:
-            own.rename(folder)
-        except OSError:  # another process has finished it meanwhile; others may be reading that one
-            shutil.rmtree(own, ignore_errors=True)
+        write_store(folder, make(), provenance | {"key": key})
     return open_store(folder)
 
 
@@ -82,7 +76,7 @@ def file_stamps(files: Iterable[Path], root: Path) -> str:
 
 
 def write_store(folder: str | Path, recordings: Iterable[Recording], provenance: dict[str, Any]) -> None:
-    """Write recordings, which must have the same number of views, as a store that replaces ``folder``.
+    """Write recordings, which must have the same number of views, as a store at ``folder``; one that is there is kept.
 
     Memory is constant in the number of frames, and ``folder`` appears only when all is written. Raises
     GhptDataError if a recording does not fit or holds a value that is not finite, and if there are no frames.
