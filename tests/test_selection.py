@@ -4,7 +4,7 @@ import torch
 
 from ghpt import randomness
 from ghpt.errors import GhptConfigError
-from ghpt.models.selection import SELECTIONS, selection_weights, softmax_weights
+from ghpt.models.selection import SELECTIONS, limit_spread, selection_weights, softmax_weights
 
 
 def pool(items=50, count=40):
@@ -67,3 +67,15 @@ def test_unknown_selection_says_what_exists():
     logits, errors, keys = pool(2, 3)
     with pytest.raises(GhptConfigError, match="weight, average"):
         selection_weights("mean", logits, errors, 1.0, keys)
+
+
+def test_a_limited_spread_keeps_the_order_and_small_differences():
+    logits, _, _ = pool()
+    wide, narrow = limit_spread(100 * logits, 1.0), limit_spread(0.01 * logits, 1.0)
+    torch.testing.assert_close(wide.std(-1, correction=0), torch.ones(len(logits)))
+    assert torch.equal(wide.argsort(-1), logits.argsort(-1))
+    torch.testing.assert_close(narrow.diff(dim=-1), 0.01 * logits.diff(dim=-1), atol=1e-6, rtol=1e-4)
+    assert torch.equal(limit_spread(logits, None), logits)
+    one = torch.zeros(3, 1, requires_grad=True)
+    limit_spread(one, 1.0).sum().backward()
+    assert torch.isfinite(one.grad).all()

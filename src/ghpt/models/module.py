@@ -15,7 +15,7 @@ from ghpt.errors import GhptError, check
 from ghpt.models.loss import LossTerms, StochasticLoss, mean_over_all
 from ghpt.models.problem import Problem
 from ghpt.models.scorer import Scorer
-from ghpt.models.selection import SELECTIONS, selection_weights, softmax_weights
+from ghpt.models.selection import SELECTIONS, limit_spread, selection_weights, softmax_weights
 
 STATISTICS_HYPOTHESES = 16
 """Hypotheses of each training sample that the feature statistics are taken from: enough for a mean and deviation."""
@@ -35,7 +35,7 @@ class Pool:
 class StochasticEstimator(L.LightningModule):
     """Hypothesis generator, scorer and loss (paper, section 3), for any ``Problem``.
 
-    ``selection``: the hypothesis of the estimation loss, ``weight`` or ``stochastic`` (straight through).
+    ``spread`` limits how much a pool's logits differ (``limit_spread``). ``selection``: the hypothesis of the estimation loss, ``weight`` or ``stochastic`` (straight through).
     All randomness is a function of (seed, optimiser step, sample): see ``ghpt.randomness``.
     """
 
@@ -48,12 +48,14 @@ class StochasticEstimator(L.LightningModule):
         hypotheses: int,
         temperature: float,
         gumbel: bool,
+        spread: float | None,
         selection: str,
         seed: int,
     ) -> None:
         super().__init__()
         check(hypotheses >= 1, "model.hypotheses", f"is {hypotheses}", "Draw at least 1 (the paper: 200).")
         check(temperature > 0, "model.temperature", f"is {temperature}", "It must be > 0 (the paper: 1.5).")
+        check(spread is None or spread > 0, "model.spread", f"is {spread}", "It must be > 0, or null for no limit.")
         check(
             selection in ("weight", "stochastic"),
             "model.selection",
@@ -65,13 +67,13 @@ class StochasticEstimator(L.LightningModule):
             torch.manual_seed(seed)
             self.scorer = scorer(problem.feature_size)
         self.hypotheses, self.temperature, self.gumbel = hypotheses, temperature, gumbel
-        self.selection, self.seed = selection, seed
+        self.spread, self.selection, self.seed = spread, selection, seed
         self.validation = torch.nn.ModuleDict({name: _mean() for name in ("weight", "average", "random")})
 
     def pool(self, batch: Any, keys: Int[Tensor, " B"]) -> Pool:
         """Draw, score and measure the hypotheses of a batch."""
         hypotheses = self.problem.generate(batch, self.hypotheses, keys)
-        logits = self.scorer(self.problem.describe(hypotheses))
+        logits = limit_spread(self.scorer(self.problem.describe(hypotheses)), self.spread)
         with torch.no_grad():
             errors, counted = self.problem.error(self.problem.expand(hypotheses), batch)
         return Pool(hypotheses, logits, errors.to(logits.dtype), counted)

@@ -12,6 +12,18 @@ SELECTIONS = ("weight", "average", "most", "least", "stochastic", "random", "bes
 """Names as in metrics.json; best and worst look at the truth and are not available in use."""
 
 
+def limit_spread(logits: Float[Tensor, "B H"], spread: float | None) -> Float[Tensor, "B H"]:
+    """Centre each pool's logits and shrink them where their standard deviation exceeds ``spread`` (None: as they are).
+
+    Not in the paper, whose scores lie between 0 and 1 and so cannot differ much either. Without a limit the weights
+    collapse onto one or two hypotheses, and a scorer is surest of itself on poses unlike those that it was trained on.
+    """
+    if spread is None:
+        return logits
+    centred = logits - logits.mean(dim=-1, keepdim=True)
+    return centred * (spread / centred.square().mean(dim=-1, keepdim=True).clamp_min(spread**2).sqrt())
+
+
 def softmax_weights(
     logits: Float[Tensor, "B H"], temperature: float, noise: Float[Tensor, "B H"] | None = None
 ) -> Float[Tensor, "B H"]:
