@@ -25,7 +25,7 @@ MODEL = {
         "alpha": 1.0, "beta": 0.01, "gamma": 0.02, "relative_errors": True,
     },
     "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True, "lr": 1e-3},
-    "hypotheses": 12, "temperature": 1.5, "gumbel": True, "spread": 1.0, "selection": "weight", "seed": 0,
+    "hypotheses": 12, "temperature": 1.5, "gumbel": True, "spread": 1.5, "selection": "weight", "seed": 0,
 }  # fmt: skip
 
 TRAINER = {
