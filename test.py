@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from ghpt.test import test
-
 from ghpt.app import run
+from ghpt.test import summary, test
 
 if __name__ == "__main__":
-    run(Path(__file__).parent / "conf", "test", test)
+    run(Path(__file__).parent / "conf", "test", test, summary)

@@ -89,12 +89,12 @@ def test_report_fits_100_columns_and_every_row_has_every_column():
     assert "28.2" in report(metrics())
 
 
-def test_terminal_table_fits_100_columns():
+def test_terminal_table_fits_80_columns():
     buffer = io.StringIO()
-    print_table(metrics(data="cmu4", trained="cmu2"), Console(file=buffer, width=100, color_system=None))
+    print_table(metrics(data="cmu4", trained="cmu2"), Console(file=buffer, width=80, color_system=None))
     lines = buffer.getvalue().splitlines()
     assert "embedded (synthetic) Panoptic CMU4" in " ".join(lines)
-    assert max(map(len, lines)) <= 100
+    assert max(map(len, lines)) <= 80
     assert not any("…" in line for line in lines)
     for name in ("weight", "worst", "LO-RANSAC"):
         assert any(name in line for line in lines)

@@ -8,8 +8,10 @@ import difflib
 import functools
 import importlib
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+import math
+import types
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from omegaconf import OmegaConf
 
@@ -36,15 +38,17 @@ def build(config: Any, path: str = "config", packages: Sequence[str] | None = No
 
     ``packages`` limits what ``_target_`` may name to objects defined in these packages (None: any).
     ``_partial_: true`` gives the class with these arguments bound, not yet called.
-    Raises GhptConfigError, naming the key's path, for an unknown target or argument or a missing argument.
+    Raises GhptConfigError, naming the key's path, for an unknown target or argument, a missing argument, and a value
+    that is not of its parameter's type.
     """
     if isinstance(config, Mapping):
         values = {k: build(v, f"{path}.{k}", packages) for k, v in config.items() if k not in ("_target_", "_partial_")}
         if "_target_" not in config:
             return values
         target = _locate(config["_target_"], path, packages)
-        _check_arguments(target, values, path, partial=bool(config.get("_partial_")))
-        return functools.partial(target, **values) if config.get("_partial_") else target(**values)
+        partial = bool(config.get("_partial_"))
+        check_arguments(target, values, path, partial)
+        return functools.partial(target, **values) if partial else target(**values)
     if isinstance(config, list | tuple):
         return [build(v, f"{path}[{i}]", packages) for i, v in enumerate(config)]
     return config
@@ -84,16 +88,89 @@ def _is_module(name: str) -> bool:
     return True
 
 
-def _check_arguments(target: Any, values: Mapping[str, Any], path: str, partial: bool) -> None:
-    try:
-        parameters = inspect.signature(target).parameters.values()
-    except ValueError:
-        return
-    named = [p for p in parameters if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY)]
-    if not any(p.kind is p.VAR_KEYWORD for p in parameters):
-        for key in set(values) - {p.name for p in named}:
-            mend = suggest(key, (p.name for p in named))
-            raise GhptConfigError(f"{path}.{key}", f"{target.__qualname__} has no such setting", mend)
-    missing = [p.name for p in named if p.default is p.empty and p.name not in values]
+def check_arguments(target: Any, values: Mapping[str, Any], path: str, partial: bool = False) -> None:
+    """Raise GhptConfigError unless ``target(**values)`` has its arguments, by name and by annotated type.
+
+    ``partial``: more may come later. ``path`` is the key that the values stand under.
+    """
+    parameters, open_ended = _parameters(target)
+    for key, value in values.items():
+        if key in parameters:
+            check_type(value, parameters[key][0], f"{path}.{key}")
+        elif not open_ended:
+            raise GhptConfigError(
+                f"{path}.{key}", f"{target.__qualname__} has no such setting", suggest(key, parameters)
+            )
+    missing = [name for name, (_, required) in parameters.items() if required and name not in values]
     if missing and not partial:
         raise GhptConfigError(path, f"{target.__qualname__} needs {', '.join(missing)}", "Set it in the yaml.")
+
+
+def check_type(value: Any, wanted: Any, key: str) -> None:
+    """Raise GhptConfigError unless a plain value is what the annotation ``wanted`` says; an integer is a number too."""
+    if is_typeddict(wanted) and isinstance(value, Mapping):
+        for name, inner in get_type_hints(wanted).items():
+            if name not in value:
+                raise GhptConfigError(f"{key}.{name}".lstrip("."), "is missing", "Set it in the yaml.")
+            check_type(value[name], inner, f"{key}.{name}".lstrip("."))
+    elif not _fits(value, wanted):
+        shown = "null" if value is None else repr(value)
+        raise GhptConfigError(key, f"is {shown}, not {_words(wanted)}", "Give a value of this kind.")
+
+
+def _parameters(target: Any) -> tuple[dict[str, tuple[Any, bool]], bool]:
+    """Name -> (annotation, required), with what ``**settings`` hands on to parent classes; whether any name goes."""
+    found: dict[str, tuple[Any, bool]] = {}
+    own = int(inspect.isclass(target))  # self is no setting
+    for function in [vars(c)["__init__"] for c in target.__mro__ if "__init__" in vars(c)] if own else [target]:
+        try:
+            signature = inspect.signature(function).parameters.values()
+        except ValueError:  # of C, without a signature
+            return found, True
+        try:
+            hints = get_type_hints(function)
+        except (NameError, TypeError):  # names that exist for type checkers alone
+            hints = {}
+        for p in list(signature)[own:]:
+            if p.kind in (p.POSITIONAL_OR_KEYWORD, p.KEYWORD_ONLY):
+                found.setdefault(p.name, (hints.get(p.name, Any), p.default is p.empty))
+        if not any(p.kind is p.VAR_KEYWORD for p in signature):
+            return found, False
+    return found, True
+
+
+_SCALARS = {int: "an integer", float: "a finite number", bool: "true or false", str: "text", types.NoneType: "null"}
+
+
+def _fits(value: Any, wanted: Any) -> bool:
+    origin, inner = get_origin(wanted), get_args(wanted)
+    if origin in (Union, types.UnionType):
+        return any(_fits(value, one) for one in inner)
+    if origin is Literal:
+        return value in inner
+    if wanted is float:
+        return type(value) in (int, float) and math.isfinite(value)
+    if wanted in _SCALARS:
+        return type(value) is wanted  # true is no integer
+    if origin is Callable:
+        return callable(value)
+    if origin in (list, tuple, Sequence, Iterable):
+        return isinstance(value, list | tuple) and (len(inner) != 1 or all(_fits(one, inner[0]) for one in value))
+    if origin in (dict, Mapping) or is_typeddict(wanted):
+        return isinstance(value, Mapping)
+    return not isinstance(wanted, type) or wanted is object or type(value) not in _SCALARS
+
+
+def _words(wanted: Any) -> str:
+    """What ``_fits`` looks for, for people."""
+    origin, inner = get_origin(wanted), get_args(wanted)
+    if origin in (Union, types.UnionType):
+        plain_ones = [one for one in inner if one in _SCALARS]
+        return " or ".join(dict.fromkeys(map(_words, plain_ones or inner)))
+    if origin is Literal:
+        return "one of " + ", ".join(map(repr, inner))
+    if origin in (list, tuple, Sequence, Iterable):
+        return "a list" + (f" ({_words(inner[0])} each)" if inner else "")
+    if origin in (dict, Mapping) or is_typeddict(wanted):
+        return "a group of settings"
+    return _SCALARS.get(wanted) or f"a {getattr(wanted, '__name__', wanted)}: a group of settings with _target_"

@@ -1,12 +1,11 @@
 """Testing: predictions first, then every number, table and figure from the predictions."""
 
+import logging
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
-import lightning as L
-
-from ghpt.config import build
+from ghpt.config import build, check_type
 from ghpt.errors import GhptCheckpointError
 from ghpt.files import sweep_temporaries
 from ghpt.models.checkpoint import load_model
@@ -14,9 +13,23 @@ from ghpt.provenance import provenance
 from ghpt.report.collect import CollectPredictions
 from ghpt.report.evaluate import evaluate, write_metrics
 from ghpt.report.predictions import open_predictions
-from ghpt.report.tables import print_table, write_report
+from ghpt.report.tables import print_table, title, write_report
 from ghpt.report.tensorboard import write_events
-from ghpt.train import progress
+from ghpt.train import make_trainer, progress, shell_status, shown
+
+_log = logging.getLogger(__name__)
+
+
+class Settings(TypedDict):
+    """What `test` needs of the configuration."""
+
+    ckpt: str | None
+    hypotheses: int | None
+    data: dict[str, Any]
+    baselines: dict[str, Any]
+    trainer: dict[str, Any]
+    seed: int
+    progress_bar: bool
 
 
 def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
@@ -24,6 +37,7 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
 
     Writes predictions.npz, metrics.json, report.md and TensorBoard events into ``output`` and prints the table.
     """
+    check_type(config, Settings, "")
     if not config["ckpt"]:
         raise GhptCheckpointError("ckpt", "is missing", "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m")
     model, trained = load_model(config["ckpt"], hypotheses=config["hypotheses"], seed=config["seed"])
@@ -33,17 +47,17 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
         "data": data.name, "source": data.source, "split": data.evaluate, "seed": config["seed"],
         "hypotheses": model.hypotheses, "provenance": origin,
     }  # fmt: skip
-    sweep_temporaries(output)
-    shutil.rmtree(output / ".predictions", ignore_errors=True)  # what an interrupted test left
-    trainer = L.Trainer(
-        **build(config["trainer"], "trainer"),
+    trainer = make_trainer(
+        config["trainer"],
         default_root_dir=output,
         logger=False,
         callbacks=[CollectPredictions(output, build(config["baselines"], "baselines"), meta), *progress(config)],
         enable_progress_bar=config["progress_bar"],
-        use_distributed_sampler=False,
     )
-    trainer.test(model, datamodule=data, verbose=False)
+    sweep_temporaries(output)
+    shutil.rmtree(output / ".predictions", ignore_errors=True)  # what an interrupted test left
+    with shell_status():
+        trainer.test(model, datamodule=data, verbose=False)
     if not trainer.is_global_zero:
         return {}
     predictions = open_predictions(output / "predictions.npz")
@@ -52,7 +66,15 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
     write_report(output / "report.md", metrics)
     write_events(output, predictions, metrics)
     print_table(metrics)
+    _log.info("Report: %s, beside it metrics.json and predictions.npz.", shown(output / "report.md"))
+    _log.info("Figures: tensorboard --logdir %s", shown(output))
     return metrics
+
+
+def summary(metrics: dict[str, Any]) -> str:
+    """What `test` returned, in words."""
+    error = metrics["selections"]["weight"]["mpjpe_relative"]
+    return f"{title(metrics)}: {'–' if error is None else f'{error:.1f} mm'}"
 
 
 test.__test__ = False  # not one for pytest

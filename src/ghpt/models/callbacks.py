@@ -6,7 +6,7 @@ from types import FrameType
 from typing import Any
 
 import lightning as L
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressBar
 
 from ghpt.errors import check
 from ghpt.models.checkpoint import FIELD
@@ -23,6 +23,8 @@ class SaveLast(Callback):
         check(every >= 1, "save_every", f"is {every}", "It must be >= 1 step.")
         self.path, self.every, self.identity = path, every, identity
         self.interrupted = False
+        self.saved: int | None = None
+        """The optimiser step that ``last.ckpt`` holds, if this run wrote it."""
         self._previous: Any = None
 
     def on_save_checkpoint(self, trainer: L.Trainer, module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
@@ -50,6 +52,7 @@ class SaveLast(Callback):
     def _save(self, trainer: L.Trainer, due: bool) -> None:
         if due or self.interrupted or trainer.received_sigterm:
             trainer.save_checkpoint(self.path, weights_only=False)
+            self.saved = trainer.global_step
         if self.interrupted:
             raise KeyboardInterrupt
 
@@ -57,6 +60,27 @@ class SaveLast(Callback):
         if self._previous is not None:
             signal.signal(signal.SIGINT, self._previous)
             self._previous = None
+
+
+class LogHyperparameters(Callback):
+    """At the end of training, the settings and the final validation errors side by side in TensorBoard."""
+
+    def __init__(self, values: dict[str, Any]) -> None:
+        self.values = values
+
+    def on_fit_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        errors = {k: v.item() for k, v in trainer.callback_metrics.items() if k.startswith("validation/")}
+        if trainer.logger and errors:
+            final = {k.replace("validation/", "final/"): v for k, v in errors.items()}
+            trainer.logger.log_hyperparams(self.values, final)
+
+
+class Progress(RichProgressBar):
+    """Lightning's bar, short enough for 80 columns."""
+
+    def get_metrics(self, trainer: L.Trainer, module: L.LightningModule) -> dict[str, Any]:
+        error = trainer.progress_bar_metrics.get("validation/weight")
+        return {} if error is None else {"mm": f"{error:.1f}"}
 
 
 def best_checkpoint(folder: Path) -> ModelCheckpoint:

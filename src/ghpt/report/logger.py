@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from lightning.fabric.loggers import TensorBoardLogger as EventsOnly
 from lightning.pytorch.loggers import TensorBoardLogger
 
 _log = logging.getLogger(__name__)
@@ -26,7 +27,10 @@ def _forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class ForgivingTensorBoard(TensorBoardLogger):
-    """Event files directly in ``folder``. A failure is counted in ``failures`` and said once."""
+    """Event files directly in ``folder``, and no hparams.yaml: the checkpoint has all settings.
+
+    A failure is counted in ``failures`` and said once.
+    """
 
     def __init__(self, folder: Path) -> None:
         super().__init__(save_dir=folder, name="", version="", default_hp_metric=False)
@@ -34,5 +38,5 @@ class ForgivingTensorBoard(TensorBoardLogger):
 
     log_metrics = _forgiving(TensorBoardLogger.log_metrics)
     log_hyperparams = _forgiving(TensorBoardLogger.log_hyperparams)
-    save = _forgiving(TensorBoardLogger.save)
+    save = _forgiving(EventsOnly.save)
     finalize = _forgiving(TensorBoardLogger.finalize)

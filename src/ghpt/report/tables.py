@@ -30,6 +30,9 @@ NAMES = {
 
 NONE = "–"
 COLUMNS = ("selection", "absolute", "relative", "aligned", "6 joints", "coverage", "paper", "difference")
+_TERMINAL = dict(zip(COLUMNS, ("selection", "abs", "rel", "PA", "6 j", "cov %", "paper", "diff %"), strict=True))
+_CAPTION = """abs: in the world; rel: relative to the pelvis; PA: Procrustes-aligned
+6 j: rel, elbows wrists knees; cov: joints estimated; diff: rel to paper"""
 _MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 _PER_ACTION = ("weight", "average", "best", "linear", "ransac")
 
@@ -68,12 +71,15 @@ def main_rows(metrics: Mapping[str, Any]) -> Rows:
 
 
 def print_table(metrics: Mapping[str, Any], console: Console | None = None) -> None:
-    """Print the main table to the terminal (or to ``console``)."""
-    table = Table(title=f"MPJPE in mm on {title(metrics)}", caption="difference: of the relative MPJPE to the paper's")
-    for column in COLUMNS:
-        table.add_column(column, justify="left" if column == COLUMNS[0] else "right", no_wrap=True)
+    """Print the main table to the terminal (or to ``console``), in 80 columns."""
+    table = Table(
+        title=f"MPJPE in mm on {title(metrics)}", caption=_CAPTION, title_justify="left", caption_justify="left"
+    )
+    for column, short in _TERMINAL.items():
+        table.add_column(short, justify="left" if column == COLUMNS[0] else "right", no_wrap=True)
     for name, row in zip(metrics["selections"], main_rows(metrics), strict=True):
-        table.add_row(*row, end_section=name == SELECTIONS[-1], style="bold" if name == "weight" else None)
+        cells = [cell.removesuffix(" %") for cell in row]
+        table.add_row(*cells, end_section=name == SELECTIONS[-1], style="bold" if name == "weight" else None)
     (console or Console()).print(table)
 
 

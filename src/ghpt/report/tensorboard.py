@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
+from torch.utils.tensorboard.summary import hparams
 
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.recording import PoseEstimate
@@ -113,7 +114,11 @@ def _hyperparameters(writer: SummaryWriter, predictions: Predictions, metrics: M
         for name, numbers in metrics["selections"].items()
         if numbers["mpjpe_relative"] is not None
     }
-    writer.add_hparams({k: v for k, v in values.items() if v is not None}, numbers, run_name=".")
+    # writer.add_hparams would write them to a second event file.
+    for summary in hparams({k: v for k, v in values.items() if v is not None}, numbers):
+        writer._get_file_writer().add_summary(summary)
+    for name, number in numbers.items():
+        writer.add_scalar(name, number, 0)
 
 
 def _sample(predictions: Predictions) -> Iterator[tuple[int, PredictionChunk]]:
