@@ -15,7 +15,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ghpt.config import plain, suggest
@@ -41,7 +41,7 @@ def run(
     jobs: list[str] = []
     failed: list[Exception] = []
 
-    def job(config: DictConfig) -> None:
+    def job(config: Any) -> None:
         _quieten()
         sys.argv[:] = command
         job_of_sweep = HydraConfig.get().mode == RunMode.MULTIRUN
@@ -102,9 +102,9 @@ def check_overrides(conf: Path, config_name: str, words: Sequence[str]) -> list[
     for override in overrides:
         if (conf / override.key_or_group).is_dir() and not override.is_delete():
             chosen = [_check_choice(conf, override.key_or_group, value) for value in _values(override)]
-            groups[override.key_or_group] = f"{override.get_key_element()}={chosen[0] or 'null'}"
+            groups[override.key_or_group] = f"{override.get_key_element()}={chosen[0]}"
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-        config = hydra.compose(config_name, overrides=list(groups.values()))
+        config: Any = OmegaConf.to_container(hydra.compose(config_name, overrides=list(groups.values())))
     for override in overrides:
         key = override.key_or_group
         if key not in groups and not key.startswith("hydra") and "@" not in key and not (conf / key).is_dir():
@@ -129,29 +129,30 @@ def _values(override: Override) -> list[Any]:
 def _check_choice(conf: Path, group: str, value: Any) -> Any:
     existing = sorted(path.stem for path in (conf / group).glob("[!_]*.yaml"))
     for name in value if isinstance(value, list) else [value]:
-        if name not in (None, "null", *existing):
-            raise GhptConfigError(group, f"there is no {name!r}", suggest(str(name), existing))
+        if name not in existing:
+            shown = "null" if name is None else repr(name)
+            raise GhptConfigError(group, f"there is no {shown}", suggest(str(name), existing))
     return value if not isinstance(value, list) else f"[{','.join(map(str, value))}]"
 
 
-def _check_key(config: DictConfig, key: str, added: bool) -> None:
+def _check_key(config: dict[str, Any], key: str, added: bool) -> None:
     node: Any = config
     parts = key.split(".")
     for depth, part in enumerate(parts):
-        if not isinstance(node, DictConfig) or part not in node:
+        if not isinstance(node, dict) or part not in node:
             if added and depth:
                 return  # whatever is built from it knows its settings
             above = ".".join(parts[:depth])
+            mend = suggest(part, node if isinstance(node, dict) else [])
             elsewhere = [path for path in _paths(config) if path.endswith(f".{parts[-1]}")]
-            mend = suggest(part, node if isinstance(node, DictConfig) else [])
             if elsewhere and "Did you mean" not in mend:
                 mend = f"Did you mean {elsewhere[0]!r}? {mend}"
             raise GhptConfigError(key, f"no such setting{f' in {above}' if above else ''}", mend)
-        node = OmegaConf.select(node, part) if not OmegaConf.is_missing(node, part) else None
+        node = node[part]
 
 
-def _paths(node: DictConfig, above: str = "") -> Iterator[str]:
-    for key in node:
+def _paths(node: dict[str, Any], above: str = "") -> Iterator[str]:
+    for key, value in node.items():
         yield f"{above}{key}"
-        if not OmegaConf.is_interpolation(node, key) and isinstance(node[key], DictConfig):
-            yield from _paths(node[key], f"{above}{key}.")
+        if isinstance(value, dict):
+            yield from _paths(value, f"{above}{key}.")
