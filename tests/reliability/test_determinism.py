@@ -1,0 +1,93 @@
+"""C1 and C4: the same command gives the same bytes; a frame's result does not depend on its batch."""
+
+import copy
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+import toys
+from ghpt.models.checkpoint import read_checkpoint
+from ghpt.test import test as run_test
+from ghpt.train import train
+
+SCRIPT = Path(__file__).with_name("run_toy.py")
+BASELINES = {
+    "linear": {"_target_": "ghpt.models.baselines.Linear"},
+    "ransac": {"_target_": "ghpt.models.baselines.Ransac", "threshold": 0.02, "pairs": 4, "seed": 0},
+}
+
+
+def arrays(folder):
+    with np.load(folder / "predictions.npz") as file:
+        return {name: file[name] for name in file.files if name != "meta"}
+
+
+def test_c1_the_same_command_twice(tmp_path, record_row):
+    """Fresh processes, another working folder, another hash seed."""
+    results = []
+    for number, hash_seed in enumerate(("0", "12345")):
+        folder, cwd = tmp_path / f"run{number}", tmp_path / f"cwd{number}"
+        cwd.mkdir()
+        environment = os.environ | {
+            "PYTHONPATH": str(SCRIPT.parents[1]), "PYTHONHASHSEED": hash_seed, "OMP_NUM_THREADS": "1",
+            "GHPT_CACHE": str(tmp_path / f"cache{number}"),
+        }  # fmt: skip
+        command = [sys.executable, str(SCRIPT), str(folder), json.dumps({"test": True})]
+        subprocess.run(command, cwd=cwd, env=environment, check=True, capture_output=True, timeout=200)
+        results.append((read_checkpoint(folder / "last.ckpt")["state_dict"], arrays(folder)))
+    (weights, first), (again, second) = results
+    same = sum(torch.equal(v, again[k]) for k, v in weights.items())
+    same += sum(v.tobytes() == second[k].tobytes() for k, v in first.items())
+    total = len(weights) + len(first)
+    record_row("C1", f"the same command twice: {same} of {total} arrays identical to the bit", same, total)
+    assert same == total
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("c4")
+    train(copy.deepcopy(toys.TRAIN), folder)
+    return folder / "last.ckpt"
+
+
+def predictions_of(checkpoint, folder, threads, **data):
+    config = copy.deepcopy(toys.TRAIN) | {"ckpt": str(checkpoint), "hypotheses": None, "baselines": BASELINES}
+    config["data"] |= data
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    try:
+        run_test(config, folder)
+    finally:
+        torch.set_num_threads(before)
+    return arrays(folder)
+
+
+def test_c4_batch_size_threads_and_workers_do_not_matter(tmp_path, checkpoint, record_row):
+    reference = predictions_of(checkpoint, tmp_path / "reference", 1, batch_size=16)
+    runs = [(1, 1, 0), (7, 1, 0), (64, 2, 0), (4096, 1, 0), (16, 2, 2)]
+    worst, differing = 0.0, 0
+    for batch_size, threads, workers in runs:
+        folder = tmp_path / f"{batch_size}-{threads}-{workers}"
+        found = predictions_of(checkpoint, folder, threads, batch_size=batch_size, workers=workers)
+        for name, value in reference.items():
+            if name.startswith(("points_", "weights_")) and name not in (
+                "points_random",
+                "points_best",
+                "points_worst",
+            ):
+                assert np.array_equal(np.isnan(value), np.isnan(found[name]))
+                worst = max(worst, np.nanmax(np.abs(value.astype(np.float64) - found[name]), initial=0))
+            else:
+                differing += value.tobytes() != found[name].tobytes()
+    figure = (
+        f"{len(runs)} ways to batch: {differing} masks or learning-free arrays differ, learned ones by {worst:.2g} mm"
+    )
+    record_row("C4", figure, len(runs) if worst < 1e-2 and not differing else 0, len(runs))
+    assert differing == 0
+    assert worst < 1e-2  # the scorer is float32, and matrix products round by their shape
