@@ -28,13 +28,15 @@ NAME, RATE_HZ = "171026_pose3", 29.97
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="the folder to make; an existing one is replaced")
+    parser.add_argument("folder", type=Path, help="the folder to make; it must not exist yet")
     parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="the developers' real data")
     parser.add_argument("--detector", type=Path, default=ROOT / "conf" / "detector" / "panoptic.yaml")
     parser.add_argument("--seed", type=int, default=0, help="of the detections")
     parser.add_argument("--frames", type=int, default=None, help="only so many, from the start")
     arguments = parser.parse_args()
 
+    if arguments.folder.exists():
+        parser.error(f"{arguments.folder} exists; name a new folder")
     detector = Detector(**yaml.safe_load(arguments.detector.read_text(encoding="utf-8")))
     take = np.load(arguments.data / "panoptic" / f"{NAME}_joints19.npz")
     calibration = arguments.data / "panoptic" / "160906_band1" / "calibration_160906_band1.json"
