@@ -48,7 +48,14 @@ def build(config: Any, path: str = "config", packages: Sequence[str] | None = No
         target = _locate(config["_target_"], path, packages)
         partial = bool(config.get("_partial_"))
         check_arguments(target, values, path, partial)
-        return functools.partial(target, **values) if partial else target(**values)
+        if partial:
+            return functools.partial(target, **values)
+        try:
+            return target(**values)
+        except GhptConfigError as error:
+            if error.key not in values:
+                raise
+            raise GhptConfigError(f"{path}.{error.key}", error.problem, error.mend) from error
     if isinstance(config, list | tuple):
         return [build(v, f"{path}[{i}]", packages) for i, v in enumerate(config)]
     return config

@@ -1,0 +1,314 @@
+"""The command line as a user meets it: what it writes and says, how it fails, how it is stopped and goes on."""
+
+import json
+import logging
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import ghpt.test as testing
+import toys
+from ghpt.app import run
+from ghpt.models.checkpoint import read_checkpoint
+from ghpt.models.module import StochasticEstimator
+from ghpt.train import summary, train, typed
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALL = ("data=toy", "model.hypotheses=5", "model.scorer.layers=[4]", "trainer.accelerator=cpu", "progress_bar=false")
+
+
+@pytest.fixture(scope="module")
+def conf(tmp_path_factory):
+    """The project's own configuration with one more data set, which is made at once."""
+    folder = tmp_path_factory.mktemp("conf") / "conf"
+    shutil.copytree(ROOT / "conf", folder)
+    (folder / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
+    return folder
+
+
+@pytest.fixture
+def command(conf, monkeypatch, capfd):
+    """``command("train", *words)`` runs train.py in this process: (exit status, stdout, stderr)."""
+    handlers, level = list(logging.root.handlers), logging.root.level
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+
+    def call(name, *words):
+        os.environ["HYDRA_FULL_ERROR"] = "0"
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
+        status = 0
+        capfd.readouterr()
+        try:
+            run(conf, name, *((train, summary) if name == "train" else (testing.test, testing.summary)))
+        except SystemExit as stop:
+            status = stop.code
+            if isinstance(status, str):  # what Python itself would do with it
+                print(status, file=sys.stderr)
+                status = 1
+        finally:
+            for handler in set(logging.root.handlers) - set(handlers):
+                handler.close()
+            logging.root.handlers[:] = handlers
+            logging.root.setLevel(level)
+        return (status, *capfd.readouterr())
+
+    return call
+
+
+def files(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def events(folder):
+    (file,) = folder.glob("*tfevents*")
+    return EventAccumulator(str(file), size_guidance={"images": 0}).Reload()
+
+
+def test_train_then_test_as_typed(command, tmp_path):
+    output = tmp_path / "a run"
+    status, _, said = command("train", *SMALL, f"output='{output}'", "trainer.max_epochs=2")
+    assert status == 0
+    written = [re.sub(r"tfevents.*", "tfevents", name) for name in files(output)]
+    assert written == [
+        ".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml",
+        "best.ckpt", "events.out.tfevents", "last.ckpt", "train.log",
+    ]  # fmt: skip
+    assert re.search(
+        r"Validation on embedded \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n", said
+    )
+    assert said.replace("\n", "") in re.sub(r".* INFO ghpt\.train: |\n", "", (output / "train.log").read_text())
+    log = events(output)
+    assert {"train/total", "train/entropy", "validation/weight", "final/weight"} <= set(log.Tags()["scalars"])
+    assert "_hparams_/session_start_info" in log.summary_metadata
+
+    next_command = re.search(r"Test it: python test\.py (.*) data=h36m", said)[1]
+    assert next_command == f"\"ckpt='{output}/last.ckpt'\""  # quoted for the shell and for Hydra
+    tested = tmp_path / "tested"
+    status, table, said = command(
+        "test", next_command.strip('"'), "data=toy", f"output={tested}", "progress_bar=false", "trainer.accelerator=cpu"
+    )
+    assert status == 0
+    assert str(tested / "report.md") in said
+    assert max(map(len, table.splitlines())) <= 80
+    assert "…" not in table
+    log = events(tested)
+    assert {"mpjpe_relative/weight", "weights/entropy", "final/weight"} <= set(log.Tags()["scalars"])
+    assert log.Tags()["histograms"]
+    assert {"skeletons", "pose_prior/S0"} <= set(log.Tags()["images"])
+    assert "_hparams_/session_start_info" in log.summary_metadata
+    metrics = json.loads((tested / "metrics.json").read_text())
+    assert f"{metrics['selections']['weight']['mpjpe_relative']:.1f}" in table
+
+
+def test_a_frame_with_too_few_views_is_missing_in_the_file_and_never_invented(command, tmp_path):
+    few = ("data=toy", "data.missing=0.6", "progress_bar=false", "trainer.accelerator=cpu")
+    assert command("train", *few, "model.hypotheses=5", "model.scorer.layers=[4]", f"output={tmp_path / 'a'}")[0] == 0
+    assert command("test", *few, f"ckpt={tmp_path / 'a' / 'last.ckpt'}", f"output={tmp_path / 'b'}")[0] == 0
+    data = toys.ToyData(**{k: v for k, v in (toys.DATA | {"missing": 0.6}).items() if k != "_target_"})
+    data.setup("test")
+    enough = torch.from_numpy(
+        np.concatenate([recording.seen[::3].sum(axis=1) >= 2 for recording in data.frames["test"].recordings])
+    ).numpy()
+    assert 0.2 < enough.mean() < 0.9
+    with np.load(tmp_path / "b" / "predictions.npz") as arrays:
+        names = [name.removeprefix("points_") for name in arrays if name.startswith("points_")]
+        assert {"weight", "best", "linear", "ransac", "lo_ransac"} <= set(names)
+        for name in names:
+            assert not arrays[f"estimated_{name}"][~enough].any(), name
+            np.testing.assert_array_equal(np.isnan(arrays[f"points_{name}"]).all(-1), ~arrays[f"estimated_{name}"])
+    metrics = json.loads((tmp_path / "b" / "metrics.json").read_text())
+    assert metrics["selections"]["linear"]["coverage"] == pytest.approx(enough.mean(), abs=0.02)
+
+
+def test_a_sweep_runs_on_after_a_failure_and_says_which(command, tmp_path):
+    words = (*SMALL, "model.temperature=-1.0,2.0", "trainer.max_epochs=1", f"output={tmp_path}")
+    status, said, _ = command("train", "-m", *words)
+    assert status == 1
+    failed, done = said.split("Jobs of the sweep:\n")[1].splitlines()
+    assert failed.startswith("  0_model.temperature--1.0: error: model.temperature: is -1.0.")
+    assert re.fullmatch(r"  1_model\.temperature-2\.0: weight \d.* mm, random \d.* mm", done)
+    assert not (tmp_path / "0_model.temperature--1.0" / "last.ckpt").exists()
+    assert "error: model.temperature: is -1.0" in (tmp_path / "0_model.temperature--1.0" / "train.log").read_text()
+    assert read_checkpoint(tmp_path / "1_model.temperature-2.0" / "last.ckpt")
+
+
+TYPOS = {
+    "data=cmu9": r"data: there is no 'cmu9'\. Did you mean 'cmu4'\? Existing: cmu1, cmu2, cmu3, cmu4, h36m, ",
+    "dat=cmu1": r"dat: no such setting\. Did you mean 'data'\? ",
+    "data.strid=1": r"data\.strid: no such setting in data\. Did you mean 'stride'\? ",
+    "data.embedded.detector.nois=1": r"data\.embedded\.detector\.nois: .* Did you mean 'noise'\? ",
+    "model=posee": r"model: there is no 'posee'\. Did you mean 'pose'\? ",
+    "model.hypothesis=3": r"model\.hypothesis: no such setting in model\. Did you mean 'hypotheses'\? ",
+    "model.scorer.layer=3": r"model\.scorer\.layer: .* Did you mean 'layers'\? ",
+    "+model.scorer.layer=3": r"model\.scorer\.layer: Scorer has no such setting\. Did you mean 'layers'\? ",
+    "trainer.max_epoch=1": r"trainer\.max_epoch: .* Did you mean 'max_epochs'\? ",
+    "+trainer.max_step=1": r"trainer\.max_step: Trainer has no such setting\. Did you mean 'max_steps'\? ",
+    "+trainer.callbacks=[]": r"trainer\.callbacks: is not for the configuration: ghpt sets it",
+    "experiment=x": r"experiment: there is no 'x'\. Existing: coordinates_only, ",
+    "experiment=null": r"experiment: there is no null\. Existing: ",
+    "+foo=1": r"foo: no such setting\. Existing: data, model, ",
+    "+data.foo=1": r"data\.foo: Panoptic has no such setting\. Existing: batch_size, ",
+    "lr=0.1": r"lr: no such setting\. Did you mean 'model\.optimizer\.lr'\? ",
+    "cmu2": r"cmu2: is not of the form key=value\. ",
+    "model.scorer.layers=[1": r"model\.scorer\.layers=\[1: is not of the form key=value\. ",
+    "model.hypotheses=abc": r"model\.hypotheses: is 'abc', not an integer\. ",
+    "model.hypotheses=2.5": r"model\.hypotheses: is 2\.5, not an integer\. ",
+    "model.gumbel=3": r"model\.gumbel: is 3, not true or false\. ",
+    "model.temperature=-1.0": r"model\.temperature: is -1\.0\. ",
+    "model.temperature=nan": r"model\.temperature: is nan, not a finite number\. ",
+    "model.problem=3": r"model\.problem: is 3, not a ",
+    "model.scorer.layers=7": r"model\.scorer\.layers: is 7, not a list \(an integer each\)\. ",
+    "model.scorer.layers=[a]": r"model\.scorer\.layers: is \['a'\], not a list \(an integer each\)\. ",
+    "model.optimizer.lr=abc": r"model\.optimizer\.lr: is 'abc', not a finite number\. ",
+    "model.optimizer.lr=-1": r"model\.optimizer: Invalid learning rate: -1\. ",
+    "model._target_=ghpt.models.modul.X": r"model\._target_: no class 'ghpt\.models\.modul\.X'\. ",
+    "data.batch_size=0": r"data\.batch_size: is 0\. ",
+    "data.cameras=3": r"data\.cameras: is 3, not a list \(an integer each\)\. ",
+    "data.evaluate=tset": r"data\.evaluate: is 'tset'\. Existing: train, validation, test\.",
+    "data.root=/no/such": r"/no/such: data\.root: there is no such folder\. ",
+    "seed=abc": r"seed: is 'abc', not an integer\. ",
+    "resume=3": r"resume: is 3, not true or false\. ",
+    "save_every=0": r"save_every: is 0\. ",
+    "trainer.accelerator=gpuu": r"trainer: You selected an invalid accelerator name: ",
+    "trainer.max_epochs=x": r"trainer\.max_epochs: is 'x', not an integer or null\. ",
+    "resume=true": r".*last\.ckpt: there is no such file\. ",
+    "output=/proc/no": r"output: .*'/proc/no'\. Name a folder that can be written\. ?",
+}
+
+
+@pytest.mark.parametrize("typo", TYPOS)
+def test_a_mistake_ends_in_one_line_that_names_it(command, tmp_path, typo):
+    status, out, said = command("train", f"output={tmp_path}", "progress_bar=false", typo)
+    assert status == 1
+    assert re.fullmatch(f"error: {TYPOS[typo]}.*\n", said), said
+    assert out == ""
+    assert not [name for name in files(tmp_path) if not name.startswith(".hydra/") and name != "train.log"]
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        (None, "ckpt: is missing. Name one: python test.py ckpt="),
+        ("ckpt=/no/such.ckpt", "/no/such.ckpt: there is no such file. Give the last.ckpt or best.ckpt"),
+        ("ckpt=3", "ckpt: is 3, not text or null"),
+        ("hypotheses=many", "hypotheses: is 'many', not an integer or null"),
+        (
+            "baselines.ransac.pair=3",
+            "baselines.ransac.pair: no such setting in baselines.ransac. Did you mean 'pairs'?",
+        ),
+        ("model=pose", "Could not override 'model'."),
+    ],
+)
+def test_a_mistake_in_testing(command, tmp_path, word, message):
+    status, _, said = command("test", f"output={tmp_path}", *([word] if word else []))
+    assert status == 1
+    assert said.startswith(f"error: {message}")
+    assert said.count("\n") == 1
+
+
+def test_an_output_that_cannot_hold_the_log(command, tmp_path):
+    (tmp_path / "train.log").mkdir()
+    status, _, said = command("train", *SMALL, f"output={tmp_path}")
+    assert status == 1
+    assert re.fullmatch(r"error: output: .*Is a directory.*train\.log.*\n", said)
+
+
+def test_the_trace_is_shown_to_who_asks_for_it(conf, tmp_path):
+    words = [sys.executable, str(ROOT / "train.py"), f"output={tmp_path}", "data=cmu9"]
+    quiet = subprocess.run(words, capture_output=True, text=True)
+    assert (quiet.returncode, quiet.stderr.count("\n"), quiet.stdout) == (1, 1, "")
+    loud = subprocess.run(words, capture_output=True, text=True, env=os.environ | {"HYDRA_FULL_ERROR": "1"})
+    assert loud.returncode == 1
+    assert "Traceback" in loud.stderr
+    assert "GhptConfigError: data: there is no 'cmu9'" in loud.stderr
+
+
+def test_values_are_typed_as_shell_and_hydra_take_them():
+    assert typed("ckpt", "runs/1_a-2.0/last.ckpt") == "ckpt=runs/1_a-2.0/last.ckpt"
+    assert typed("ckpt", "a b/[1],x=2") == "\"ckpt='a b/[1],x=2'\""
+
+
+@contextmanager
+def restored(number):
+    """Lightning leaves an interrupt ignored."""
+    before = signal.getsignal(number)
+    try:
+        yield
+    finally:
+        signal.signal(number, before)
+
+
+STOPPED = {"trainer": {"max_epochs": 20}, "train": {"save_every": 2}}
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("whole")
+    train(toys.TRAIN | STOPPED["train"] | {"trainer": toys.TRAINER | STOPPED["trainer"]}, folder)
+    return read_checkpoint(folder / "last.ckpt")
+
+
+@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(tmp_path, uninterrupted, number, status):
+    script = ROOT / "tests" / "reliability" / "run_toy.py"
+    child = subprocess.Popen(
+        [sys.executable, str(script), str(tmp_path), json.dumps(STOPPED)], text=True, stderr=subprocess.PIPE,
+        env=os.environ | {"PYTHONPATH": str(ROOT / "tests"), "OMP_NUM_THREADS": "1"},
+    )  # fmt: skip
+    last = tmp_path / "last.ckpt"
+    while not last.exists():
+        assert child.poll() is None, "training ended before its first save"
+        time.sleep(0.01)
+    child.send_signal(number)
+    _, said = child.communicate(timeout=60)
+    assert child.returncode == status, said
+    stopped = read_checkpoint(last)["global_step"]
+    assert 0 < stopped < uninterrupted["global_step"]
+    assert f"last.ckpt holds training step {stopped}.\n" in said
+    assert f"Go on with the same command and output={tmp_path} resume=true" in said
+    assert "Traceback" not in said
+    assert not [path for path in tmp_path.iterdir() if path.name.endswith(".tmp")]
+    train(toys.TRAIN | STOPPED["train"] | {"resume": True, "trainer": toys.TRAINER | STOPPED["trainer"]}, tmp_path)
+    resumed = read_checkpoint(last)
+    assert resumed["global_step"] == uninterrupted["global_step"]
+    for key, value in uninterrupted["state_dict"].items():
+        assert torch.equal(resumed["state_dict"][key], value), key
+
+
+def test_a_second_interrupt_takes_effect_at_once(tmp_path, monkeypatch):
+    """Sent within a step, of which the first waits for the end."""
+    reached = []
+
+    def interrupted_twice(self, batch, batch_idx):
+        os.kill(os.getpid(), signal.SIGINT)
+        reached.append("between")
+        os.kill(os.getpid(), signal.SIGINT)
+        reached.append("after")
+
+    monkeypatch.setattr(StochasticEstimator, "training_step", interrupted_twice)
+    with restored(signal.SIGINT), pytest.raises(SystemExit) as stop:
+        train(toys.TRAIN, tmp_path)
+    assert (stop.value.code, reached) == (130, ["between"])
+    assert not [name for name in files(tmp_path) if "tfevents" not in name]
+
+
+def test_an_interrupt_while_the_data_are_prepared_leaves_nothing(tmp_path, monkeypatch):
+    def interrupted(self, split):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(toys.ToyData, "make", interrupted)
+    with restored(signal.SIGINT), pytest.raises(SystemExit) as stop:
+        train(toys.TRAIN | {"data": toys.DATA | {"cache": str(tmp_path / "cache")}}, tmp_path / "run")
+    assert stop.value.code == 130
+    assert files(tmp_path) == []
