@@ -141,4 +141,4 @@ def _draw(axes: Axes, points: Float[np.ndarray, "17 2"]) -> None:
 
 def _scale_bar(axes: Axes, low: Float[np.ndarray, "2"]) -> None:
     axes.plot([low[0] + 20, low[0] + 520], [low[1] + 30] * 2, color=MIDDLE, linewidth=1.5)
-    axes.text(low[0] + 270, low[1] + 45, "500 mm", ha="center", va="bottom", fontsize=8)
+    axes.text(low[0] + 540, low[1] + 30, "500 mm", ha="left", va="center", fontsize=8)
