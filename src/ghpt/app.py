@@ -85,9 +85,12 @@ def run(
 
 def _quieten() -> None:
     """Leave out what Lightning says that its users can neither use nor mend."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", r".*treespec, LeafSpec.* is deprecated")
     warnings.filterwarnings("ignore", r".*does not have many workers")  # reading is memory-mapped
+    warnings.filterwarnings("ignore", r"torch\.distributed\.nn\.functional\.all_gather is deprecated")
+    warnings.filterwarnings("ignore", r"It is recommended to use `self\.log\('validation/.*sync_dist=True")  # they are
     warnings.filterwarnings("ignore", r"Checkpoint directory .* exists and is not empty")
 
 

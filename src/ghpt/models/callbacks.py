@@ -42,6 +42,8 @@ class SaveLast(Callback):
         self.interrupted = True
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
+        if trainer.world_size > 1:  # or one process would wait for the others' part of a checkpoint
+            self.interrupted = trainer.strategy.reduce_boolean_decision(self.interrupted, all=False)
         # Not between an epoch's last step and its validation: resumed there, Lightning would skip the validation.
         if not trainer.is_last_batch:
             self._save(trainer, due=trainer.global_step % self.every == 0)
