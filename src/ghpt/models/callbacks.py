@@ -1,21 +1,25 @@
 """When checkpoints are written."""
 
 import signal
+from contextlib import suppress
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from ghpt.errors import check
 from ghpt.models.checkpoint import FIELD
 
 
 class SaveLast(Callback):
-    """Keep ``last.ckpt`` up to date: every ``every`` steps, after each epoch, and when interrupted.
+    """Keep ``last.ckpt`` up to date: every ``every`` steps, after each epoch, and when stopped.
 
-    An interrupt (Ctrl-C) takes effect after the running step, so that what is saved is whole; a second one at once.
+    SIGINT (Ctrl-C) and SIGTERM take effect after the running step, so that what is saved is whole, and in all processes
+    at the same one; a second signal takes effect at once. (Lightning's own handler of SIGTERM has the processes wait
+    for each other where they are, which with two or more is for ever.)
     ``identity`` is what every checkpoint says of itself.
     """
 
@@ -25,20 +29,21 @@ class SaveLast(Callback):
         self.interrupted = False
         self.saved: int | None = None
         """The optimiser step that ``last.ckpt`` holds, if this run wrote it."""
-        self._previous: Any = None
+        self._stop: type[BaseException] = KeyboardInterrupt
+        self._previous: dict[int, Any] = {}
 
     def on_save_checkpoint(self, trainer: L.Trainer, module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
         checkpoint[FIELD] = self.identity
 
-    def on_fit_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        try:
-            self._previous = signal.signal(signal.SIGINT, self._interrupt)
-        except ValueError:  # not in the main thread: then nobody sends us SIGINT either
-            self._previous = None
+    def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            with suppress(ValueError):  # not in the main thread: then nobody sends us signals either
+                self._previous[number] = signal.signal(number, self._interrupt)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
+        self._stop = SIGTERMException if number == signal.SIGTERM else KeyboardInterrupt
         if self.interrupted:
-            raise KeyboardInterrupt
+            raise self._stop
         self.interrupted = True
 
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
@@ -52,16 +57,16 @@ class SaveLast(Callback):
         self._save(trainer, due=True)
 
     def _save(self, trainer: L.Trainer, due: bool) -> None:
-        if due or self.interrupted or trainer.received_sigterm:
+        if due or self.interrupted:
             trainer.save_checkpoint(self.path, weights_only=False)
             self.saved = trainer.global_step
         if self.interrupted:
-            raise KeyboardInterrupt
+            raise self._stop
 
     def teardown(self, trainer: L.Trainer, module: L.LightningModule, stage: str) -> None:
-        if self._previous is not None:
-            signal.signal(signal.SIGINT, self._previous)
-            self._previous = None
+        for number, handler in self._previous.items():
+            signal.signal(number, handler)
+        self._previous.clear()
 
 
 class LogHyperparameters(Callback):
