@@ -5,6 +5,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, TypedDict
 
+from ghpt.config import check_arguments
 from ghpt.data.datamodule import KeyPointDataModule
 from ghpt.data.detector import Detector
 from ghpt.data.embedded import embedded_recordings
@@ -28,6 +29,7 @@ class _Arrangement(KeyPointDataModule):
     def __init__(self, cameras: Sequence[int], embedded: Embedded, **settings: Any) -> None:
         super().__init__(**settings)
         check(len(cameras) >= 2, "data.cameras", f"is {list(cameras)}", "Triangulation needs at least 2 views.")
+        check_arguments(Detector, embedded["detector"], "data.embedded.detector")
         self.cameras, self.embedded = list(cameras), embedded
 
     def _embedded(self, split: str) -> Iterable[Recording]:

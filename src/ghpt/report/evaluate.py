@@ -35,8 +35,9 @@ class _Selection:
             MPJPE(kind, actions, len(JOINTS)) for kind in ("absolute", "relative", "aligned")
         )
         self.prior = PosePrior(subjects)
+        # One process reads the predictions of all; the others have nothing to add.
         for metric in (self.absolute, self.relative, self.aligned, self.prior):
-            metric.distributed_available_fn = lambda: False  # one process reads the predictions of all; the others have none to add
+            metric.distributed_available_fn = lambda: False
 
     def numbers(self) -> dict[str, float | None]:
         relative = self.relative.compute()
