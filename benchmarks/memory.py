@@ -60,7 +60,7 @@ def main() -> None:
     from measure import machine, settings, show
 
     wanted = settings(frames="1000,8000", hypotheses=20)
-    lengths, rows = [int(n) for n in wanted["frames"].split(",")], []
+    title, lengths, rows = machine(), [int(n) for n in wanted["frames"].split(",")], []
     with tempfile.TemporaryDirectory() as folder:
         train = ["train.py", "data=cmu2", "model=pose", "progress_bar=false", f"output={folder}/train"]
         measured = {}
@@ -73,7 +73,7 @@ def main() -> None:
         first, last = (measured[f"test, {count:,} frames"] for count in (lengths[0], lengths[-1]))
         slopes = [100_000 * (b - a) / (lengths[-1] - lengths[0]) for a, b in zip(first[:2], last[:2], strict=True)]
         rows.append(["growth in MiB per 100,000 frames", *(f"{slope:.0f}" for slope in slopes), ""])
-    show(machine(), ["peak memory, MiB", "whole", "private", "seconds"], rows)
+    show(title, ["peak memory, MiB", "whole", "private", "seconds"], rows)
 
 
 if __name__ == "__main__":

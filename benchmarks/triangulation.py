@@ -1,6 +1,6 @@
 """Speed and accuracy of triangulation beside its peers: ``python benchmarks/triangulation.py``.
 
-All methods get the same key points: 5 pixels of noise, one in fifty unseen, and in the second error one detection in
+All methods get key points of the same kind: 5 pixels of noise, one in fifty unseen, and in the second error one detection in
 ten 100 pixels off. A point is one joint of one frame; for subsets, of one hypothesis. pycolmap and the loop work point
 by point, so they get fewer frames.
 
