@@ -7,7 +7,7 @@ from ghpt.config import TRUSTED, build
 from ghpt.errors import GhptConfigError
 from ghpt.models.scorer import Scorer
 
-SCORER = {"_target_": "ghpt.models.scorer.Scorer", "size": 3, "layers": [4, 5], "clip": 10.0}
+SCORER = {"_target_": "ghpt.models.scorer.Scorer", "size": 3, "layers": [4, 5], "clip": 10.0, "bfloat16": False}
 
 
 def test_builds_nested_and_partial():

@@ -68,7 +68,7 @@ class NumbersData(L.LightningDataModule):
 def module(**changes):
     settings = {
         "problem": GuessTheNumber(),
-        "scorer": partial(Scorer, layers=[16], clip=10.0),
+        "scorer": partial(Scorer, layers=[16], clip=10.0, bfloat16=False),
         "loss": StochasticLoss(alpha=1.0, beta=0.01, gamma=0.02, relative_errors=True),
         "optimizer": partial(torch.optim.Adam, lr=0.02),
         "hypotheses": 20, "temperature": 1.5, "gumbel": True, "spread": 1.5, "selection": "weight", "seed": 0,

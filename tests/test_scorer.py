@@ -19,7 +19,7 @@ def test_standardised_training_features_have_mean_0_and_deviation_1():
 
 
 def test_statistics_travel_in_the_state():
-    a, b = (Scorer(3, [4], clip=5.0) for _ in range(2))
+    a, b = (Scorer(3, [4], clip=5.0, bfloat16=False) for _ in range(2))
     a.standardise.fit(torch.randn(10, 3, generator=torch.Generator().manual_seed(0)))
     b.load_state_dict(a.state_dict())
     x = torch.randn(2, 6, 3, generator=torch.Generator().manual_seed(1))
@@ -29,7 +29,7 @@ def test_statistics_travel_in_the_state():
 
 
 def test_each_hypothesis_is_scored_alone():
-    scorer = Scorer(3, [8, 8], clip=5.0).double()
+    scorer = Scorer(3, [8, 8], clip=5.0, bfloat16=False).double()
     x = torch.randn(2, 6, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     order = torch.tensor([3, 1, 5, 0, 2, 4])
     torch.testing.assert_close(scorer(x[:, order]), scorer(x)[:, order])
@@ -40,4 +40,17 @@ def test_each_hypothesis_is_scored_alone():
 )
 def test_out_of_range(settings, key):
     with pytest.raises(GhptConfigError, match=rf"model\.scorer\.{key}"):
-        Scorer(**({"size": 3, "layers": [4], "clip": 5.0} | settings))
+        Scorer(**({"size": 3, "layers": [4], "clip": 5.0, "bfloat16": False} | settings))
+
+
+def test_bfloat16_rounds_in_training_alone():
+    exact = Scorer(3, [64, 64], clip=5.0, bfloat16=False)
+    fast = Scorer(3, [64, 64], clip=5.0, bfloat16=True)
+    fast.load_state_dict(exact.state_dict())
+    x = torch.randn(40, 3, generator=torch.Generator().manual_seed(1))
+    assert fast(x).dtype == torch.float32
+    assert not torch.equal(fast(x), exact(x))
+    torch.testing.assert_close(fast(x), exact(x), atol=0.02, rtol=0.02)
+    fast(x).sum().backward()
+    assert fast.network[0].weight.grad.dtype == torch.float32
+    assert torch.equal(fast.eval()(x), exact(x))

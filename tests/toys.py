@@ -19,7 +19,10 @@ DATA = {
 MODEL = {
     "_target_": "ghpt.models.module.StochasticEstimator",
     "problem": {"_target_": "ghpt.models.pose.PoseTriangulation", "coordinates": True, "lengths": True},
-    "scorer": {"_target_": "ghpt.models.scorer.Scorer", "_partial_": True, "layers": [32, 16], "clip": 10.0},
+    "scorer": {
+        "_target_": "ghpt.models.scorer.Scorer", "_partial_": True,
+        "layers": [32, 16], "clip": 10.0, "bfloat16": False,
+    },
     "loss": {
         "_target_": "ghpt.models.loss.StochasticLoss",
         "alpha": 1.0, "beta": 0.01, "gamma": 0.02, "relative_errors": True,
