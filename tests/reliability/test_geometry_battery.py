@@ -429,6 +429,7 @@ def test_d3_is_recorded(record_row):
     if not tally["examples"]:
         pytest.skip("the fuzzing itself did not run")
     record_row("D3", "broken number in any slot, random masks, gradients", tally["examples"], tally["examples"])
+    assert tally["examples"] >= 500
 
 
 def everything(scene, seen):
