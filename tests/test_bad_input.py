@@ -35,7 +35,7 @@ def toy(**data: Any) -> dict[str, Any]:
     return copy.deepcopy(toys.TRAIN) | {"data": toys.DATA | data}
 
 
-def refused(settings: dict[str, Any], folder: Path, kind: type[GhptError], message: str) -> None:
+def check_refused(settings: dict[str, Any], folder: Path, kind: type[GhptError], message: str) -> None:
     """`train` raises this error, and leaves no file in its output and no recording in the cache."""
     settings["data"]["cache"] = str(folder / "cache")
     with pytest.raises(kind, match=message):
@@ -60,13 +60,13 @@ def refused(settings: dict[str, Any], folder: Path, kind: type[GhptError], messa
     ],
 )
 def test_cameras_and_folders(tmp_path, words, kind, message):
-    refused(config(*words), tmp_path, kind, message)
+    check_refused(config(*words), tmp_path, kind, message)
 
 
 @pytest.mark.parametrize(("data", "missing"), [("h36m", "labels"), ("cmu1", "sequence|calibration|folder")])
 def test_a_folder_that_is_not_the_data_set(tmp_path, data, missing):
     (tmp_path / "empty").mkdir()
-    refused(config(f"data={data}", f"data.root={tmp_path / 'empty'}"), tmp_path, GhptDataError, missing)
+    check_refused(config(f"data={data}", f"data.root={tmp_path / 'empty'}"), tmp_path, GhptDataError, missing)
 
 
 def test_a_truncated_labels_file(tmp_path):
@@ -86,7 +86,7 @@ def test_a_truncated_labels_file(tmp_path):
 def test_an_empty_split(tmp_path, monkeypatch):
     make = toys.ToyData.make
     monkeypatch.setattr(toys.ToyData, "make", lambda self, split: [] if split == "train" else make(self, split))
-    refused(toy(), tmp_path, GhptDataError, r"embedded: train: there are no frames to prepare")
+    check_refused(toy(), tmp_path, GhptDataError, r"embedded: train: there are no frames to prepare")
 
 
 def test_no_frame_with_enough_joints(tmp_path):
@@ -113,7 +113,7 @@ def test_a_source_that_gives_what_is_not_finite(tmp_path, monkeypatch, place, va
             yield recording
 
     monkeypatch.setattr(toys.ToyData, "make", broken)
-    refused(toy(), tmp_path, GhptDataError, rf"S0/Walking-1: {place}: .*not finite")
+    check_refused(toy(), tmp_path, GhptDataError, rf"S0/Walking-1: {place}: .*not finite")
 
 
 def numbers(node: Any, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
@@ -146,7 +146,7 @@ def test_every_number_has_a_type_and_a_range_and_is_named(tmp_path, path):
     wrong = ["many", math.nan] if path[-1] == "seed" else ["many", math.nan, -1 if _whole(path) else -1.0]
     for value in wrong:
         name = "model.optimizer" if "optimizer" in path and value == -1 else ".".join(path)
-        refused(changed(toy(), path, value), tmp_path, GhptConfigError, f"^{name}: ")
+        check_refused(changed(toy(), path, value), tmp_path, GhptConfigError, f"^{name}: ")
 
 
 def _whole(path: tuple[str, ...]) -> bool:

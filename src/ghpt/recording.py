@@ -6,7 +6,6 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -86,11 +85,3 @@ class PoseEstimate:
 def joints_with_enough_views(seen: Bool[Tensor, "*B V J"], least: int = 2) -> Bool[Tensor, "*B J"]:
     """Which joints are seen in at least ``least`` views, the fewest that triangulation needs."""
     return seen.sum(dim=-2) >= least
-
-
-def empty_batch(like: KeyPointBatch) -> KeyPointBatch:
-    """A batch of no frames, for a process whose share of the last global batch is empty."""
-    return KeyPointBatch(
-        **{f.name: (v[:0] if isinstance(v := getattr(like, f.name), torch.Tensor) else v.index(slice(0, 0)))
-           for f in fields(like)}
-    )  # fmt: skip

@@ -122,6 +122,7 @@ def read_npz(path: Path, fields: dict[str, tuple[Shape, str]]) -> dict[str, np.n
                     arrays[field] = flat.reshape(found, order=order)
     except KeyError as error:
         raise GhptDataError(path, "", f"lacks an array: {error}", f"It must hold {', '.join(fields)}.") from error
+    # zipfile raises NotImplementedError for a compression that it does not know, RuntimeError for encryption
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
         raise GhptDataError(path, "", f"is not a whole npz file ({error})", "Write it again.") from error
     return arrays

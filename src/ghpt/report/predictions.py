@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 import shutil
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -20,17 +19,14 @@ from torch import Tensor
 from ghpt.errors import GhptDataError, GhptError
 from ghpt.files import atomic_write
 from ghpt.recording import PoseEstimate, Recording
+from ghpt.report.stored_npz import Member, add_member, members_of, text_table
 from ghpt.skeleton import JOINTS
 
 FORMAT_VERSION = 1
 WEIGHTS = ("entropy", "max", "effective")
 """Summaries of a frame's weights: entropy (nats), the largest, and 1 / sum of squares (hypotheses in effect)."""
 
-_BLOCK = 1 << 20
 # What numpy writes, and no more: its own reader evaluates the header as Python and lets odd errors through.
-_HEADER = re.compile(
-    rb"\{'descr': '(?P<dtype>[<|][bifU]\d{1,7})', 'fortran_order': False, 'shape': \((?P<shape>[\d, ]{0,99})\), \} *\n"
-)
 _MEND = "Run the test again to make it anew"
 
 
@@ -104,29 +100,15 @@ class PredictionWriter:
         with atomic_write(path, verify=open_predictions) as handle, zipfile.ZipFile(handle, "w") as archive:
             for name, (dtype, shape) in self._layout.items():
                 with open(self.folder / name, "rb") as rows:
-                    _add(archive, name, np.dtype(dtype), (self.count, *shape), rows)
+                    add_member(archive, name, np.dtype(dtype), (self.count, *shape), rows)
             for name, table in tables.items():
-                _add(archive, name, table.dtype, table.shape, table.tobytes())
+                add_member(archive, name, table.dtype, table.shape, table.tobytes())
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _map(self, name: str) -> np.memmap:
         # Mapped anew for each use: what a map has touched counts as the process's memory while it is open.
         dtype, shape = (self._layout | {"written": ("|b1", ())})[name]
         return np.memmap(self.folder / name, dtype, "r+", shape=(self.count, *shape))
-
-
-def _add(
-    archive: zipfile.ZipFile, name: str, dtype: np.dtype, shape: tuple[int, ...], content: IO[bytes] | bytes
-) -> None:
-    info = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
-    info.create_system = 3
-    header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
-    with archive.open(info, "w", force_zip64=True) as member:
-        np.lib.format.write_array_header_1_0(member, header)
-        if isinstance(content, bytes):
-            member.write(content)
-        else:
-            shutil.copyfileobj(content, member, _BLOCK)
 
 
 class PredictionChunk(NamedTuple):
@@ -140,12 +122,6 @@ class PredictionChunk(NamedTuple):
     weights: dict[str, Float[Tensor, " B"]]
 
 
-class _Member(NamedTuple):
-    offset: int
-    dtype: np.dtype
-    shape: tuple[int, ...]
-
-
 @dataclass(frozen=True)
 class Predictions:
     """An opened predictions file. Rows are read when asked for."""
@@ -157,7 +133,7 @@ class Predictions:
     recording_name: tuple[str, ...]
     recording_subject: tuple[str, ...]
     recording_action: tuple[str, ...]
-    _members: dict[str, _Member]
+    _members: dict[str, Member]
 
     def __len__(self) -> int:
         return self._members["frame"].shape[0]
@@ -197,8 +173,8 @@ def open_predictions(path: str | Path) -> Predictions:
     """
     path = Path(path)
     try:
-        members = _members(path)
-        tables = {name: _table(path, members, name) for name in
+        members = members_of(path)
+        tables = {name: text_table(path, members, name) for name in
                   ("recording_name", "recording_subject", "recording_action", "joint_name", "meta")}  # fmt: skip
         meta = json.loads(tables["meta"][0])
     except FileNotFoundError as error:
@@ -221,42 +197,3 @@ def open_predictions(path: str | Path) -> Predictions:
     if len({len(table) for table in recordings}) != 1:
         raise GhptDataError(path, "recording_name", "subjects and actions are not as many", _MEND)
     return Predictions(path, meta, tuple(names), *recordings, members)
-
-
-def _members(path: Path) -> dict[str, _Member]:
-    """Where each array lies in the file. Raises ValueError or BadZipFile for anything but plain stored arrays."""
-    size = path.stat().st_size
-    with open(path, "rb") as handle, zipfile.ZipFile(handle) as archive:
-        entries = archive.infolist()
-        if any(e.compress_type != zipfile.ZIP_STORED or e.file_size != e.compress_size for e in entries):
-            raise ValueError("a member is compressed")
-        if sum(e.file_size for e in entries) > size:
-            raise ValueError("members overlap")
-        if bad := archive.testzip():
-            raise ValueError(f"{bad} does not fit its checksum")
-        return {entry.filename.removesuffix(".npy"): _member(handle, entry) for entry in entries}
-
-
-def _member(handle: IO[bytes], entry: zipfile.ZipInfo) -> _Member:
-    handle.seek(entry.header_offset + 26)
-    lengths = np.frombuffer(handle.read(4), "<u2")
-    start = entry.header_offset + 30 + int(lengths.sum())
-    handle.seek(start)
-    prefix = handle.read(10)
-    header = handle.read(int.from_bytes(prefix[8:], "little"))
-    parsed = _HEADER.fullmatch(header) if prefix[:8] == b"\x93NUMPY\x01\x00" else None
-    if parsed is None:
-        raise ValueError(f"{entry.filename} is no array of numbers or text")
-    shape = tuple(int(length) for length in parsed["shape"].replace(b",", b" ").split())
-    dtype, offset = np.dtype(parsed["dtype"].decode()), start + len(prefix) + len(header)
-    if math.prod(shape) * dtype.itemsize != start + entry.file_size - offset:
-        raise ValueError(f"{entry.filename} does not hold what its header says")
-    return _Member(offset, dtype, shape)
-
-
-def _table(path: Path, members: Mapping[str, _Member], name: str) -> tuple[str, ...]:
-    if name not in members or members[name].dtype.kind != "U":
-        raise ValueError(f"there is no text {name}")
-    member = members[name]
-    count = int(np.prod(member.shape))
-    return tuple(str(text) for text in np.fromfile(path, member.dtype, count, offset=member.offset))
