@@ -6,6 +6,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
@@ -80,6 +81,56 @@ class PoseEstimate:
     points: Float[Tensor, "*B J 3"]
     """World frame, mm."""
     estimated: Bool[Tensor, "*B J"]
+
+
+@dataclass(frozen=True)
+class PairBatch:
+    """B pairs of cameras, each with M frames of one person before its rig. All views travel with a pair, so that
+    whoever estimates a whole rig has the same frames; the pairs of one ``draw`` share theirs."""
+
+    sample: Int[Tensor, " B"]
+    """Position in the data set: the key of the pair's random draws."""
+    rig: Int[Tensor, " B"]
+    """Index of the rig among those of the split."""
+    draw: Int[Tensor, " B"]
+    """Number of the draw of frames, over all rigs."""
+    pair: Int[Tensor, "B 2"]
+    """The views: reference a, then target b; ``x_b = R x_a + t``."""
+    cameras: Cameras
+    """K (known) and the true R, t (for errors and the known scale alone), leading dimensions B V, float64."""
+    key_points: Float[Tensor, "B V M J 2"]
+    confidence: Float[Tensor, "B V M J"]
+    seen: Bool[Tensor, "B V M J"]
+    points: Float[Tensor, "B P 3"]
+    """Random points of the capture volume, world, mm: the paper's X*."""
+
+    def __len__(self) -> int:
+        return len(self.sample)
+
+    def to(self, *args: Any, **kwargs: Any) -> PairBatch:
+        return PairBatch(**{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})
+
+    def pin_memory(self) -> PairBatch:
+        return PairBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
+
+    def of_pair(self, values: Tensor) -> Tensor:
+        """Of values [B, V, ...] those of the pair: [B, 2, ...]."""
+        return values[torch.arange(len(self), device=values.device)[:, None], self.pair]
+
+    def pair_cameras(self) -> Cameras:
+        """The reference and the target camera, [B, 2]."""
+        return Cameras(*(self.of_pair(getattr(self.cameras, name)) for name in ("K", "R", "t")))
+
+
+@dataclass(frozen=True)
+class RelativePoseEstimate:
+    """Relative camera poses from any selection or classical estimator: ``x_b = R x_a + t``. One that is not
+    ``estimated`` is the identity with t = 0 and means nothing."""
+
+    R: Float[Tensor, "*B 3 3"]
+    t: Float[Tensor, "*B 3"]
+    """mm; of length 1 where nothing has given it a scale."""
+    estimated: Bool[Tensor, "*B"]
 
 
 def joints_with_enough_views(seen: Bool[Tensor, "*B V J"], least: int = 2) -> Bool[Tensor, "*B J"]:

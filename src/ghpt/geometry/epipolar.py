@@ -1,0 +1,148 @@
+"""Two views: normalised 8-point algorithm, essential matrix, the four relative poses, distances of rays.
+
+Points are normalised image coordinates, ``(x, y, 1) = K^-1 (u, v, 1)``, of the reference camera a and the target
+camera b: ``x_b = R x_a + t``, ``E = [t]x R``, ``b^T E a = 0``. t has length 1. Everything is batched and never raises
+on values: what a set of points does not determine is masked.
+"""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+MINIMUM = 8
+"""Correspondences that the 8-point algorithm needs."""
+DEGENERATE = 1e-10
+"""The second smallest eigenvalue of the (normalised) equations over the largest, below which they have more than one
+solution: collinear points, a plane, coinciding cameras. Rounding gives 1e-16, a person moving in 3D 1e-5 and more."""
+
+
+def normalise(K: Float[Tensor, "*B 3 3"], pixels: Float[Tensor, "*B N 2"]) -> Float[Tensor, "*B N 2"]:
+    """Pixels as normalised image coordinates, float64; K is upper triangular with last row (0, 0, 1)."""
+    K, pixels = K.double()[..., None, :, :], pixels.double()
+    y = (pixels[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
+    x = (pixels[..., 0] - K[..., 0, 2] - K[..., 0, 1] * y) / K[..., 0, 0]
+    return torch.stack((x, y), dim=-1)
+
+
+def homogeneous(points: Float[Tensor, "*B 2"]) -> Float[Tensor, "*B 3"]:
+    return torch.cat((points, torch.ones_like(points[..., :1])), dim=-1)
+
+
+def cross_matrix(t: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
+    """[t]x, with ``[t]x v = t x v``."""
+    x, y, z = t.unbind(-1)
+    zero = torch.zeros_like(x)
+    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
+
+
+def essential(R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
+    """E = [t]x R of a relative pose."""
+    return cross_matrix(t) @ R
+
+
+def _hartley(points: Float[Tensor, "*B N 2"], weights: Float[Tensor, "*B N"]) -> tuple[Tensor, Tensor]:
+    """Points with mean 0 and mean distance sqrt(2) (Hartley 1997), and the 3x3 matrix that makes them so."""
+    share = weights / weights.sum(-1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
+    mean = (share[..., None] * points).sum(-2)
+    centred = points - mean[..., None, :]
+    distance = (share * centred.norm(dim=-1)).sum(-1)
+    scale = 2**0.5 / torch.where(distance > 0, distance, 1.0)
+    T = torch.diag_embed(torch.stack((scale, scale, torch.ones_like(scale)), dim=-1))
+    T[..., :2, 2] = -scale[..., None] * mean
+    return centred * scale[..., None, None], T
+
+
+def eight_point(
+    a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], weights: Float[Tensor, "*B N"]
+) -> tuple[Float[Tensor, "*B 3 3"], Bool[Tensor, "*B"]]:
+    """The essential matrix (singular values 1, 1, 0) that minimises the weighted sum of (b^T E a)^2, by the normalised
+    8-point algorithm, and whether the points determine one (then at least 8 have a weight); 0 where not.
+
+    A point with weight 0 is not used, whatever its numbers are.
+    """
+    used = (weights > 0) & torch.isfinite(a).all(-1) & torch.isfinite(b).all(-1)
+    weights = torch.where(used, weights, 0.0).double()
+    a, b = (torch.where(used[..., None], x, 0.0).double() for x in (a, b))
+    (an, Ta), (bn, Tb) = _hartley(a, weights), _hartley(b, weights)
+    rows = (homogeneous(bn)[..., :, None] * homogeneous(an)[..., None, :]).flatten(-2)
+    normal = rows.mT @ (weights[..., None] * rows)
+    finite = torch.isfinite(normal).all(-1).all(-1)
+    values, vectors = torch.linalg.eigh(torch.where(finite[..., None, None], normal, 0.0))
+    ok = finite & (used.sum(-1) >= MINIMUM) & (values[..., 1] > DEGENERATE * values[..., -1])
+    F = Tb.mT @ vectors[..., 0].unflatten(-1, (3, 3)) @ Ta
+    U, _, Vt = torch.linalg.svd(torch.where(ok[..., None, None], F, torch.eye(3, dtype=F.dtype, device=F.device)))
+    E = U[..., :2] @ Vt[..., :2, :]
+    return torch.where(ok[..., None, None], E, 0.0), ok
+
+
+def decompose(E: Float[Tensor, "*B 3 3"]) -> tuple[Float[Tensor, "*B 4 3 3"], Float[Tensor, "*B 4 3"]]:
+    """The four relative poses of an essential matrix: (R1, t), (R1, -t), (R2, t), (R2, -t), t of length 1."""
+    U, _, Vt = torch.linalg.svd(E)
+    U, Vt = (M * torch.where(torch.linalg.det(M) < 0, -1.0, 1.0)[..., None, None] for M in (U, Vt))
+    W = E.new_tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    R1, R2, t = U @ W @ Vt, U @ W.mT @ Vt, U[..., 2]
+    return torch.stack((R1, R1, R2, R2), dim=-3), torch.stack((t, -t, t, -t), dim=-2)
+
+
+def depths(
+    R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
+) -> tuple[Float[Tensor, "*B N"], Float[Tensor, "*B N"]]:
+    """Depths, in units of t, in a and b of the midpoints between the rays; 0 where the rays are parallel.
+
+    The rays' nearest points are at ``alpha R a`` and ``beta b - t`` in b's axes (all from a's centre).
+    """
+    u, v = homogeneous(a) @ R.mT, homogeneous(b)
+    uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
+    ut, vt = (u @ t[..., None])[..., 0], (v @ t[..., None])[..., 0]
+    determinant = uu * vv - uv * uv
+    good = determinant > 1e-14 * uu * vv
+    safe = torch.where(good, determinant, 1.0)
+    alpha, beta = (uv * vt - vv * ut) / safe, (uu * vt - uv * ut) / safe
+    return torch.where(good, alpha, 0.0), torch.where(good, beta, 0.0)
+
+
+def in_front(
+    R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
+) -> Bool[Tensor, "*B N"]:
+    """Which points lie in front of both cameras."""
+    alpha, beta = depths(R, t, a, b)
+    return (alpha > 0) & (beta > 0)
+
+
+def pose_in_front(
+    E: Float[Tensor, "*B 3 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B N"]
+) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"], Bool[Tensor, "*B"]]:
+    """Of an essential matrix's four poses the one with most of the used points in front, and whether one has more than
+    the others. Identity and t = 0 where none has."""
+    Rs, ts = decompose(E)
+    front = in_front(Rs, ts, a[..., None, :, :], b[..., None, :, :]) & used[..., None, :]
+    count = front.sum(-1)
+    top = count.topk(2, dim=-1)
+    best, ok = top.indices[..., 0], top.values[..., 0] > top.values[..., 1]
+    R = Rs.gather(-3, best[..., None, None, None].expand(*best.shape, 1, 3, 3))[..., 0, :, :]
+    t = ts.gather(-2, best[..., None, None].expand(*best.shape, 1, 3))[..., 0, :]
+    eye = torch.eye(3, dtype=R.dtype, device=R.device)
+    return torch.where(ok[..., None, None], R, eye), torch.where(ok[..., None], t, 0.0), ok
+
+
+def ray_distances(
+    R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
+) -> Float[Tensor, "*B N"]:
+    """Distances, in units of t, between corresponding rays (as lines; parallel ones: between the parallels)."""
+    u, v = homogeneous(a) @ R.mT, homogeneous(b)
+    normal = torch.linalg.cross(u, v)
+    length = normal.norm(dim=-1)
+    parallel = length <= 1e-7 * u.norm(dim=-1) * v.norm(dim=-1)
+    skew = (normal @ t[..., None])[..., 0].abs() / torch.where(parallel, 1.0, length)
+    aside = torch.linalg.cross(v, t[..., None, :].expand_as(v)).norm(dim=-1) / v.norm(dim=-1)
+    return torch.where(parallel, aside, skew)
+
+
+def sampson_error(
+    E: Float[Tensor, "*B 3 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
+) -> Float[Tensor, "*B N"]:
+    """First-order distance of each correspondence from the epipolar geometry (normalised image coordinates, >= 0)."""
+    a, b = homogeneous(a), homogeneous(b)
+    Ea, Eb = a @ E.mT, b @ E
+    square = Ea[..., :2].square().sum(-1) + Eb[..., :2].square().sum(-1)
+    return (b * Ea).sum(-1).abs() / square.clamp_min(torch.finfo(E.dtype).tiny).sqrt()
