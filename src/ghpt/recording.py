@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.epipolar import normalise
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,14 @@ class PairBatch:
     def of_pair(self, values: Tensor) -> Tensor:
         """Of values [B, V, ...] those of the pair: [B, 2, ...]."""
         return values[torch.arange(len(self), device=values.device)[:, None], self.pair]
+
+    def correspondences(self) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
+        """The pairs' points in a and in b, N = M x J, normalised image coordinates (float64), and which of them both
+        see; the others are 0."""
+        points = normalise(self.of_pair(self.cameras.K), self.of_pair(self.key_points).flatten(2, 3))
+        both = self.of_pair(self.seen).flatten(2, 3).all(dim=1) & torch.isfinite(points).all(-1).all(1)
+        points = torch.where(both[:, None, :, None], points, 0.0)
+        return points[:, 0], points[:, 1], both
 
     def pair_cameras(self) -> Cameras:
         """The reference and the target camera, [B, 2]."""

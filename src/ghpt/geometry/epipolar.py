@@ -126,16 +126,18 @@ def pose_in_front(
 
 
 def ray_distances(
-    R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
-) -> Float[Tensor, "*B N"]:
-    """Distances, in units of t, between corresponding rays (as lines; parallel ones: between the parallels)."""
-    u, v = homogeneous(a) @ R.mT, homogeneous(b)
-    normal = torch.linalg.cross(u, v)
-    length = normal.norm(dim=-1)
-    parallel = length <= 1e-7 * u.norm(dim=-1) * v.norm(dim=-1)
-    skew = (normal @ t[..., None])[..., 0].abs() / torch.where(parallel, 1.0, length)
-    aside = torch.linalg.cross(v, t[..., None, :].expand_as(v)).norm(dim=-1) / v.norm(dim=-1)
-    return torch.where(parallel, aside, skew)
+    R: Float[Tensor, "*B H 3 3"], t: Float[Tensor, "*B H 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
+) -> Float[Tensor, "*B H N"]:
+    """Distances, in units of t (of length 1), between the corresponding rays (as lines) under each of H poses.
+
+    With unit rays f it is |f_b^T E f_a| / |R f_a x f_b|: two products of matrices for all poses and points. Rays closer
+    than 1e-6 rad to parallel have no well-defined distance and get at most 1.
+    """
+    fa, fb = (homogeneous(x) / homogeneous(x).norm(dim=-1, keepdim=True) for x in (a, b))
+    products = (fb[..., :, None] * fa[..., None, :]).flatten(-2).mT
+    numerator = (essential(R, t).flatten(-2) @ products).abs()
+    cosine = R.flatten(-2) @ products
+    return (numerator / (1 - cosine * cosine).clamp_min(1e-12).sqrt()).clamp(max=1)
 
 
 def sampson_error(

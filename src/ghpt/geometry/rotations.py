@@ -64,6 +64,19 @@ def matrix_to_quaternion(R: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 4"]:
     return torch.where(q[..., :1] < 0, -q, q)
 
 
+def average_rotation(R: Float[Tensor, "*B H 3 3"], weights: Float[Tensor, "*B H"]) -> Float[Tensor, "*B 3 3"]:
+    """The rotation of the weighted sum of quaternions, their signs aligned with the direction that fits all best.
+
+    That direction is the first eigenvector of the sum of w q q^T (Markley et al. 2007), whose sign of each q is of no
+    consequence; it is taken as given in gradients. For rotations near one another the sum and it agree.
+    """
+    q = matrix_to_quaternion(R)
+    outer = torch.einsum("...h,...hi,...hj->...ij", weights, q, q).detach()
+    main = torch.linalg.eigh(outer).eigenvectors[..., -1]
+    sign = torch.where((q @ main[..., None])[..., 0] < 0, -1.0, 1.0)
+    return quaternion_to_matrix(((weights * sign)[..., None] * q).sum(-2))
+
+
 def vector_to_matrix(v: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     """The rotation by \\|v\\| radians about v (Rodrigues)."""
     half = torch.linalg.vector_norm(v, dim=-1, keepdim=True) / 2
