@@ -1,0 +1,221 @@
+"""Classical estimators of a pair's relative pose, on the same correspondences as the learned one.
+
+Correspondences are the joints that both views of the pair see, in all its frames. Thresholds are fractions of the
+person's size in the image (the median, over the pair's frames and views, of the diagonal of the box around the seen key
+points), so that they mean the same at any resolution and distance. A robust estimator that fails, or finds fewer than 8
+inliers, falls back to the 8-point algorithm on all correspondences: it never gains by leaving hard pairs out.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import poselib
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from ghpt.errors import check
+from ghpt.geometry.epipolar import MINIMUM, eight_point, normalise, pose_in_front, sampson_error
+from ghpt.models.baselines import person_size
+from ghpt.randomness import key, uniform
+from ghpt.recording import PairBatch, RelativePoseEstimate
+
+
+class Correspondences(NamedTuple):
+    """The joints of a pair's frames in both views: N = M J."""
+
+    a: Float[Tensor, "B N 2"]
+    """Normalised image coordinates in the reference view, float64; 0 where not ``used``."""
+    b: Float[Tensor, "B N 2"]
+    """The same in the target view."""
+    used: Bool[Tensor, "B N"]
+    size: Float[Tensor, " B"]
+    """The person's size, normalised image coordinates; 0 where it has none."""
+
+
+def correspondences(batch: PairBatch) -> Correspondences:
+    """What both views of each pair see."""
+    K, pixels, seen = (batch.of_pair(x) for x in (batch.cameras.K, batch.key_points, batch.seen))
+    points = normalise(K, pixels.flatten(2, 3))
+    used = (seen.flatten(2, 3) & torch.isfinite(points).all(-1)).all(1)
+    focal = (K[..., 0, 0] + K[..., 1, 1]).double() / 2
+    size = person_size(pixels.double(), seen) / focal[..., None]
+    median = torch.where(size > 0, size, torch.nan).flatten(1).nanmedian(-1).values
+    a, b = torch.where(used[:, None, :, None], points, 0.0).unbind(1)
+    return Correspondences(a, b, used, median.nan_to_num(0.0))
+
+
+class PairPose(NamedTuple):
+    """A pose of each pair, ``x_b = R x_a + t`` with \\|t\\| = 1, and whether there is one."""
+
+    R: Float[Tensor, "*B 3 3"]
+    t: Float[Tensor, "*B 3"]
+    ok: Bool[Tensor, "*B"]
+
+
+def _linear(
+    a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B N"]
+) -> tuple[PairPose, Bool[Tensor, "*B"]]:
+    """The 8-point pose of the used correspondences, and whether they determine an essential matrix."""
+    E, determined = eight_point(a, b, used.double())
+    R, t, front = pose_in_front(E, a, b, used)
+    return PairPose(R, t, front & determined), determined
+
+
+def _estimate(pose: PairPose) -> RelativePoseEstimate:
+    eye = torch.eye(3, dtype=pose.R.dtype, device=pose.R.device)
+    R = torch.where(pose.ok[..., None, None], pose.R, eye)
+    return RelativePoseEstimate(R, torch.where(pose.ok[..., None], pose.t, 0.0), pose.ok)
+
+
+class PairBaseline(ABC):
+    """A classical estimator: ``baseline(batch)`` gives float64 poses with t of length 1, each pair's a function of that
+    pair alone."""
+
+    @abstractmethod
+    def __call__(self, batch: PairBatch) -> RelativePoseEstimate: ...
+
+
+class EightPoint(PairBaseline):
+    """The normalised 8-point algorithm on all correspondences."""
+
+    @torch.no_grad()
+    def __call__(self, batch: PairBatch) -> RelativePoseEstimate:
+        a, b, used, _ = correspondences(batch)
+        return _estimate(_linear(a, b, used)[0])
+
+
+class Robust(PairBaseline):
+    """An estimator that tells inliers from outliers, pair by pair; ``EightPoint`` where it finds too few."""
+
+    @abstractmethod
+    def pose(
+        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
+    ) -> PairPose | None:
+        """The pose of one pair from N >= 8 correspondences (normalised image coordinates) of a person of that
+        ``size``; None where there is none."""
+
+    @torch.no_grad()
+    def __call__(self, batch: PairBatch) -> RelativePoseEstimate:
+        points = correspondences(batch)
+        linear, determined = _linear(points.a, points.b, points.used)
+        result = _estimate(linear)
+        # clone: the loop writes
+        R, t, ok = result.R.clone(), result.t.clone(), result.estimated.clone()
+        for i in torch.nonzero(determined & (points.size > 0)).flatten().tolist():
+            used = points.used[i]
+            found = self.pose(points.a[i, used], points.b[i, used], points.size[i].item(), batch.sample[i])
+            if found is not None and found.ok:
+                R[i], t[i], ok[i] = found.R.to(R), found.t.to(t), True
+        return RelativePoseEstimate(R, t, ok)
+
+
+@dataclass(frozen=True)
+class Ransac(Robust):
+    """Of ``samples`` random minimal samples the essential matrix with the least truncated squared error (MSAC), then
+    the 8-point algorithm on its inliers.
+
+    ``threshold``: an inlier's largest Sampson error, as a fraction of the person's size. The samples are keyed by
+    ``seed`` and the pair's ``sample``.
+    """
+
+    samples: int
+    threshold: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        _check_positive(samples=self.samples, threshold=self.threshold)
+
+    def pose(
+        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
+    ) -> PairPose | None:
+        keys = key(self.seed, "pair ransac", sample, device=a.device)
+        chosen = uniform(keys, (self.samples, len(a))).topk(MINIMUM, dim=-1).indices
+        E, ok = eight_point(a[chosen], b[chosen], torch.ones(chosen.shape, dtype=a.dtype, device=a.device))
+        error = sampson_error(E, a, b) / (self.threshold * size)
+        score = torch.where(ok, (1 - error.square()).clamp_min(0).sum(-1), -1.0)
+        best = score.argmax()
+        inlier = error[best] <= 1
+        return _linear(a, b, inlier)[0] if ok[best] else None
+
+
+@dataclass(frozen=True)
+class Usac(Robust):
+    """OpenCV's ``findEssentialMat`` with one of its USAC methods; of the four poses the one with most of its inliers in
+    front.
+
+    ``threshold``: as a fraction of the person's size. ``pixels``: the person's size that OpenCV sees. Its methods hold
+    constants in pixels (MAGSAC's largest threshold, the cells of the neighbourhoods), so that neither normalised
+    coordinates nor the camera's own resolution would do. Their random state is OpenCV's fixed one.
+    """
+
+    method: str
+    threshold: float
+    pixels: float
+    confidence: float
+    iterations: int
+
+    def __post_init__(self) -> None:
+        known = [name for name in dir(cv2) if name.startswith("USAC_")]
+        check(self.method in known, "method", f"is {self.method!r}", f"Choose from {', '.join(known)}.")
+        _check_positive(threshold=self.threshold, pixels=self.pixels, iterations=self.iterations)
+        check(0 < self.confidence < 1, "confidence", f"is {self.confidence}", "It must be between 0 and 1.")
+
+    def pose(
+        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
+    ) -> PairPose | None:
+        focal = self.pixels / size
+        E, mask = cv2.findEssentialMat(
+            (focal * a).cpu().numpy(), (focal * b).cpu().numpy(), np.diag([focal, focal, 1.0]),
+            getattr(cv2, self.method), self.confidence, self.threshold * self.pixels, self.iterations,
+        )  # fmt: skip
+        if E is None or E.shape != (3, 3) or not np.isfinite(E).all():
+            return None
+        inlier = torch.from_numpy(mask[:, 0] > 0).to(a.device)
+        pose = PairPose(*pose_in_front(torch.from_numpy(E).to(a), a, b, inlier))
+        return pose if inlier.sum() >= MINIMUM else None
+
+
+@dataclass(frozen=True)
+class PoseLib(Robust):
+    """PoseLib's LO-RANSAC of the 5-point solver, then its refinement on the inliers under a robust loss.
+
+    ``threshold`` (largest epipolar error of an inlier) and ``scale`` (of the loss) are fractions of the person's size.
+    """
+
+    threshold: float
+    loss: str
+    scale: float
+    iterations: int
+    seed: int
+
+    def __post_init__(self) -> None:
+        _check_positive(threshold=self.threshold, scale=self.scale, iterations=self.iterations)
+        check(self.loss in _LOSSES, "loss", f"is {self.loss!r}", f"Choose from {', '.join(_LOSSES)}.")
+
+    def pose(
+        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
+    ) -> PairPose | None:
+        # pixels in units of the person's size
+        camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": [1 / size, 1 / size, 0.0, 0.0]}
+        ransac = {"max_epipolar_error": self.threshold, "max_iterations": self.iterations, "seed": self.seed}
+        bundle = {"loss_type": self.loss, "loss_scale": self.scale}
+        x, y = ((points / size).cpu().numpy() for points in (a, b))
+        found, info = poselib.estimate_relative_pose(x, y, camera, camera, ransac, bundle)
+        t = torch.tensor(np.array(found.t))
+        if info["num_inliers"] < MINIMUM or not torch.isfinite(t).all() or not t.any():
+            return None
+        return PairPose(torch.tensor(np.array(found.R)), t / t.norm(), torch.tensor(True))
+
+
+_LOSSES = ("TRIVIAL", "TRUNCATED", "HUBER", "CAUCHY", "TRUNCATED_LE_ZACH")
+
+
+def _check_positive(**values: float | int) -> None:
+    for name, value in values.items():
+        check(value > 0, name, f"is {value}", "It must be > 0.")
