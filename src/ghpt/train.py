@@ -49,6 +49,7 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
     data = build(config["data"], "data")
     model = build(config["model"], "model")
     _check_optimizer(model)
+    data.serve(model.problem)
     identity = {
         "format_version": FORMAT_VERSION,
         "config": {"model": config["model"], "data": config["data"], "seed": seed},
@@ -83,7 +84,7 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
         raise
     errors = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("validation/")}
     if trainer.is_global_zero:
-        _say_finished(last, data, errors)
+        _say_finished(last, data, model.problem.measures, errors)
     return errors
 
 
@@ -158,8 +159,8 @@ def _flat(config: Any, above: str) -> dict[str, Any]:
     }
 
 
-def _say_finished(last: Path, data: Any, errors: dict[str, float]) -> None:
-    _log.info("Validation on %s, MPJPE relative to the pelvis:", words(data.name, data.source))
+def _say_finished(last: Path, data: Any, measures: str, errors: dict[str, float]) -> None:
+    _log.info("Validation on %s, %s:", words(data.name, data.source), measures)
     _log.info("  %s", summary(errors))
     _log.info("Checkpoint: %s", shown(last))
     where = "data=h36m" if data.root is None else f"data={data.name} {typed('data.root', data.root)}"

@@ -8,13 +8,13 @@ from typing import Any
 
 import lightning as L
 import numpy as np
-from torch.utils.data import DataLoader
 
 from ghpt import randomness
 from ghpt.data.frames import BatchOrder, FrameLoader, Frames, trainable
+from ghpt.data.pairs import Pairs, PairSettings
 from ghpt.data.store import prepared
 from ghpt.errors import GhptDataError, check
-from ghpt.recording import KeyPointBatch, Recording
+from ghpt.recording import KeyPointBatch, PairBatch, Recording
 
 SPLITS = ("train", "validation", "test")
 
@@ -49,7 +49,12 @@ class KeyPointDataModule(L.LightningDataModule):
         self.name, self.root, self.cache, self.seed = name, root, cache, seed
         self.train_samples, self.least_joints, self.stride = train_samples, least_joints, stride
         self.evaluate, self.batch_size, self.workers = evaluate, batch_size, workers
-        self.frames: dict[str, Frames] = {}
+        self.pairs: PairSettings | None = None
+        self.frames: dict[str, Frames | Pairs] = {}
+
+    def serve(self, problem: Any) -> None:
+        """Serve what ``problem`` takes: pairs of cameras where it has ``PairSettings`` (``pairs``), else frames."""
+        self.pairs = getattr(problem, "pairs", None)
 
     @property
     def source(self) -> str:
@@ -73,9 +78,7 @@ class KeyPointDataModule(L.LightningDataModule):
     def setup(self, stage: str) -> None:
         for role, split in self._roles(stage).items():
             if role not in self.frames:
-                recordings = self._open(split)
-                chosen = self._random(recordings) if role == "train" else self._every(recordings)
-                self.frames[role] = Frames(recordings, chosen)
+                self.frames[role] = self._choose(self._open(split), role == "train")
 
     def _roles(self, stage: str) -> dict[str, str]:
         """What the stage needs: role -> split."""
@@ -89,6 +92,11 @@ class KeyPointDataModule(L.LightningDataModule):
             mend = "Choose another split, or check what data.root holds."
             raise GhptDataError(self.source, f"{self.name} {split}", "the split has no frames", mend)
         return recordings
+
+    def _choose(self, recordings: Sequence[Recording], training: bool) -> Frames | Pairs:
+        if self.pairs is not None:
+            return Pairs(recordings, self.pairs, self.seed, self.train_samples if training else None)
+        return Frames(recordings, self._random(recordings) if training else self._every(recordings))
 
     def _every(self, recordings: Sequence[Recording]) -> np.ndarray:
         """Every ``stride``-th frame of each recording."""
@@ -113,21 +121,21 @@ class KeyPointDataModule(L.LightningDataModule):
             )
         return chosen[: self.train_samples]
 
-    def train_dataloader(self) -> DataLoader[KeyPointBatch]:
+    def train_dataloader(self) -> FrameLoader:
         return self._loader("train", seed=self.seed, done=lambda: self.trainer.global_step)
 
-    def val_dataloader(self) -> DataLoader[KeyPointBatch]:
+    def val_dataloader(self) -> FrameLoader:
         return self._loader("validation")
 
-    def test_dataloader(self) -> DataLoader[KeyPointBatch]:
+    def test_dataloader(self) -> FrameLoader:
         return self._loader("test")
 
-    def _loader(self, role: str, seed: int | None = None, done: Any = lambda: 0) -> DataLoader[KeyPointBatch]:
+    def _loader(self, role: str, seed: int | None = None, done: Any = lambda: 0) -> FrameLoader:
         rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
         order = BatchOrder(len(self.frames[role]), self.batch_size, rank, world, seed, done)
         return FrameLoader(self.frames[role], order, self.workers)
 
-    def all_training_batches(self) -> Iterator[KeyPointBatch]:
+    def all_training_batches(self) -> Iterator[KeyPointBatch | PairBatch]:
         """Every training sample once, in order, the same on every process: for the feature statistics."""
         frames = self.frames["train"]
         for first in range(0, len(frames), self.batch_size):

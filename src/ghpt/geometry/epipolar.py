@@ -62,13 +62,33 @@ def eight_point(
     """
     used = (weights > 0) & torch.isfinite(a).all(-1) & torch.isfinite(b).all(-1)
     weights = torch.where(used, weights, 0.0).double()
-    a, b = (torch.where(used[..., None], x, 0.0).double() for x in (a, b))
-    (an, Ta), (bn, Tb) = _hartley(a, weights), _hartley(b, weights)
-    rows = (homogeneous(bn)[..., :, None] * homogeneous(an)[..., None, :]).flatten(-2)
-    normal = rows.mT @ (weights[..., None] * rows)
+    (rows_a, Ta), (rows_b, Tb) = (_hartley(torch.where(used[..., None], x, 0.0).double(), weights) for x in (a, b))
+    rows = (homogeneous(rows_b)[..., :, None] * homogeneous(rows_a)[..., None, :]).flatten(-2)
+    return _smallest(rows.mT @ (weights[..., None] * rows), used.sum(-1), Ta, Tb)
+
+
+def eight_point_subsets(
+    a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], subsets: Bool[Tensor, "*B H N"]
+) -> tuple[Float[Tensor, "*B H 3 3"], Bool[Tensor, "*B H"]]:
+    """``eight_point`` of H subsets of the same points, which must be finite: one product of matrices for all.
+
+    The points are normalised once, by all that are in any subset.
+    """
+    anywhere = subsets.any(-2).double()
+    (a, Ta), (b, Tb) = _hartley(a.double(), anywhere), _hartley(b.double(), anywhere)
+    rows = (homogeneous(b)[..., :, None] * homogeneous(a)[..., None, :]).flatten(-2)
+    i, j = torch.triu_indices(9, 9, device=rows.device)
+    normal = torch.empty((*subsets.shape[:-1], 9, 9), dtype=rows.dtype, device=rows.device)
+    normal[..., i, j] = subsets.double() @ (rows[..., i] * rows[..., j])
+    normal[..., j, i] = normal[..., i, j]
+    return _smallest(normal, subsets.sum(-1), Ta[..., None, :, :], Tb[..., None, :, :])
+
+
+def _smallest(normal: Tensor, count: Tensor, Ta: Tensor, Tb: Tensor) -> tuple[Tensor, Tensor]:
+    """The essential matrix of normal equations, and whether they have one solution."""
     finite = torch.isfinite(normal).all(-1).all(-1)
     values, vectors = torch.linalg.eigh(torch.where(finite[..., None, None], normal, 0.0))
-    ok = finite & (used.sum(-1) >= MINIMUM) & (values[..., 1] > DEGENERATE * values[..., -1])
+    ok = finite & (count >= MINIMUM) & (values[..., 1] > DEGENERATE * values[..., -1])
     F = Tb.mT @ vectors[..., 0].unflatten(-1, (3, 3)) @ Ta
     U, _, Vt = torch.linalg.svd(torch.where(ok[..., None, None], F, torch.eye(3, dtype=F.dtype, device=F.device)))
     E = U[..., :2] @ Vt[..., :2, :]
@@ -112,15 +132,34 @@ def in_front(
 def pose_in_front(
     E: Float[Tensor, "*B 3 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B N"]
 ) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"], Bool[Tensor, "*B"]]:
-    """Of an essential matrix's four poses the one with most of the used points in front, and whether one has more than
-    the others. Identity and t = 0 where none has."""
-    Rs, ts = decompose(E)
-    front = in_front(Rs, ts, a[..., None, :, :], b[..., None, :, :]) & used[..., None, :]
-    count = front.sum(-1)
+    """``poses_in_front`` of one essential matrix for each set of points."""
+    R, t, ok = poses_in_front(E[..., None, :, :], a, b, used[..., None, :])
+    return R[..., 0, :, :], t[..., 0, :], ok[..., 0]
+
+
+def poses_in_front(
+    E: Float[Tensor, "*B H 3 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B H N"]
+) -> tuple[Float[Tensor, "*B H 3 3"], Float[Tensor, "*B H 3"], Bool[Tensor, "*B H"]]:
+    """Of the four poses of each of H essential matrices the one with most of its used points in front, and whether one
+    has more than the others. Identity and t = 0 where none has.
+
+    Only signs are needed: with unit rays f, those of the depths' numerators (see ``depths``), and -t flips both.
+    """
+    Rs, ts = (x[..., ::2, :, :] if x.dim() > E.dim() else x[..., ::2, :] for x in decompose(E))
+    fa, fb = (homogeneous(x) / homogeneous(x).norm(dim=-1, keepdim=True) for x in (a, b))
+    products = (fb[..., :, None] * fa[..., None, :]).flatten(-2).mT
+    uv = (Rs.flatten(-2).flatten(-3, -2) @ products).unflatten(-2, (-1, 2))
+    ut = ((Rs.mT @ ts[..., None])[..., 0].flatten(-3, -2) @ fa.mT).unflatten(-2, (-1, 2))
+    vt = (ts.flatten(-3, -2) @ fb.mT).unflatten(-2, (-1, 2))
+    alpha, beta = uv * vt - ut, vt - uv * ut
+    forward = (alpha > 0) & (beta > 0) & used[..., None, :]
+    backward = (alpha < 0) & (beta < 0) & used[..., None, :]
+    count = torch.stack((forward.sum(-1), backward.sum(-1)), dim=-1).flatten(-2)
     top = count.topk(2, dim=-1)
     best, ok = top.indices[..., 0], top.values[..., 0] > top.values[..., 1]
-    R = Rs.gather(-3, best[..., None, None, None].expand(*best.shape, 1, 3, 3))[..., 0, :, :]
-    t = ts.gather(-2, best[..., None, None].expand(*best.shape, 1, 3))[..., 0, :]
+    index = (best // 2)[..., None, None]
+    R = Rs.gather(-3, index[..., None].expand(*best.shape, 1, 3, 3))[..., 0, :, :]
+    t = ts.gather(-2, index.expand(*best.shape, 1, 3))[..., 0, :] * (1 - 2 * (best % 2))[..., None]
     eye = torch.eye(3, dtype=R.dtype, device=R.device)
     return torch.where(ok[..., None, None], R, eye), torch.where(ok[..., None], t, 0.0), ok
 

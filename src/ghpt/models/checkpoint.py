@@ -68,13 +68,15 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
 def load_model(path: str | Path, **changes: Any) -> tuple[StochasticEstimator, dict[str, Any]]:
     """The model that a checkpoint describes, with its weights, and what the checkpoint says of itself.
 
-    ``changes`` replace top-level settings of the model (such as ``hypotheses``). Only classes of ghpt and
+    ``changes`` replace settings of the model (such as ``hypotheses``, or ``problem.frames``); None leaves one. Only classes of ghpt and
     torch's optimisers can be named by a checkpoint. Raises GhptCheckpointError.
     """
     checkpoint = read_checkpoint(path)
     ours = checkpoint[FIELD]
     try:
-        config = ours["config"]["model"] | {name: value for name, value in changes.items() if value is not None}
+        config = ours["config"]["model"]
+        for name, value in changes.items():
+            config = config if value is None else _changed(config, name.split("."), value)
         model = build(config, "model", packages=TRUSTED)
         model.load_state_dict(checkpoint["state_dict"], strict=True)
     except (KeyError, TypeError, AttributeError, RuntimeError, GhptConfigError) as error:
@@ -86,3 +88,9 @@ def load_model(path: str | Path, **changes: Any) -> tuple[StochasticEstimator, d
     if not isinstance(model, StochasticEstimator):
         raise GhptCheckpointError(path, f"holds a {type(model).__name__}", "Give one that train.py wrote.")
     return model, ours
+
+
+def _changed(config: dict[str, Any], path: list[str], value: Any) -> dict[str, Any]:
+    """The configuration with one setting changed."""
+    name, *rest = path
+    return config | {name: _changed(config[name], rest, value) if rest else value}

@@ -30,6 +30,8 @@ class PoseHypotheses:
 class PoseTriangulation:
     """Generate, describe, combine and measure 3D poses."""
 
+    measures = "MPJPE relative to the pelvis"
+
     def __init__(self, coordinates: bool, lengths: bool) -> None:
         check(
             coordinates or lengths,

@@ -7,6 +7,7 @@
 A third problem is one file with a class like this and one yaml::
 
     class LineFit:
+        measures, feature_size = "distance from the true line", 10
         def generate(self, batch, count, keys): ...      # two random points each -> [B, H, 2]
         def describe(self, hypotheses): ...              # sorted residuals -> [B, H, D]
         def combine(self, hypotheses, weights): ...      # weights [B, H] -> [B, 2]
@@ -24,6 +25,8 @@ from torch import Tensor
 class Problem(Protocol):
     """Hypotheses and estimates are the problem's own types; only the problem looks inside."""
 
+    measures: str
+    """What ``error`` is, for people; mm."""
     feature_size: int
     """D, the length of the feature vector that the scorer sees."""
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -16,14 +17,17 @@ from ghpt.geometry.cameras import project
 from ghpt.geometry.epipolar import (
     MINIMUM,
     depths,
-    eight_point,
+    eight_point_subsets,
     homogeneous,
     normalise,
-    pose_in_front,
+    poses_in_front,
     ray_distances,
 )
 from ghpt.geometry.rotations import average_rotation
 from ghpt.recording import PairBatch, RelativePoseEstimate
+
+CHEIRALITY = 256
+"""Correspondences, evenly over all, that tell which of four poses has them in front: more would only repeat it."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +49,7 @@ class RelativePoseHypotheses:
 class RelativePose:
     """Generate, describe, combine and measure relative camera poses.
 
-    ``sample``: T, the correspondences of a hypothesis. ``features``: number of quantiles of the ray distances.
+    ``sample``: T of a hypothesis, as a share of the correspondences that both cameras see (8 at least). ``features``: number of quantiles of the ray distances.
     ``frames``, ``draws``, ``points``: see ``PairSettings``. ``scale``: what gives t its length. ``largest_error``: mm,
     no point counts for more (one almost at infinity would drown the pool).
     """
@@ -57,12 +61,12 @@ class RelativePose:
         frames: int,
         draws: int,
         points: int,
-        sample: int,
+        sample: float,
         features: int,
         scale: Callable[[RelativePoseEstimate, PairBatch], Tensor],
         largest_error: float,
     ) -> None:
-        check(sample >= MINIMUM, "sample", f"is {sample}", f"The 8-point algorithm needs {MINIMUM}.")
+        check(0 < sample <= 1, "sample", f"is {sample}", "It is a share: more than 0, at most 1.")
         check(features >= 2, "features", f"is {features}", "It must be >= 2.")
         check(largest_error > 0, "largest_error", f"is {largest_error}", "It must be > 0 (mm).")
         self.pairs = PairSettings(frames, draws, points)
@@ -76,16 +80,15 @@ class RelativePose:
         Where they are degenerate or no pose has most points in front, all correspondences stand in for them.
         """
         a, b, both = batch.correspondences()
-        whole_R, whole_t, whole = _solve(a, b, both)
-        chosen = _subsets(both, count, self.sample, keys)
-        index = chosen[..., None].expand(*chosen.shape, 2)
-        used = both[:, None].expand(-1, count, -1).gather(2, chosen)
-        some_a, some_b = (x[:, None].expand(-1, count, -1, -1).gather(2, index) for x in (a, b))
-        R, t, ok = _solve(some_a, some_b, used)
-        R = torch.where(ok[..., None, None], R, whole_R[:, None])
-        t = torch.where(ok[..., None], t, whole_t[:, None])
-        length = self.scale(RelativePoseEstimate(R, t, ok | whole[:, None]), batch)
-        return RelativePoseHypotheses(R, t * length[..., None], whole, a, b, both)
+        subsets = torch.cat((random_subsets(both, count, self.sample, keys), both[:, None]), dim=1)
+        E, determined = eight_point_subsets(a, b, subsets)
+        some = slice(None, None, -(-a.shape[1] // CHEIRALITY))
+        R, t, ok = poses_in_front(E, a[:, some], b[:, some], both[:, None, some] & determined[..., None])
+        R = torch.where(ok[..., None, None], R, R[:, -1:])[:, :-1]
+        t = torch.where(ok[..., None], t, t[:, -1:])[:, :-1]
+        estimated = ok[:, -1]
+        length = self.scale(RelativePoseEstimate(R, t, estimated[:, None].expand(-1, count)), batch)
+        return RelativePoseHypotheses(R, t * length[..., None], estimated, a, b, both)
 
     @torch.no_grad()
     def describe(self, hypotheses: RelativePoseHypotheses) -> Float[Tensor, "B H D"]:
@@ -94,8 +97,8 @@ class RelativePose:
         h = hypotheses
         length = h.t.norm(dim=-1, keepdim=True)
         direction = h.t / torch.where(length > 0, length, 1.0)
-        distances = ray_distances(h.R, direction, h.a, h.b) * length
-        return quantiles(distances, h.both[:, None].expand_as(distances), self.feature_size).float()
+        distances = ray_distances(h.R, direction, h.a, h.b).float() * length.float()
+        return quantiles(distances, h.both[:, None].expand_as(distances), self.feature_size)
 
     def combine(self, hypotheses: RelativePoseHypotheses, weights: Float[Tensor, "B H"]) -> RelativePoseEstimate:
         """Weighted average of the rotations' quaternions and of the translations.
@@ -137,25 +140,23 @@ class RelativePose:
         return error, measured & (estimate.estimated.flatten(1).all(-1) if extra else estimate.estimated)
 
 
-def _solve(
-    a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B N"]
-) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"], Bool[Tensor, "*B"]]:
-    """The pose that has most of the used points in front, of the 8-point algorithm's essential matrix."""
-    E, determined = eight_point(a, b, used.double())
-    R, t, ok = pose_in_front(E, a, b, used & determined[..., None])
-    return R, t, ok & determined
-
-
-def _subsets(both: Bool[Tensor, "B N"], count: int, size: int, keys: Int[Tensor, " B"]) -> Int[Tensor, "B H T"]:
-    """``size`` distinct random correspondences for each hypothesis, usable ones first."""
-    size = min(size, both.shape[-1])
-    order = randomness.uniform(keys, (count, both.shape[-1]), dtype=torch.float32)
-    return torch.where(both[:, None], order, 2.0).topk(size, dim=-1, largest=False, sorted=False).indices
+def random_subsets(
+    both: Bool[Tensor, "B N"], count: int, share: float, keys: Int[Tensor, " B"]
+) -> Bool[Tensor, "B H N"]:
+    """For each hypothesis a random ``share`` of the usable correspondences, 8 at least (all where there are fewer)."""
+    number = both.shape[-1]
+    size = (both.sum(-1) * share).ceil().clamp_min(MINIMUM).clamp_max(number)
+    # a hash of 64 bits makes two numbers to order the correspondences by
+    order = randomness.bits(keys, (count, -(-number // 2))).view(torch.int32)[..., :number]
+    order = torch.where(both[:, None], order, torch.iinfo(torch.int32).max)
+    chosen = order.topk(int(size.max()) if len(size) else 0, dim=-1, largest=False).indices
+    first = (torch.arange(chosen.shape[-1], device=both.device) < size[:, None, None]).expand_as(chosen)
+    return torch.zeros_like(order, dtype=torch.bool).scatter(-1, chosen, first) & both[:, None]
 
 
 def quantiles(values: Float[Tensor, "*B N"], mask: Bool[Tensor, "*B N"], count: int) -> Float[Tensor, "*B D"]:
     """``count`` evenly spaced quantiles (0 to 1, linear between order statistics) of the values in the mask; else 0."""
-    ordered = torch.where(mask, values, torch.inf).sort(dim=-1).values
+    ordered = _sorted(torch.where(mask, values, torch.inf))
     number = mask.sum(-1, keepdim=True)
     place = torch.linspace(0, 1, count, dtype=values.dtype, device=values.device) * (number - 1).clamp_min(0)
     low = place.floor().long()
@@ -163,3 +164,9 @@ def quantiles(values: Float[Tensor, "*B N"], mask: Bool[Tensor, "*B N"], count: 
     below, above = ordered.gather(-1, low), ordered.gather(-1, high)
     found = torch.where(high > low, torch.lerp(below, above, place - low), below)
     return torch.where(number > 0, found, 0.0)
+
+
+def _sorted(values: Float[Tensor, "*B N"]) -> Float[Tensor, "*B N"]:
+    if values.device.type != "cpu":
+        return values.sort(dim=-1).values
+    return torch.from_numpy(np.sort(values.numpy(), axis=-1))  # torch also makes the indices, 8 times slower
