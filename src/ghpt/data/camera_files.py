@@ -1,0 +1,226 @@
+"""People's own camera files: Pose2Sim, aniposelib, caliscope, freemocap, OpenCV, EasyMocap and Panoptic.
+
+All are read as world to camera, mm; the TOML and yml formats are in metres, Panoptic in centimetres.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ghpt.data.opencv_yml import read_yml
+from ghpt.data.validate import check_cameras, open_input, read_json
+from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.rotations import vector_to_matrix
+
+_MM_PER_M, _MM_PER_CM = 1000.0, 10.0
+_LARGEST = 16 << 20
+"""Bytes of a TOML file."""
+_MOST_CAMERAS = 10_000
+_FIELDS = ("matrix", "distortions", "rotation", "translation")
+_FORMATS = (
+    "Known: TOML of Pose2Sim, aniposelib, caliscope or freemocap; intri.yml (with extri.yml beside it) of OpenCV or "
+    "EasyMocap; calibration JSON of CMU Panoptic."
+)
+
+
+@dataclass(frozen=True)
+class CameraFile:
+    """V cameras as a user's file has them: intrinsics always, extrinsics (mm) and image sizes if it has them."""
+
+    path: str
+    format: str
+    names: tuple[str, ...]
+    other_names: tuple[str, ...]
+    """What else the file calls each camera (a TOML table's key); '' where nothing."""
+    K: Float[Tensor, "V 3 3"]
+    distortion: Float[Tensor, "V 5"]
+    """OpenCV's k1, k2, p1, p2, k3."""
+    size: Int[Tensor, "V 2"] | None
+    """Width and height, pixels; None unless the file has it for all cameras."""
+    R: Float[Tensor, "V 3 3"] | None
+    """World to camera; None, with ``t``, unless the file has both for all cameras and they are not all the same."""
+    t: Float[Tensor, "V 3"] | None
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def cameras(self) -> Cameras | None:
+        """The calibrated cameras; None without extrinsics."""
+        return None if self.R is None or self.t is None else Cameras(self.K, self.R, self.t)
+
+    def select(self, indices: Sequence[int]) -> CameraFile:
+        """Some of the cameras, in this order."""
+        at = list(indices)
+        tensors = {
+            field: None if (value := getattr(self, field)) is None else value[at]
+            for field in ("K", "distortion", "size", "R", "t")
+        }
+        names, other = (tuple(v[i] for i in at) for v in (self.names, self.other_names))
+        return CameraFile(self.path, self.format, names, other, **tensors)
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """One camera of a file, in the file's own unit of length."""
+
+    name: str
+    other: str
+    K: Any
+    distortion: Any
+    size: Any = None
+    R: Any = None
+    """A 3x3 matrix or a rotation vector."""
+    t: Any = None
+
+
+def read_cameras(path: str | Path) -> CameraFile:
+    """The cameras of a file, or of a folder with intri.yml; its format is recognised by its content.
+
+    Raises GhptDataError, naming file, field and mend, for anything that is not a pinhole camera with the lens of
+    ``ghpt.data.lens``: fisheye lenses among it.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "intri.yml"
+    with open_input(path) as handle:
+        start = handle.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
+    if start.startswith(b"%YAML"):
+        return _checked(path, "OpenCV", _opencv(path), _MM_PER_M)
+    if start.startswith(b"{"):
+        return _checked(path, "Panoptic", _panoptic(path), _MM_PER_CM)
+    return _checked(path, *_toml(path), _MM_PER_M)
+
+
+def _toml(path: Path) -> tuple[str, list[_Entry]]:
+    with open_input(path) as handle:
+        data = handle.read(_LARGEST + 1)
+    if len(data) > _LARGEST:
+        raise GhptDataError(path, "", f"has more than {_LARGEST >> 20} MiB", "Check that this is the right file.")
+    try:
+        content = tomllib.loads(data.decode("utf-8-sig"))
+    except (ValueError, RecursionError) as error:
+        raise GhptDataError(path, "", f"is no camera file: not TOML either ({error})", _FORMATS) from error
+    nested = content.get("cameras")
+    tables = nested if isinstance(nested, dict) else content
+    entries = []
+    for key, table in tables.items():
+        if isinstance(table, dict) and any(field in table for field in _FIELDS) and table.get("ignore") is not True:
+            entries.append(_toml_camera(path, key, table, nested is tables))
+    known = "caliscope" if nested is tables else "Pose2Sim" if any("fisheye" in t for t in tables.values()
+                                                                  if isinstance(t, dict)) else "aniposelib"  # fmt: skip
+    return known, entries
+
+
+def _toml_camera(path: Path, key: str, table: Mapping[str, Any], numbered: bool) -> _Entry:
+    if table.get("fisheye") is True:
+        raise GhptDataError(path, f"{key}.fisheye", "is true: fisheye lenses are not supported",
+                            "Undistort the images or the key points first, and give the pinhole camera.")  # fmt: skip
+    for field in ("matrix", "distortions"):
+        if field not in table:
+            raise GhptDataError(path, f"{key}.{field}", "is missing", "Calibrate the intrinsics of this camera.")
+    other = f"cam_{key}" if numbered and key.isdigit() else key
+    return _Entry(str(table.get("name", other)), other, table["matrix"], table["distortions"], table.get("size"),
+                  table.get("rotation"), table.get("translation"))  # fmt: skip
+
+
+def _opencv(path: Path) -> list[_Entry]:
+    intrinsic = read_yml(path)
+    beside = path.with_name(path.name.replace("intri", "extri"))
+    extrinsic = read_yml(beside) if beside != path and beside.is_file() else intrinsic
+    names = intrinsic.get("names")
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise GhptDataError(path, "names", "is not a list of the cameras' names", "Write it as EasyMocap does.")
+    entries = []
+    for name in names:
+        if f"K_{name}" not in intrinsic:
+            raise GhptDataError(path, f"K_{name}", "is missing", "Calibrate the intrinsics of this camera.")
+        lens = intrinsic.get(f"dist_{name}", intrinsic.get(f"D_{name}"))
+        size = [intrinsic.get(f"{side}_{name}") for side in "WH"]
+        vector, matrix = extrinsic.get(f"R_{name}"), extrinsic.get(f"Rot_{name}")
+        entries.append(_Entry(name, "", intrinsic[f"K_{name}"], [0.0] * 5 if lens is None else lens,
+                              None if None in size else size, vector if matrix is None else matrix,
+                              extrinsic.get(f"T_{name}")))  # fmt: skip
+    return entries
+
+
+def _panoptic(path: Path) -> list[_Entry]:
+    content = read_json(path)
+    cameras = content.get("cameras") if isinstance(content, dict) else None
+    if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
+        raise GhptDataError(path, "cameras", "is not a list of cameras", _FORMATS)
+    high = [camera for camera in cameras if camera.get("type", "hd") == "hd"]
+    for camera in high:
+        for field in ("name", "K", "distCoef"):
+            if field not in camera:
+                raise GhptDataError(path, f"camera {camera.get('name')}, {field}", "is missing", "Get the file again.")
+    return [_Entry(str(c["name"]), "", c["K"], c["distCoef"], c.get("resolution"), c.get("R"), c.get("t"))
+            for c in high]  # fmt: skip
+
+
+def _checked(path: Path, form: str, entries: Sequence[_Entry], mm_per_unit: float) -> CameraFile:
+    if not entries or len(entries) > _MOST_CAMERAS:
+        raise GhptDataError(path, "", f"holds {len(entries)} cameras", _FORMATS)
+    names = tuple(entry.name for entry in entries)
+    K = np.stack([_numbers(path, e.name, "matrix", e.K, (9,)).reshape(3, 3) for e in entries])
+    lens = np.stack([np.resize(np.append(_numbers(path, e.name, "distortion", e.distortion, (4, 5)), 0), 5)
+                     for e in entries])  # fmt: skip
+    poses = [_pose(path, e, mm_per_unit) for e in entries]
+    known = all(pose is not None for pose in poses)
+    R, t = (np.stack(part) for part in zip(*(pose or (np.eye(3), np.zeros(3)) for pose in poses), strict=True))
+    # what is not all the same tells the cameras apart: a file before extrinsic calibration has zeros for all
+    known = known and bool((np.abs(R - R[0]) > 0).any() or (np.abs(t - t[0]) > 0).any())
+    cameras, distortion = check_cameras(path, names, K, R, t, lens)
+    sizes = [_size(path, entry) for entry in entries]
+    return CameraFile(
+        path=str(path), format=form, names=names, other_names=tuple(entry.other for entry in entries),
+        K=cameras.K, distortion=torch.from_numpy(distortion),
+        size=None if None in sizes else torch.tensor(sizes, dtype=torch.int64),
+        R=cameras.R if known else None, t=cameras.t if known else None,
+    )  # fmt: skip
+
+
+def _pose(path: Path, entry: _Entry, mm_per_unit: float) -> tuple[np.ndarray, np.ndarray] | None:
+    if any(
+        value is None or isinstance(value, str) or (isinstance(value, list) and not value)
+        for value in (entry.R, entry.t)
+    ):
+        return None  # caliscope writes "null"
+    rotation = _numbers(path, entry.name, "rotation", entry.R, (3, 9))
+    vector = torch.from_numpy(rotation) if rotation.size == 3 else None
+    R = rotation.reshape(3, 3) if vector is None else vector_to_matrix(vector).numpy()
+    return R, _numbers(path, entry.name, "translation", entry.t, (3,)) * mm_per_unit
+
+
+def _size(path: Path, entry: _Entry) -> tuple[int, int] | None:
+    if entry.size is None:
+        return None
+    width, height = _numbers(path, entry.name, "size", entry.size, (2,))
+    if not (1 <= width <= 1e6 and 1 <= height <= 1e6):
+        problem = f"is {width:g} x {height:g}"
+        raise GhptDataError(path, f"camera {entry.name}, size", problem, "Give width and height in pixels.")
+    return round(width), round(height)
+
+
+def _numbers(path: Path, name: str, field: str, value: Any, sizes: tuple[int, ...]) -> Float[np.ndarray, " N"]:
+    """A list (of lists, or an array) of as many finite numbers as one of ``sizes``, flat."""
+    try:
+        array = np.array(value)
+        flat = array.astype(np.float64).ravel() if array.dtype.kind in "fiu" else np.empty(0)
+    except (ValueError, OverflowError):
+        flat = np.empty(0)
+    if flat.size not in sizes or not np.isfinite(flat).all():
+        expected = " or ".join(map(str, sizes))
+        problem = f"is not {expected} finite numbers"
+        raise GhptDataError(path, f"camera {name}, {field}", problem, "Check how the file was written.")
+    return flat

@@ -1,0 +1,61 @@
+"""The yml files of OpenCV's FileStorage, as far as they hold names, numbers and matrices.
+
+Read without FileStorage: it reads names without quotes as numbers, and aborts the process on some damaged files.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from jaxtyping import Float
+
+from ghpt.data.validate import open_input
+from ghpt.errors import GhptDataError
+
+Node = str | float | list[str] | Float[np.ndarray, "..."]
+_LARGEST = 4 << 20
+_MEND = "It must be a yml file that OpenCV or EasyMocap wrote."
+
+
+def read_yml(path: Path) -> dict[str, Node | None]:
+    """Key -> matrix, number, text or list of texts. Raises GhptDataError for a file that is too large or damaged."""
+    with open_input(path) as handle:
+        data = handle.read(_LARGEST + 1)
+    if len(data) > _LARGEST:
+        raise GhptDataError(path, "", f"has more than {_LARGEST >> 20} MiB", _MEND)
+    # %YAML:1.0 is no directive of YAML's
+    body = b"\n".join(line for line in data.splitlines() if not line.startswith(b"%"))
+    try:
+        content = yaml.load(body.decode("utf-8-sig"), Loader=yaml.BaseLoader)  # builds texts, lists and dicts alone
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise GhptDataError(path, "", f"is not valid yml ({' '.join(str(error).split())})", _MEND) from error
+    if not isinstance(content, dict):
+        raise GhptDataError(path, "", "holds no keys", _MEND)
+    return {str(key): _node(path, str(key), value) for key, value in content.items()}
+
+
+def _node(path: Path, key: str, value: Any) -> Node | None:
+    if isinstance(value, dict) and {"rows", "cols", "data"} <= set(value):
+        return _matrix(path, key, value)
+    if isinstance(value, list):
+        return [str(item) for item in value]
+    if isinstance(value, str):
+        try:
+            return float(value)
+        except ValueError:
+            return value
+    return None
+
+
+def _matrix(path: Path, key: str, value: dict[str, Any]) -> Float[np.ndarray, "rows cols"]:
+    try:
+        shape = int(value["rows"]), int(value["cols"])
+        flat = np.array([float(item) for item in value["data"]])
+        if min(shape) < 0 or flat.size != shape[0] * shape[1]:
+            raise ValueError(f"{flat.size} numbers for {shape[0]} x {shape[1]}")
+    except (ValueError, TypeError, OverflowError) as error:
+        raise GhptDataError(path, key, f"is no matrix ({error})", _MEND) from error
+    return flat.reshape(shape)
