@@ -9,24 +9,26 @@ from ghpt.config import build, check_type
 from ghpt.errors import GhptCheckpointError
 from ghpt.files import sweep_temporaries
 from ghpt.models.checkpoint import load_model
+from ghpt.models.pose import PoseTriangulation
+from ghpt.models.relative_pose import RelativePose
 from ghpt.provenance import provenance
-from ghpt.report.collect import CollectPredictions
-from ghpt.report.evaluate import evaluate, write_metrics
-from ghpt.report.predictions import open_predictions
-from ghpt.report.tables import print_table, title, write_report
-from ghpt.report.tensorboard import write_events
+from ghpt.report.evaluate import write_metrics
+from ghpt.report.pairs import PAIRS
+from ghpt.report.poses import POSES
+from ghpt.report.report import Report
+from ghpt.report.tables import title
 from ghpt.train import make_trainer, progress, shell_status, shown
 
+REPORTS: dict[type, Report] = {PoseTriangulation: POSES, RelativePose: PAIRS}
 _log = logging.getLogger(__name__)
 
 
 class Settings(TypedDict):
-    """What `test` needs of the configuration."""
+    """What `test` needs of the configuration, whatever the problem; see also ``Report.settings``."""
 
     ckpt: str | None
     hypotheses: int | None
     data: dict[str, Any]
-    baselines: dict[str, Any]
     trainer: dict[str, Any]
     seed: int
     progress_bar: bool
@@ -40,18 +42,25 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
     check_type(config, Settings, "")
     if not config["ckpt"]:
         raise GhptCheckpointError("ckpt", "is missing", "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m")
-    model, trained = load_model(config["ckpt"], hypotheses=config["hypotheses"], seed=config["seed"])
+    changes = {"hypotheses": config["hypotheses"], "seed": config["seed"], "problem.frames": config.get("frames")}
+    model, trained = load_model(config["ckpt"], **changes)
+    report = REPORTS.get(type(model.problem))
+    if report is None:
+        raise GhptCheckpointError(config["ckpt"], f"is of a {type(model.problem).__name__}", "It has no report.")
+    check_type(config, report.settings, "")
     data = build(config["data"], "data")
+    data.serve(model.problem)
     origin = provenance(config["seed"]) | {"checkpoint": str(config["ckpt"]), "training": trained["provenance"]}
     meta = {
         "data": data.name, "source": data.source, "split": data.evaluate, "seed": config["seed"],
         "hypotheses": model.hypotheses, "provenance": origin,
     }  # fmt: skip
+    baselines = build(config[report.baselines], report.baselines)
     trainer = make_trainer(
         config["trainer"],
         default_root_dir=output,
         logger=False,
-        callbacks=[CollectPredictions(output, build(config["baselines"], "baselines"), meta), *progress(config)],
+        callbacks=[report.collect(output, baselines, meta), *progress(config)],
         enable_progress_bar=config["progress_bar"],
     )
     sweep_temporaries(output)
@@ -60,12 +69,12 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
         trainer.test(model, datamodule=data, verbose=False)
     if not trainer.is_global_zero:
         return {}
-    predictions = open_predictions(output / "predictions.npz")
-    metrics = evaluate(predictions)
+    predictions = report.open(output / "predictions.npz")
+    metrics = report.evaluate(predictions)
     write_metrics(output / "metrics.json", metrics)
-    write_report(output / "report.md", metrics)
-    write_events(output, predictions, metrics)
-    print_table(metrics)
+    report.write_report(output / "report.md", metrics)
+    report.write_events(output, predictions, metrics)
+    report.print_table(metrics)
     _log.info("Report: %s, beside it metrics.json and predictions.npz.", shown(output / "report.md"))
     _log.info("Figures: tensorboard --logdir %s", shown(output))
     return metrics
@@ -73,7 +82,8 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
 
 def summary(metrics: dict[str, Any]) -> str:
     """What `test` returned, in words."""
-    error = metrics["selections"]["weight"]["mpjpe_relative"]
+    weight = metrics["selections"]["weight"]
+    error = next(weight[report.headline] for report in REPORTS.values() if report.headline in weight)
     return f"{title(metrics)}: {'–' if error is None else f'{error:.1f} mm'}"
 
 

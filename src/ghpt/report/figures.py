@@ -67,7 +67,7 @@ def skeletons(
     if poses:
         handles.append(Line2D([], [], color=TRUTH, linewidth=4, label="truth"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(_wrapped(heading, 55 * len(shown) // 2), fontsize=10)
+    figure.suptitle(wrapped(heading, 55 * len(shown) // 2), fontsize=10)
     return figure
 
 
@@ -86,7 +86,7 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
     axes.set_xticks(range(len(PARTS)), [part.replace("_", " ") for part in PARTS])
     axes.set_ylabel("S²: variance of left / right length")
     heading = f"Pose prior of {subject} (lower is better)\n{title(metrics)}"
-    axes.set_title(_wrapped(heading, 110), fontsize=10)
+    axes.set_title(wrapped(heading, 110), fontsize=10)
     axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -109,7 +109,7 @@ def up_axis(truth: Float[np.ndarray, "N 17 3"]) -> Float[np.ndarray, "3"]:
     return np.sign(trunk[axis]) * np.eye(3)[axis]
 
 
-def _wrapped(text: str, width: int) -> str:
+def wrapped(text: str, width: int) -> str:
     """Paths in a title may be long."""
     return "\n".join(textwrap.fill(line, width) for line in text.splitlines())
 

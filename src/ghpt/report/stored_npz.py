@@ -77,3 +77,10 @@ def text_table(path: Path, members: Mapping[str, Member], name: str) -> tuple[st
     member = members[name]
     count = int(np.prod(member.shape))
     return tuple(str(text) for text in np.fromfile(path, member.dtype, count, offset=member.offset))
+
+
+def read_rows(path: Path, member: Member, start: int, stop: int) -> np.ndarray:
+    """The rows of a member's first dimension from ``start`` up to ``stop``, and no others."""
+    each = math.prod(member.shape[1:])
+    offset = member.offset + start * each * member.dtype.itemsize
+    return np.fromfile(path, member.dtype, (stop - start) * each, offset=offset).reshape(-1, *member.shape[1:])

@@ -1,8 +1,7 @@
 """A test run in TensorBoard. It shows what metrics.json holds; it can fail without costing the run anything."""
 
 import logging
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,8 @@ from torch.utils.tensorboard.summary import hparams
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.recording import PoseEstimate
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
-from ghpt.report.predictions import WEIGHTS, PredictionChunk, Predictions
+from ghpt.report.predictions import PredictionChunk, Predictions
+from ghpt.report.rows import WEIGHTS
 from ghpt.report.tables import title, trained_on
 
 SHOWN = ("weight", "most", "least", "random")
@@ -28,42 +28,43 @@ _BLOCK = 1000
 _log = logging.getLogger(__name__)
 
 
-class _Failures:
-    """Keeps a failing part from stopping the next; counts them and says so once."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    @contextmanager
-    def caught(self, part: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:
-            self.count += 1
-            if self.count == 1:
-                _log.warning("TensorBoard: %s cannot be written (%s); the test's files are complete", part, error)
-
-
 def write_events(folder: str | Path, predictions: Predictions, metrics: Mapping[str, Any]) -> int:
-    """Write a test run's scalars, histograms, figures and hyper-parameters as events in ``folder``.
+    """Write a test run's scalars, histograms, figures and hyper-parameters, as ``write_parts`` does."""
+    return write_parts(
+        folder,
+        {
+            "scalars": lambda writer: _scalars(writer, metrics),
+            "the weights": lambda writer: _weights(writer, predictions),
+            "the skeletons": lambda writer: _skeletons(writer, predictions, metrics),
+            "the pose prior": lambda writer: _pose_prior(writer, metrics),
+            "the hyper-parameters": lambda writer: write_hyperparameters(
+                writer, predictions.meta, metrics, "mpjpe_relative"
+            ),
+        },
+    )
+
+
+def write_parts(folder: str | Path, parts: Mapping[str, Callable[[SummaryWriter], None]]) -> int:
+    """Write each part (what it is called -> what writes it) as events in ``folder``.
 
     Never raises: the number of parts that failed is returned, and the first is said as a logged warning.
     """
-    failures = _Failures()
-    with failures.caught("the event file"):
-        writer = SummaryWriter(str(folder))
-        with failures.caught("scalars"):
-            _scalars(writer, metrics)
-        with failures.caught("the weights"):
-            _weights(writer, predictions)
-        with failures.caught("the skeletons"):
-            _skeletons(writer, predictions, metrics)
-        with failures.caught("the pose prior"):
-            _pose_prior(writer, metrics)
-        with failures.caught("the hyper-parameters"):
-            _hyperparameters(writer, predictions, metrics)
-        writer.close()
-    return failures.count
+    failures: list[Exception] = []
+
+    def attempt(part: str, write: Callable[[], Any]) -> Any:
+        try:
+            return write()
+        except Exception as error:
+            if not failures:
+                _log.warning("TensorBoard: %s cannot be written (%s); the test's files are complete", part, error)
+            failures.append(error)
+
+    writer = attempt("the event file", lambda: SummaryWriter(str(folder)))
+    if writer is not None:
+        for part, write in parts.items():
+            attempt(part, lambda write=write: write(writer))
+        attempt("the event file", writer.close)
+    return len(failures)
 
 
 def _scalars(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
@@ -74,8 +75,13 @@ def _scalars(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
 
 
 def _weights(writer: SummaryWriter, predictions: Predictions) -> None:
-    for summary in WEIGHTS:
-        values = torch.cat([chunk.weights[summary] for _, chunk in _sample(predictions)])
+    chunks = [chunk.weights for _, chunk in _sample(predictions)]
+    write_weights(writer, {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS})
+
+
+def write_weights(writer: SummaryWriter, weights: Mapping[str, Float[Tensor, " N"]]) -> None:
+    """Mean and histogram of each summary of the weights."""
+    for summary, values in weights.items():
         writer.add_scalar(f"weights/{summary}", values.mean().item(), 0)
         writer.add_histogram(f"weights/{summary}", values.numpy(), 0)
 
@@ -105,14 +111,15 @@ def _pose_prior(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
         writer.add_image(f"pose_prior/{subject}", image(pose_prior_bars(metrics, subject)), 0, dataformats="HWC")
 
 
-def _hyperparameters(writer: SummaryWriter, predictions: Predictions, metrics: Mapping[str, Any]) -> None:
+def write_hyperparameters(
+    writer: SummaryWriter, meta: Mapping[str, Any], metrics: Mapping[str, Any], error: str
+) -> None:
+    """The settings of a test run beside each selection's ``error``."""
     trained, source = trained_on(metrics)
     values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
-    values |= {"trained_on": trained, "trained_on_source": source, "hypotheses": predictions.meta.get("hypotheses")}
+    values |= {"trained_on": trained, "trained_on_source": source, "hypotheses": meta.get("hypotheses")}
     numbers = {
-        f"final/{name}": numbers["mpjpe_relative"]
-        for name, numbers in metrics["selections"].items()
-        if numbers["mpjpe_relative"] is not None
+        f"final/{name}": numbers[error] for name, numbers in metrics["selections"].items() if numbers[error] is not None
     }
     # writer.add_hparams would write them to a second event file.
     for summary in hparams({k: v for k, v in values.items() if v is not None}, numbers):

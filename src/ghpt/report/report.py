@@ -1,0 +1,30 @@
+"""What testing needs to know of a problem: how its predictions are collected, measured and shown."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ghpt.report.collect import Collect
+
+
+@dataclass(frozen=True)
+class Report:
+    """One instance for each problem. ``metrics`` below is what ``evaluate`` returns, the content of metrics.json."""
+
+    settings: type
+    """The settings that test.py needs for this problem alone, a TypedDict."""
+    baselines: str
+    """The one of them that names the classical estimators."""
+    collect: type[Collect]
+    """Writes predictions.npz."""
+    open: Callable[[Path], Any]
+    """Opens and checks it."""
+    evaluate: Callable[[Any], dict[str, Any]]
+    """Opened predictions -> metrics."""
+    print_table: Callable[[Mapping[str, Any]], None]
+    write_report: Callable[[Path, Mapping[str, Any]], None]
+    write_events: Callable[[Path, Any, Mapping[str, Any]], int]
+    """Folder, opened predictions and metrics; never raises."""
+    headline: str
+    """The number of a selection, in mm, that sums a run up."""
