@@ -43,7 +43,7 @@ class KeyPoints:
     """For each view the number of frames with more than one person, of whom one was followed."""
 
 
-def read_key_points(path: str | Path, skeleton: str | None = None, rate_hz: float | None = None) -> KeyPoints:
+def read_key_points(path: str | Path, skeleton: str | None = None, rate_hz: int | float | None = None) -> KeyPoints:
     """The key points of a folder or file; ``skeleton`` and ``rate_hz`` say what the files do not, or overrule them.
 
     Raises GhptDataError for what is damaged, empty or not known, naming file, field and mend.

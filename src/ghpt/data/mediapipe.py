@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import io
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -62,9 +63,12 @@ def _table(path: Path) -> Float[np.ndarray, "N 5"]:
             columns = [header.index(name) for name in COLUMNS]
             # an empty cell is a point that was not found
             empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
-            table = np.loadtxt(handle, delimiter=",", usecols=columns, converters=empty, ndmin=2)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # of a table without rows
+                table = np.loadtxt(handle, delimiter=",", usecols=columns, converters=empty, ndmin=2)
         except (ValueError, StopIteration, csv.Error) as error:
             raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
+    table = table.reshape(-1, len(COLUMNS))
     whole = table[:, :3][np.isfinite(table[:, :3])]
     if not (np.abs(np.nan_to_num(table)) < 1e12).all() or (whole != np.round(whole)).any():
         raise GhptDataError(path, "", "holds an index that is not whole, or a number beyond 1e12", _WRITE)

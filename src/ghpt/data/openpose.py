@@ -20,7 +20,7 @@ _MOST_PEOPLE = 64
 _JUMP = 2.0
 """How much of a person's quality (at most 1) a jump by their own size costs."""
 
-People = list[Float[np.ndarray, "P K 3"]]
+People = list[Float[np.ndarray, "_ K 3"]]
 """For each frame the people in it: x, y, confidence of their joints; pixels."""
 
 

@@ -1,0 +1,159 @@
+"""Our own npz, the matching of views to cameras by name, and what stands between a detector and a calibration."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ghpt.data.camera_files import CameraFile
+from ghpt.data.key_points import KeyPoints, read_key_points, write_key_points
+from ghpt.data.lens import distort
+from ghpt.data.skeletons import SKELETONS
+from ghpt.data.views import look_through, matched, normal
+from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import project
+from scenes import random_scene
+
+
+def camera_file(names, other=None, lens: float = 0.0) -> CameraFile:
+    views = len(names)
+    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(views, 3, 3)
+    distortion = torch.tensor([lens, lens / 2, 0, 0, 0], dtype=torch.float64).expand(views, 5)
+    return CameraFile(
+        "Calib.toml", "Pose2Sim", tuple(names), tuple(other or [""] * views), K, distortion, None, None, None
+    )
+
+
+def key_points(views=("a", "b"), frames: int = 5, joints=SKELETONS["coco_17"]) -> KeyPoints:
+    rng = np.random.default_rng(0)
+    shape = (frames, len(views), len(joints))
+    seen = rng.random(shape) < 0.8
+    seen[0] = True
+    values = np.where(seen[..., None], rng.uniform(0, 1000, (*shape, 2)), 0)
+    return KeyPoints(
+        "pose",
+        tuple(views),
+        tuple(joints),
+        np.arange(frames) * 2 + 3,
+        values,
+        np.where(seen, rng.random(shape), 0),
+        seen,
+        60.0,
+        (0,) * len(views),
+    )
+
+
+def test_our_npz_comes_back_as_it_was(tmp_path):
+    points = key_points()
+    write_key_points(tmp_path / "points.npz", points)
+    found = read_key_points(tmp_path / "points.npz")
+    for name, value in vars(replace(points, path=str(tmp_path / "points.npz"))).items():
+        assert np.array_equal(getattr(found, name), value), name
+    assert read_key_points(tmp_path / "points.npz", rate_hz=30).rate_hz == 30
+
+
+def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):
+    points = key_points()
+    values = np.where(points.seen[..., None], points.key_points, np.nan)
+    np.savez(tmp_path / "p.npz", key_points=values, views=np.array(["a", "b"]), skeleton=np.array("COCO-17"))
+    found = read_key_points(tmp_path / "p.npz")
+    np.testing.assert_array_equal(found.seen, points.seen)
+    assert np.isfinite(found.key_points).all()
+    assert found.joints == SKELETONS["coco_17"]
+    assert found.frame.tolist() == [0, 1, 2, 3, 4]
+    assert (found.confidence == points.seen).all()
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"key_points": None}, "key_points: is missing"),
+        ({"views": None}, "views: is missing"),
+        ({"views": np.array(["a", "a"])}, "views: names 2 for 2 of key_points, or one twice"),
+        ({"views": np.array(["a"])}, "views: names 1 for 2"),
+        ({"views": np.array([1, 2])}, "views: is not a list of texts"),
+        ({"joints": np.array(["nose"])}, "lack right_ankle|joints: names 1 for 17"),
+        ({"skeleton": np.array("body_25"), "joints": None}, "body_25 has 25 joints and the key points have 17"),
+        ({"skeleton": np.array("mine"), "joints": None}, "there is no skeleton 'mine'"),
+        ({"key_points": np.zeros((5, 2, 17))}, "key_points: has shape 5 x 2 x 17"),
+        ({"confidence": np.ones((5, 2, 16))}, "confidence: has shape 5 x 2 x 16"),
+        ({"frame": np.array([1, 2, 2, 3, 4])}, "frame: is empty, or does not rise"),
+        ({"seen": np.zeros((5, 2, 17), bool)}, "view a: has no key point"),
+        ({"views": np.array(["a", None], dtype=object)}, "Python objects"),
+    ],
+)
+def test_a_bad_npz_is_named(change, says, tmp_path):
+    points = key_points()
+    arrays = {name: np.array(value) for name, value in vars(points).items() if name not in ("path", "several")}
+    arrays = {name: value for name, value in (arrays | change).items() if value is not None}
+    np.savez(tmp_path / "p.npz", **arrays)
+    with pytest.raises(GhptDataError, match=says):
+        read_key_points(tmp_path / "p.npz")
+
+
+def test_a_cut_npz_is_named(tmp_path):
+    write_key_points(tmp_path / "p.npz", key_points())
+    (tmp_path / "p.npz").write_bytes((tmp_path / "p.npz").read_bytes()[:-30])
+    with pytest.raises(GhptDataError, match="not a whole npz"):
+        read_key_points(tmp_path / "p.npz")
+
+
+@pytest.mark.parametrize(
+    ("views", "names", "other", "expected"),
+    [
+        (["b", "a"], ["a", "b"], None, [(1, 0), (0, 1)]),
+        (["cam1_json", "cam2_json", "cam10_json"], ["cam01", "cam02", "cam10"], None, [(0, 0), (1, 1), (2, 2)]),
+        (["cam_10", "cam_2"], ["left", "right"], ["cam_2", "cam_10"], [(1, 0), (0, 1)]),
+        (["Cam.01", "cam1x"], ["cam1", "cam1x"], None, [(0, 0), (1, 1)]),
+        (["cam1", "cam01"], ["cam1", "cam01"], None, [(0, 0), (1, 1)]),
+        (["00_05", "00_15"], ["00_15", "00_05"], None, [(1, 0), (0, 1)]),
+    ],
+)
+def test_views_find_their_cameras_by_name(views, names, other, expected):
+    assert matched("pose", views, camera_file(names, other), {}, None) == expected
+
+
+@pytest.mark.parametrize(
+    ("views", "names", "says"),
+    [
+        (["a", "c"], ["a", "b"], r"view c has no camera \(views: a, c; cameras of Calib.toml: a, b\)"),
+        (["a"], ["a", "b"], "camera b has no view"),
+        (["cam_1", "Cam1"], ["cam1", "cam2"], "camera cam1 has more than one view"),
+        (["cam1", "x"], ["cam01", "cam001"], "view cam1 has more than one camera"),
+    ],
+)
+def test_what_is_not_one_to_one_is_refused_with_both_sides(views, names, says):
+    with pytest.raises(GhptDataError, match=says):
+        matched("pose", views, camera_file(names), {}, None)
+
+
+def test_the_user_says_which_is_which_and_which_to_use():
+    cameras = camera_file(["front", "back", "top"])
+    pairs = matched("pose", ["1", "2", "top"], cameras, {"1": "back", "2": "front"}, None)
+    assert pairs == [(1, 0), (0, 1), (2, 2)]
+    assert matched("pose", ["front", "top", "x"], cameras, {}, ["top", "front"]) == [(0, 0), (1, 2)]
+    with pytest.raises(GhptDataError, match="there is no view back with a camera"):
+        matched("pose", ["front", "top"], cameras, {}, ["top", "back"])
+
+
+def test_zeros_inside_a_number_stay():
+    assert normal("cam_100") == "cam100" != normal("cam10") == normal("CAM-010_json")
+
+
+def test_the_lens_is_undone_before_means_are_taken():
+    """A body of 17 exact points through a strong lens: thorax is the mean of the ideal shoulders."""
+    scene = random_scene(4, frames=1, views=2)
+    cameras = camera_file(["a", "b"], lens=-0.2)
+    cameras = replace(cameras, K=scene.cameras.K[0])
+    pixels, _ = project(scene.cameras, scene.points)
+    seen_by_lens = torch.stack([distort(pixels[0, v], cameras.K[v], cameras.distortion[v]) for v in range(2)])
+    joints = SKELETONS["coco_17"]
+    points = replace(
+        key_points(joints=joints, frames=1), key_points=seen_by_lens.numpy()[None], seen=np.ones((1, 2, 17), bool)
+    )
+    views = look_through(points, cameras)
+    mean = pixels[0, :, [joints.index("left_shoulder"), joints.index("right_shoulder")]].mean(1)
+    np.testing.assert_allclose(views.key_points[0, :, 8], mean, atol=1e-3)
+    assert views.seen.all()
+    assert views.recording("x", scene.cameras.index(0)).truth_seen.sum() == 0

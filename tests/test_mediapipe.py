@@ -1,0 +1,78 @@
+"""caliscope's table of landmarks: long to dense, hands and face left out, gaps left gaps."""
+
+import numpy as np
+import pytest
+
+from ghpt.data.key_points import read_key_points
+from ghpt.data.mediapipe import read_caliscope
+from ghpt.data.skeletons import SKELETONS
+from ghpt.errors import GhptDataError
+
+HEADER = "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"
+
+
+def table(tmp_path, *rows, header=HEADER):
+    path = tmp_path / "xy_HOLISTIC.csv"
+    path.write_text("\n".join([header, *rows]) + "\n")
+    return path
+
+
+def test_rows_become_an_array_whatever_their_order(tmp_path):
+    rng = np.random.default_rng(0)
+    pixels = rng.uniform(0, 1000, (4, 3, 33, 2))
+    there = rng.random((4, 3, 33)) < 0.7
+    there[[0, 3], 0, 0] = there[1:3, 0, 0] = True
+    frames, ports = [5, 6, 9, 12], [0, 2, 10]
+    rows = []
+    for t, v, k in zip(*np.nonzero(there), strict=True):
+        x, y = pixels[t, v, k].tolist()
+        rows.append(f"{frames[t]},{ports[v]},{t},1.5,{k},{x!r},{y!r},,")
+    rows += ["5,0,0,1.5,400,1,2,,", "5,2,0,1.5,100,1,2,,"]
+    found = read_key_points(table(tmp_path, *rng.permutation(rows)))
+    assert found.views == ("cam_0", "cam_2", "cam_10")
+    assert found.frame.tolist() == frames
+    assert found.joints == SKELETONS["mediapipe_33"]
+    np.testing.assert_array_equal(found.seen, there)
+    np.testing.assert_array_equal(found.key_points[there], pixels[there])
+    assert (found.confidence == there).all()
+
+
+def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):
+    _, _, points, seen = read_caliscope(table(tmp_path, "0,0,0,1.5,0,10,20,,", "0,1,0,1.5,0,,,,", "0,1,0,1.5,1,3,4,,"))
+    assert seen[0, :, :2].tolist() == [[True, False], [False, True]]
+    assert (points[~seen] == 0).all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ([], "no body landmark"),
+        (["0,0,0,1,0,1,2,,"] * 2, "a point is there twice"),
+        (["0,0,0,1,0,1"], "is damaged"),
+        (["0,0,0,1,x,1,2,,"], "is damaged"),
+        (["0,0.5,0,1,0,1,2,,"], "an index that is not whole"),
+        (["0,0,0,1,0,1e300,2,,"], "a number beyond"),
+        (["0,0,0,1,100,1,2,,"], "no body landmark"),
+    ],
+)
+def test_a_bad_table_is_named(rows, says, tmp_path):
+    with pytest.raises(GhptDataError, match=says):
+        read_key_points(table(tmp_path, *rows))
+
+
+def test_another_csv_is_not_taken_for_it(tmp_path):
+    with pytest.raises(GhptDataError, match=r"not a key-point format that is known.*OpenPose"):
+        read_key_points(table(tmp_path, "0,1", header="a,b"))
+
+
+def test_the_real_recording(shared_data):
+    """Every body landmark of the file is at its place, found by an independent count."""
+    path = shared_data / "caliscope" / "xy_HOLISTIC.csv"
+    found = read_key_points(path)
+    assert found.views == ("cam_0", "cam_1", "cam_2", "cam_3")
+    rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
+    body = [row for row in rows if int(row[4]) < 33]
+    assert found.seen.sum() == len(body)
+    for row in body[:: len(body) // 50]:
+        t, v, k = found.frame.tolist().index(int(row[0])), int(row[1]), int(row[4])
+        assert found.key_points[t, v, k].tolist() == [float(row[5]), float(row[6])]

@@ -1,0 +1,148 @@
+"""OpenPose's folders: frames by their numbers, missing ones missing, and one person followed through each view."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ghpt.data.key_points import read_key_points
+from ghpt.data.openpose import follow, read_people
+from ghpt.data.skeletons import SKELETONS
+from ghpt.errors import GhptDataError
+
+RNG = np.random.default_rng(0)
+BODY = RNG.uniform(0, 400, (25, 2))
+JOINTS = {"skeleton": "body_25b"}
+
+
+def person(x: float = 0, size: float = 1, confidence: float = 0.8) -> np.ndarray:
+    return np.concatenate([BODY * size + [x, 0], np.full((25, 1), confidence)], -1)
+
+
+def write(folder, people, name="cam1_{:012d}_keypoints.json", frames=None):
+    folder.mkdir(parents=True, exist_ok=True)
+    for frame, found in zip(frames or range(len(people)), people, strict=True):
+        content = {"version": 1.3, "people": [{"pose_keypoints_2d": p.ravel().tolist()} for p in found]}
+        (folder / name.format(frame)).write_text(json.dumps(content))
+
+
+def test_frames_keep_their_numbers_and_gaps_stay_gaps(tmp_path):
+    write(tmp_path / "cam1", [[person(t)] for t in range(6)])
+    write(tmp_path / "cam2", [[person(100 + t)] for t in (0, 2, 3, 7)], "x.{:04d}.json", frames=[0, 2, 3, 7])
+    found = read_key_points(tmp_path, **JOINTS)
+    assert found.frame.tolist() == [0, 1, 2, 3, 4, 5, 7]
+    assert found.seen[:, 0, 0].tolist() == [True] * 6 + [False]
+    assert found.seen[:, 1, 0].tolist() == [True, False, True, True, False, False, True]
+    np.testing.assert_allclose(
+        found.key_points[[0, 2, 3, 6], 1, :, 0] - BODY[:, 0], np.array([[100], [102], [103], [107]]) + np.zeros(25)
+    )
+    assert found.joints == SKELETONS["body_25b"]
+
+
+def test_zeros_are_missing_and_confidence_stays_in_its_range(tmp_path):
+    one = person()
+    one[3], one[4, 2] = 0, 1.04
+    write(tmp_path / "cam1", [[one], []])
+    write(tmp_path / "cam2", [[person()], [person()]])
+    found = read_key_points(tmp_path, **JOINTS)
+    assert not found.seen[0, 0, 3]
+    assert found.seen[0, 0].sum() == 24
+    assert not found.seen[1, 0].any()
+    assert found.confidence.max() == 1
+
+
+def test_the_person_tracked_best_is_followed_wherever_the_list_has_them():
+    """A small unsure passer-by, listed first or last; and one who is larger for some frames, but passes."""
+    rng = np.random.default_rng(1)
+    people, truth = [], []
+    for t in range(40):
+        main, other = person(5 * t), person(900 - 8 * t, 0.4, 0.4)
+        found = [main, other]
+        if 10 <= t < 16:
+            found.append(person(1500, 1.5, 0.9))
+        order = rng.permutation(len(found))
+        people.append(np.stack([found[i] for i in order]))
+        truth.append(int(np.flatnonzero(order == 0)[0]))
+    people[20] = np.zeros((0, 25, 3))
+    truth[20] = -1
+    assert follow(people).tolist() == truth
+
+
+def test_following_is_the_best_of_all_choices():
+    """Against every choice of one person a frame, by brute force."""
+    from itertools import product
+
+    from ghpt.data.openpose import _JUMP, _jump, _quality
+
+    rng = np.random.default_rng(5)
+    people = [np.stack([person(rng.uniform(0, 300), rng.uniform(0.5, 1.5), rng.uniform(0.2, 1)) for _ in range(3)])
+              for _ in range(5)]  # fmt: skip
+    quality = np.stack([_quality(found) for found in people]) / max(_quality(found).max() for found in people)
+
+    def value(choice):
+        jumps = sum(_jump(people[t], people[t + 1])[choice[t], choice[t + 1]] for t in range(4))
+        return sum(quality[t, c] for t, c in enumerate(choice)) - _JUMP * jumps
+
+    assert tuple(follow(people)) == max(product(range(3), repeat=5), key=value)
+
+
+def test_the_number_of_people_is_told(tmp_path):
+    write(tmp_path / "a", [[person(), person(900)], [person()], []])
+    write(tmp_path / "b", [[person()]] * 3)
+    assert read_key_points(tmp_path, **JOINTS).several == (1, 0)
+
+
+def test_cameras_without_a_common_frame_are_refused(tmp_path):
+    write(tmp_path / "a", [[person()]] * 2, frames=[1, 2])
+    write(tmp_path / "b", [[person()]] * 2, frames=[3, 4])
+    with pytest.raises(GhptDataError, match=r"no frame is in all views \(a 1 to 2, b 3 to 4\)"):
+        read_key_points(tmp_path, **JOINTS)
+
+
+def test_bad_folders_are_named(tmp_path):
+    with pytest.raises(GhptDataError, match=r"holds no folder with OpenPose's JSON files.*for each camera"):
+        read_key_points(tmp_path)
+    write(tmp_path / "a", [[]] * 3)
+    with pytest.raises(GhptDataError, match="people: is empty"):
+        read_key_points(tmp_path)
+    write(tmp_path / "b", [[person()]] * 3)
+    with pytest.raises(GhptDataError, match="view a: has no key point"):
+        read_key_points(tmp_path, **JOINTS)
+    with pytest.raises(GhptDataError, match="Name the folder above"):
+        read_key_points(tmp_path / "a")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("x.json", "{}", "its name has no frame number"),
+        ("01.json", '{"people": []}', "has the frame number 1, as 01.json has"),
+        ("9.json", '{"people": [', "is not valid JSON"),
+        ("9.json", '{"people": 1}', "people: is not a list of people"),
+        ("9.json", '{"people": [{}]}', r"people\[0\]\.pose_keypoints_2d: is not a list of x, y, confidence"),
+        ("9.json", '{"people": [{"pose_keypoints_2d": [1, 2]}]}', "is not a list of x, y, confidence"),
+        ("9.json", '{"people": [{"pose_keypoints_2d": [NaN, 2, 3]}]}', "NaN is no JSON number"),
+        ("9.json", '{"people": [{"pose_keypoints_2d": [1e300, 2, 3]}]}', "holds a number beyond 1e6"),
+        ("9.json", '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}', "people of 1 joints, the files before of 25"),
+        ("9.json", '{"people": [' + ",".join(['{"pose_keypoints_2d": []}'] * 65) + "]}", "65 are listed"),
+    ],
+)
+def test_a_bad_file_is_named(name, content, says, tmp_path):
+    write(tmp_path, [[person()]] * 3)
+    (tmp_path / name).write_text(content)
+    with pytest.raises(GhptDataError, match=says):
+        read_people(tmp_path)
+
+
+def test_the_real_recording(shared_data):
+    found = read_key_points(shared_data / "pose2sim_single" / "pose")
+    assert found.views == ("cam1_json", "cam2_json", "cam3_json", "cam4_json")
+    assert found.joints == SKELETONS["body_25b"]
+    assert found.frame.tolist() == list(range(100))
+    assert found.several == (100, 100, 0, 0)
+    size = (
+        np.where(found.seen[..., None], found.key_points, np.inf).min(2),
+        np.where(found.seen[..., None], found.key_points, -np.inf).max(2),
+    )
+    # of the other person, at the edge of two views, less than 500 pixels are seen
+    assert (np.linalg.norm(size[1] - size[0], axis=-1) > 500).all()
