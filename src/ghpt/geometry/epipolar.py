@@ -13,7 +13,12 @@ MINIMUM = 8
 """Correspondences that the 8-point algorithm needs."""
 DEGENERATE = 1e-10
 """The second smallest eigenvalue of the (normalised) equations over the largest, below which they have more than one
-solution: collinear points, a plane, coinciding cameras. Rounding gives 1e-16, a person moving in 3D 1e-5 and more."""
+solution: collinear points, a plane, coinciding cameras, a pure rotation.
+
+Exact points of such scenes give up to 1e-13, pixels in float32 1e-12; a person in one pose 1e-4 and more, 8 random
+joints 1e-8 (one sample in thousands falls below the limit and is lost). Key-point noise hides the degenerate scenes: at
+3 pixels they too give 1e-5 to 1e-3, so this eigenvalue cannot tell them, and the pose that comes of them means nothing.
+"""
 
 
 def normalise(K: Float[Tensor, "*B 3 3"], pixels: Float[Tensor, "*B N 2"]) -> Float[Tensor, "*B N 2"]:
@@ -96,8 +101,10 @@ def _smallest(normal: Tensor, count: Tensor, Ta: Tensor, Tb: Tensor) -> tuple[Te
 
 
 def decompose(E: Float[Tensor, "*B 3 3"]) -> tuple[Float[Tensor, "*B 4 3 3"], Float[Tensor, "*B 4 3"]]:
-    """The four relative poses of an essential matrix: (R1, t), (R1, -t), (R2, t), (R2, -t), t of length 1."""
-    U, _, Vt = torch.linalg.svd(E)
+    """The four relative poses of an essential matrix: (R1, t), (R1, -t), (R2, t), (R2, -t), t of length 1.
+    Finite and meaningless where E is not finite."""
+    finite = torch.isfinite(E).all(-1).all(-1)[..., None, None]
+    U, _, Vt = torch.linalg.svd(torch.where(finite, E, 0.0))
     U, Vt = (M * torch.where(torch.linalg.det(M) < 0, -1.0, 1.0)[..., None, None] for M in (U, Vt))
     W = E.new_tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     R1, R2, t = U @ W @ Vt, U @ W.mT @ Vt, U[..., 2]
@@ -107,9 +114,9 @@ def decompose(E: Float[Tensor, "*B 3 3"]) -> tuple[Float[Tensor, "*B 4 3 3"], Fl
 def depths(
     R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
 ) -> tuple[Float[Tensor, "*B N"], Float[Tensor, "*B N"]]:
-    """Depths, in units of t, in a and b of the midpoints between the rays; 0 where the rays are parallel.
+    """Depths, in units of t: in a of the point of a's ray nearest to b's, in b of that of b's ray; 0 for parallel rays.
 
-    The rays' nearest points are at ``alpha R a`` and ``beta b - t`` in b's axes (all from a's centre).
+    These points are at ``alpha R a`` and ``beta b - t`` in b's axes (all from a's centre).
     """
     u, v = homogeneous(a) @ R.mT, homogeneous(b)
     uu, vv, uv = (u * u).sum(-1), (v * v).sum(-1), (u * v).sum(-1)
