@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -20,57 +19,27 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.errors import check
-from ghpt.geometry.epipolar import MINIMUM, eight_point, normalise, pose_in_front, sampson_error
+from ghpt.geometry.epipolar import MINIMUM, eight_point, pose_in_front, sampson_error
 from ghpt.models.baselines import person_size
 from ghpt.randomness import key, uniform
 from ghpt.recording import PairBatch, RelativePoseEstimate
 
 
-class Correspondences(NamedTuple):
-    """The joints of a pair's frames in both views: N = M J."""
-
-    a: Float[Tensor, "B N 2"]
-    """Normalised image coordinates in the reference view, float64; 0 where not ``used``."""
-    b: Float[Tensor, "B N 2"]
-    """The same in the target view."""
-    used: Bool[Tensor, "B N"]
-    size: Float[Tensor, " B"]
-    """The person's size, normalised image coordinates; 0 where it has none."""
-
-
-def correspondences(batch: PairBatch) -> Correspondences:
-    """What both views of each pair see."""
+def size_in_image(batch: PairBatch) -> Float[Tensor, " B"]:
+    """The person's size in the pair's views, in normalised image coordinates; 0 where it has none."""
     K, pixels, seen = (batch.of_pair(x) for x in (batch.cameras.K, batch.key_points, batch.seen))
-    points = normalise(K, pixels.flatten(2, 3))
-    used = (seen.flatten(2, 3) & torch.isfinite(points).all(-1)).all(1)
     focal = (K[..., 0, 0] + K[..., 1, 1]).double() / 2
     size = person_size(pixels.double(), seen) / focal[..., None]
-    median = torch.where(size > 0, size, torch.nan).flatten(1).nanmedian(-1).values
-    a, b = torch.where(used[:, None, :, None], points, 0.0).unbind(1)
-    return Correspondences(a, b, used, median.nan_to_num(0.0))
+    return torch.where(size > 0, size, torch.nan).flatten(1).nanmedian(-1).values.nan_to_num(0.0)
 
 
-class PairPose(NamedTuple):
-    """A pose of each pair, ``x_b = R x_a + t`` with \\|t\\| = 1, and whether there is one."""
-
-    R: Float[Tensor, "*B 3 3"]
-    t: Float[Tensor, "*B 3"]
-    ok: Bool[Tensor, "*B"]
-
-
-def _linear(
+def linear_pose(
     a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B N"]
-) -> tuple[PairPose, Bool[Tensor, "*B"]]:
-    """The 8-point pose of the used correspondences, and whether they determine an essential matrix."""
+) -> tuple[RelativePoseEstimate, Bool[Tensor, "*B"]]:
+    """The 8-point algorithm's pose of the used correspondences, and whether they determine an essential matrix."""
     E, determined = eight_point(a, b, used.double())
-    R, t, front = pose_in_front(E, a, b, used)
-    return PairPose(R, t, front & determined), determined
-
-
-def _estimate(pose: PairPose) -> RelativePoseEstimate:
-    eye = torch.eye(3, dtype=pose.R.dtype, device=pose.R.device)
-    R = torch.where(pose.ok[..., None, None], pose.R, eye)
-    return RelativePoseEstimate(R, torch.where(pose.ok[..., None], pose.t, 0.0), pose.ok)
+    R, t, ok = pose_in_front(E, a, b, used & determined[..., None])
+    return RelativePoseEstimate(R, t, ok), determined
 
 
 class PairBaseline(ABC):
@@ -86,8 +55,7 @@ class EightPoint(PairBaseline):
 
     @torch.no_grad()
     def __call__(self, batch: PairBatch) -> RelativePoseEstimate:
-        a, b, used, _ = correspondences(batch)
-        return _estimate(_linear(a, b, used)[0])
+        return linear_pose(*batch.correspondences())[0]
 
 
 class Robust(PairBaseline):
@@ -96,21 +64,19 @@ class Robust(PairBaseline):
     @abstractmethod
     def pose(
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> PairPose | None:
+    ) -> RelativePoseEstimate | None:
         """The pose of one pair from N >= 8 correspondences (normalised image coordinates) of a person of that
         ``size``; None where there is none."""
 
     @torch.no_grad()
     def __call__(self, batch: PairBatch) -> RelativePoseEstimate:
-        points = correspondences(batch)
-        linear, determined = _linear(points.a, points.b, points.used)
-        result = _estimate(linear)
-        # clone: the loop writes
-        R, t, ok = result.R.clone(), result.t.clone(), result.estimated.clone()
-        for i in torch.nonzero(determined & (points.size > 0)).flatten().tolist():
-            used = points.used[i]
-            found = self.pose(points.a[i, used], points.b[i, used], points.size[i].item(), batch.sample[i])
-            if found is not None and found.ok:
+        a, b, used = batch.correspondences()
+        size = size_in_image(batch)
+        linear, determined = linear_pose(a, b, used)
+        R, t, ok = linear.R.clone(), linear.t.clone(), linear.estimated.clone()
+        for i in torch.nonzero(determined & (size > 0)).flatten().tolist():
+            found = self.pose(a[i, used[i]], b[i, used[i]], size[i].item(), batch.sample[i])
+            if found is not None and found.estimated:
                 R[i], t[i], ok[i] = found.R.to(R), found.t.to(t), True
         return RelativePoseEstimate(R, t, ok)
 
@@ -133,7 +99,7 @@ class Ransac(Robust):
 
     def pose(
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> PairPose | None:
+    ) -> RelativePoseEstimate | None:
         keys = key(self.seed, "pair ransac", sample, device=a.device)
         chosen = uniform(keys, (self.samples, len(a))).topk(MINIMUM, dim=-1).indices
         E, ok = eight_point(a[chosen], b[chosen], torch.ones(chosen.shape, dtype=a.dtype, device=a.device))
@@ -141,7 +107,7 @@ class Ransac(Robust):
         score = torch.where(ok, (1 - error.square()).clamp_min(0).sum(-1), -1.0)
         best = score.argmax()
         inlier = error[best] <= 1
-        return _linear(a, b, inlier)[0] if ok[best] else None
+        return linear_pose(a, b, inlier)[0] if ok[best] else None
 
 
 @dataclass(frozen=True)
@@ -168,16 +134,18 @@ class Usac(Robust):
 
     def pose(
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> PairPose | None:
+    ) -> RelativePoseEstimate | None:
         focal = self.pixels / size
-        E, mask = cv2.findEssentialMat(
-            (focal * a).cpu().numpy(), (focal * b).cpu().numpy(), np.diag([focal, focal, 1.0]),
-            getattr(cv2, self.method), self.confidence, self.threshold * self.pixels, self.iterations,
-        )  # fmt: skip
+        x, y = ((focal * points).cpu().numpy() for points in (a, b))
+        settings = (getattr(cv2, self.method), self.confidence, self.threshold * self.pixels, self.iterations)
+        try:
+            E, mask = cv2.findEssentialMat(x, y, np.diag([focal, focal, 1.0]), *settings)
+        except cv2.error:
+            return None
         if E is None or E.shape != (3, 3) or not np.isfinite(E).all():
             return None
         inlier = torch.from_numpy(mask[:, 0] > 0).to(a.device)
-        pose = PairPose(*pose_in_front(torch.from_numpy(E).to(a), a, b, inlier))
+        pose = RelativePoseEstimate(*pose_in_front(torch.from_numpy(E).to(a), a, b, inlier))
         return pose if inlier.sum() >= MINIMUM else None
 
 
@@ -200,17 +168,17 @@ class PoseLib(Robust):
 
     def pose(
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> PairPose | None:
+    ) -> RelativePoseEstimate | None:
         # pixels in units of the person's size
         camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": [1 / size, 1 / size, 0.0, 0.0]}
         ransac = {"max_epipolar_error": self.threshold, "max_iterations": self.iterations, "seed": self.seed}
         bundle = {"loss_type": self.loss, "loss_scale": self.scale}
         x, y = ((points / size).cpu().numpy() for points in (a, b))
         found, info = poselib.estimate_relative_pose(x, y, camera, camera, ransac, bundle)
-        t = torch.tensor(np.array(found.t))
+        t = torch.tensor(found.t)
         if info["num_inliers"] < MINIMUM or not torch.isfinite(t).all() or not t.any():
             return None
-        return PairPose(torch.tensor(np.array(found.R)), t / t.norm(), torch.tensor(True))
+        return RelativePoseEstimate(torch.tensor(found.R), t / t.norm(), torch.tensor(True))
 
 
 _LOSSES = ("TRIVIAL", "TRUNCATED", "HUBER", "CAUCHY", "TRUNCATED_LE_ZACH")
