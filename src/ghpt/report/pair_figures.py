@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-import torch
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -26,6 +25,8 @@ _STYLES = {
     "rig": ("#000000", (0, (6, 2)), "X"),
 }  # fmt: skip
 _OTHER = ("#F0E442", ":", "*")
+_BANDS = ("weight", "eight_point")
+"""The two of the paper's figure; the bands of others are fainter, so that many can be told apart."""
 CLIP = 80.0
 """mm at which fig:comparison-to-8-point is cut."""
 _MANY_CAMERAS = 8
@@ -51,25 +52,34 @@ def rig_figure(
         estimates = {k: RelativePoseEstimate(e.R[first], e.t[first], e.estimated[first]) for k, e in estimates.items()}
     right, forward, up = _axes_of(cameras)
     centre = cameras.centre.numpy()
-    size = 0.09 * float(np.linalg.norm(np.ptp(centre, axis=0)))
-    figure = Figure(figsize=(10, 5.4), layout="constrained")
+    extent = float(np.linalg.norm(np.ptp(centre, axis=0)))
+    size = 0.09 * extent
+    off = {name: _off(cameras, pair, estimate) for name, estimate in estimates.items()}
+    times = _enlargement(np.concatenate([d for _, d in off.values()]), extent)
+    figure = Figure(figsize=(10, 5.6), layout="constrained")
     panels = figure.subplots(1, 2)
     views = (np.stack((right, forward)), np.stack((right, up)))
     for axes, view, caption in zip(panels, views, ("from above", "from the side"), strict=True):
         axes.plot(*(points.numpy() @ view.T / 1000).T, ".", color="#DDDDDD", markersize=2, zorder=0)
         _draw(axes, cameras, size, view, TRUTH, "-", 4.5, 1)
         for name, estimate in estimates.items():
-            colour, style, _ = _STYLES.get(name, _OTHER)
-            _draw(axes, _targets(cameras, pair, estimate), size, view, colour, style, 1.3, 2)
+            colour, style, marker = _STYLES.get(name, _OTHER)
+            _draw(axes, _targets(cameras, pair, estimate), size, view, colour, style, 0.9, 2)
+            start, difference = (x @ view.T / 1000 for x in off[name])
+            stalks = np.stack((start, start + times * difference), axis=1)
+            axes.add_collection(LineCollection(stalks, colors=colour, linewidths=1.6, zorder=3))
+            axes.plot(*stalks[:, 1].T, marker, color=colour, markersize=5, zorder=4)
         _limits(axes, (cameras.centre.numpy() @ view.T) / 1000, points.numpy() @ view.T / 1000, size / 1000)
         axes.set_title(caption, fontsize=10)
     if len(names) <= _MANY_CAMERAS:
         _name(panels[0], names, centre @ views[0].T / 1000, centre.mean(0) @ views[0].T / 1000, size / 1000)
     handles = [Line2D([], [], color=TRUTH, linewidth=4.5, label="true cameras")]
     for name, estimate in estimates.items():
-        colour, style, _ = _STYLES.get(name, _OTHER)
-        label = f"{NAMES.get(name, name)}: {_said(cameras, pair, estimate)}"
-        handles.append(Line2D([], [], color=colour, linestyle=style, linewidth=1.3, label=label))
+        colour, style, marker = _STYLES.get(name, _OTHER)
+        label = f"{NAMES.get(name, name)}: {_said(estimate, off[name][1])}; stalks: {times} times that"
+        handles.append(
+            Line2D([], [], color=colour, linestyle=style, linewidth=1.2, marker=marker, markersize=5, label=label)
+        )
     figure.legend(handles=handles, loc="outside lower center", ncols=1, frameon=False, fontsize=9)
     figure.suptitle(wrapped(heading, 110), fontsize=10)
     return figure
@@ -85,7 +95,7 @@ def frames_sweep(results: Sweep, heading: str) -> Figure:
         frames = sorted(by_frames)
         mean, deviation, _ = np.array([_statistics(by_frames[m]) for m in frames]).T
         low, high = (np.clip(np.nan_to_num(mean + s * deviation, nan=np.inf, posinf=np.inf), 0, CLIP) for s in (-1, 1))
-        axes.fill_between(frames, low, high, color=colour, alpha=0.16, linewidth=0)
+        axes.fill_between(frames, low, high, color=colour, alpha=0.2 if name in _BANDS else 0.08, linewidth=0)
         axes.plot(
             frames, np.minimum(mean, CLIP), color=colour, linestyle=style, marker=marker, markersize=5,
             markeredgecolor="white", markeredgewidth=0.6, linewidth=1.8, label=NAMES.get(name, name),
@@ -180,13 +190,23 @@ def _name(axes: Axes, names: Sequence[str], places: np.ndarray, middle: np.ndarr
         axes.text(*(place + 0.8 * size * away), f"{number}: {name}", ha="center", va="center", fontsize=8)
 
 
-def _said(cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseEstimate) -> str:
+def _off(cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseEstimate) -> tuple[np.ndarray, np.ndarray]:
+    """True centres of the target cameras that were estimated, and what the estimated ones differ by; world, mm."""
+    true = cameras.centre[pair[estimate.estimated][:, 1]]
+    return true.numpy(), (_targets(cameras, pair, estimate).centre - true).numpy()
+
+
+def _enlargement(differences: Float[np.ndarray, "N 3"], extent: float) -> int:
+    """A round number of times by which the differences are seen in a figure of the rig."""
+    largest = float(np.linalg.norm(differences, axis=-1).max(initial=0))
+    return max((times for times in (1, 2, 5, 10, 20, 50, 100) if times * largest <= 0.15 * extent), default=1)
+
+
+def _said(estimate: RelativePoseEstimate, differences: Float[np.ndarray, "N 3"]) -> str:
     """How far the estimated centres are from the true ones, in words."""
-    missing = int((~estimate.estimated).sum())
-    without = f"; {missing} of {len(pair)} pairs have none" if missing else ""
-    if missing == len(pair):
+    total, missing = len(estimate.estimated), int((~estimate.estimated).sum())
+    if missing == total:
         return "no pair was estimated"
-    target = pair[estimate.estimated][:, 1]
-    distance = (_targets(cameras, pair, estimate).centre - cameras.centre[target]).norm(dim=-1)
-    low, high = (torch.round(x).int() for x in (distance.min(), distance.max()))
-    return f"targets' centres {low} to {high} mm from the true ones{without}"
+    distance = np.linalg.norm(differences, axis=-1)
+    without = f" ({missing} of {total} pairs have none)" if missing else ""
+    return f"targets' centres {distance.min():.0f} to {distance.max():.0f} mm off{without}"

@@ -13,7 +13,7 @@ from rich.table import Table
 from ghpt.files import atomic_write
 from ghpt.models.selection import SELECTIONS
 from ghpt.report.pair_evaluate import ALONE, ERRORS
-from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_DISSECTION
+from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_CAMERAS, FUNDAMENTAL_DISSECTION, fundamental_pair
 from ghpt.report.tables import NONE, Rows, markdown, title, trained_on
 
 NAMES = {
@@ -25,8 +25,10 @@ NAMES = {
 UNITS = {
     "E_R": "10⁻³", "E_t": "mm", "E_2D": "px", "E_3D": "mm", "rotation_deg": "degrees", "translation_deg": "degrees"
 }  # fmt: skip
+COLUMNS = 6
+"""The most pairs that have a column each in the terminal."""
 MANY = 10
-"""With more pairs than these there are no columns of pairs, and the terminal shows the worst."""
+"""The most that have one in report.md, and a row in the terminal: of more it shows the worst."""
 _WORDS = {
     "E_R": "rotation, as quaternions", "E_t": "translation", "E_2D": "points in the target's image",
     "E_3D": "points in space", "rotation_deg": "angle between the rotations",
@@ -35,24 +37,31 @@ _WORDS = {
 _CAPTION = """medians over draws; E_R in 1e-3, E_t and E_3D in mm, E_2D in pixels
 rot, dir: degrees between the rotations, the directions of t"""
 _PAPER = "; in brackets: the paper, real data"
+_ABOUT_THE_PAPER = (
+    "In brackets: the paper, tab:fundamental-evaluation, on the real data set. Its cameras are counted around the "
+    "room, so that its (1, 3) and (2, 4) face each other; in the data set's order these are 1-4 and 2-3, and each "
+    "number of the paper stands at the pair of the same place. Which way around it counts is not said: exchanging 1-2 "
+    "with 1-3 and 3-4 with 2-4 would fit its words as well."
+)
 
 
 def pair_order(metrics: Mapping[str, Any]) -> list[str]:
-    """The pairs' names in the order of tab:fundamental-evaluation if they are those, else as they are."""
+    """The pairs' names, on Human3.6M in the order of tab:fundamental-evaluation: those that face each other first."""
     pairs = list(next(iter(metrics["selections"].values()))["pairs"])
-    paper = [f"{a}-{b}" for a, b in FUNDAMENTAL]
-    return paper if set(pairs) == set(paper) else pairs
+    paper = [fundamental_pair(pair) for pair in FUNDAMENTAL]
+    return paper if metrics["data"] == "h36m" and set(pairs) == set(paper) else pairs
 
 
-def paper_errors(metrics: Mapping[str, Any]) -> dict[str, dict[str, float]]:
-    """tab:fundamental-evaluation by pair name; empty unless the run is one on Human3.6M's test split, trained there."""
+def of_paper(metrics: Mapping[str, Any], table: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
+    """A table of the paper by pair name; empty unless the run is one on Human3.6M's test split, trained there."""
     here = (trained_on(metrics)[0], metrics["data"], metrics["split"]) == ("h36m", "h36m", "test")
-    return {f"{a}-{b}": errors for (a, b), errors in FUNDAMENTAL.items()} if here else {}
+    whole = len(metrics["cameras"]) == len(FUNDAMENTAL_CAMERAS)
+    return {fundamental_pair(pair): errors for pair, errors in table.items()} if here and whole else {}
 
 
 def pair_rows(metrics: Mapping[str, Any], name: str) -> Rows:
     """A row for each pair: its name and the six errors of a selection, for ``weight`` with the paper's in brackets."""
-    paper = paper_errors(metrics) if name == "weight" else {}
+    paper = of_paper(metrics, FUNDAMENTAL) if name == "weight" else {}
     rows = []
     for pair in _worst_first(metrics, name):
         numbers, printed = metrics["selections"][name]["pairs"][pair], paper.get(pair, {})
@@ -67,7 +76,7 @@ def print_pair_tables(metrics: Mapping[str, Any], console: Console | None = None
     worst = f", the {MANY} worst of {len(rows)} pairs" if len(rows) > MANY else ""
     table = Table(
         title=f"weight{worst} on {title(metrics)}",
-        caption=_CAPTION + (_PAPER if paper_errors(metrics) else ""),
+        caption=_CAPTION + (_PAPER if of_paper(metrics, FUNDAMENTAL) else ""),
         title_justify="left",
         caption_justify="left",
     )
@@ -88,7 +97,7 @@ def print_pair_tables(metrics: Mapping[str, Any], console: Console | None = None
 def comparison(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
     """Header and rows: E_3D of every name on each pair, or, where there are many, the median pair and the worst."""
     order = pair_order(metrics)
-    many, rows = len(order) > MANY, []
+    many, rows = len(order) > COLUMNS, []
     for name, numbers in metrics["selections"].items():
         by_pair = {pair: numbers["pairs"][pair]["E_3D"] for pair in order}
         cells = [_short(by_pair[pair]) for pair in order]
@@ -105,7 +114,7 @@ def comparison(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
 def pair_report(metrics: Mapping[str, Any]) -> str:
     """The Markdown report of a test run of the camera problem."""
     provenance = metrics.get("provenance") or {}
-    paper = paper_errors(metrics)
+    paper = of_paper(metrics, FUNDAMENTAL)
     parts = [
         f"# Relative camera poses on {title(metrics)}",
         f"{metrics['draws']} draws of {metrics['frames']} frames, cameras {', '.join(metrics['cameras'])}, "
@@ -117,7 +126,7 @@ def pair_report(metrics: Mapping[str, Any]) -> str:
         "without an estimate counts as infinitely bad. Best and worst look at the truth.",
         "## Selection `weight`",
         markdown(["pair", *(f"{error}, {UNITS[error]}" for error in ERRORS)], pair_rows(metrics, "weight")),
-        "In brackets: the paper, tab:fundamental-evaluation, on the real data set." if paper else "",
+        _ABOUT_THE_PAPER if paper else "",
         "## E_3D of all",
         markdown(*comparison(metrics)),
         "## One part estimated, the other true",
@@ -139,8 +148,7 @@ def write_pair_report(path: str | Path, metrics: Mapping[str, Any]) -> None:
 
 def dissection(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
     """Header and rows of tab:fundamental-dissection for ``weight``."""
-    paper, rows = paper_errors(metrics), []
-    printed = {f"{a}-{b}": parts for (a, b), parts in FUNDAMENTAL_DISSECTION.items()} if paper else {}
+    printed, rows = of_paper(metrics, FUNDAMENTAL_DISSECTION), []
     for pair in pair_order(metrics):
         numbers = metrics["selections"]["weight"]["pairs"][pair]
         cells = [
@@ -181,11 +189,16 @@ def _worst_first(metrics: Mapping[str, Any], name: str) -> list[str]:
 
 def _with_paper(error: str, value: float | None, paper: float | None) -> str:
     ours = _short(_scaled(error, value))
-    return ours if paper is None else f"{ours} ({_scaled(error, paper):.3g})"
+    return ours if paper is None else f"{ours} ({_printed(1000 * paper if error == 'E_R' else paper)})"
 
 
 def _scaled(error: str, value: float | None) -> float | None:
     return None if value is None else 1000 * value if error == "E_R" else value
+
+
+def _printed(value: float) -> str:
+    """As the paper prints it: 0.72, 4.9, 10.8, 23."""
+    return f"{value:.2g}" if value < 1 else f"{value:.1f}" if value % 1 or value < 10 else f"{value:.0f}"
 
 
 def _or_infinite(value: float | None) -> float:

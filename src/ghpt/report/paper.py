@@ -64,6 +64,17 @@ FUNDAMENTAL_DISSECTION = {
 }
 """Appendix A, tab:fundamental-dissection: the errors when one part of the pose is estimated and the other is true."""
 
+FUNDAMENTAL_CAMERAS = (1, 2, 4, 3)
+"""The place in Human3.6M's own order of cameras of what these two tables call 1, 2, 3, 4. The paper says that its
+pairs (1, 3) and (2, 4) are diagonal. In the data set's order 54138969, 55011271, 58860488, 60457274 the cameras that
+face each other (178 degrees apart about the middle) are 1-4 and 2-3, so the paper counts around the room. Its words
+leave open which way around: the other one exchanges (1, 2) with (1, 4) and (3, 4) with (2, 3)."""
+
+
+def fundamental_pair(pair: tuple[int, int]) -> str:
+    """The name, in the data set's order of cameras, of a pair of those tables."""
+    return "{}-{}".format(*sorted(FUNDAMENTAL_CAMERAS[camera - 1] for camera in pair))
+
 
 def paper_value(data: str, selection: str, trained_on: str | None) -> float | None:
     """The paper's pelvis-relative MPJPE of a selection on the test split of ``data``; None where it prints none.

@@ -1,0 +1,145 @@
+import logging
+import sys
+
+import numpy as np
+import pytest
+import torch
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from ghpt.recording import RelativePoseEstimate
+from ghpt.report import pair_figures
+from ghpt.report.figures import image
+from ghpt.report.pair_evaluate import ERRORS, evaluate_pairs
+from ghpt.report.pair_figures import CLIP, frames_sweep, rig_figure, sweep_table
+from ghpt.report.pair_tensorboard import _typical_draw, write_pair_events
+from ghpt.report.rows import WEIGHTS
+from pair_report import content, moved, rig, true_poses, written
+
+RIGS = [rig(9), rig(11)]
+ALL = torch.tensor([(a, b) for a in range(4) for b in range(a + 1, 4)])
+
+
+def run(tmp_path, views: int = 4, draws: int = 3):
+    rigs = [rig(9, views), rig(11, views)]
+    predictions = written(tmp_path, rigs, content(rigs, draws))
+    return predictions, evaluate_pairs(predictions)
+
+
+def test_up_is_up_and_right_is_the_first_cameras():
+    right, forward, up = pair_figures._axes_of(RIGS[0].cameras)
+    np.testing.assert_allclose(np.stack((right, forward, up)) @ np.stack((right, forward, up)).T, np.eye(3), atol=1e-12)
+    assert up[2] > 0.98  # the rig's z is up
+    towards = RIGS[0].cameras.R[0, 2].numpy()
+    assert forward @ towards > 0.95  # the first camera looks up the page
+    assert np.linalg.det(np.stack((right, forward, up))) == pytest.approx(1)  # seen from above, not mirrored
+
+
+def test_rig_figure_draws_each_target_where_the_estimate_has_it():
+    own = RIGS[0]
+    truth = true_poses([own], torch.zeros(6, dtype=torch.int64), ALL)
+    exact = pair_figures._targets(own.cameras, ALL, moved(truth, 0.0, 0.0, seed=0))
+    torch.testing.assert_close(exact.centre, own.cameras.centre[ALL[:, 1]])
+    estimate = moved(truth, 0.2, 0.0, seed=0)
+    figure = rig_figure(own.cameras, own.names, own.points, ALL, {"weight": estimate}, "heading")
+    above, side = figure.axes
+    lines = [len(c.get_segments()) for c in above.collections]
+    assert lines == [4 * 8, 6 * 8, 6]  # true pyramids, estimated pyramids, stalks
+    assert [text.get_text() for text in above.texts] == ["1: c0", "2: c1", "3: c2", "4: c3"]
+    distance = (pair_figures._targets(own.cameras, ALL, estimate).centre - own.cameras.centre[ALL[:, 1]]).norm(dim=-1)
+    (legend,) = figure.legends
+    said = [text.get_text() for text in legend.get_texts()]
+    assert said[1].startswith(f"weight: targets' centres {distance.min():.0f} to {distance.max():.0f} mm off")
+    assert above.get_aspect() == side.get_aspect() == 1
+    assert image(figure).std() > 10
+
+
+def test_rig_figure_without_estimates_or_with_wild_ones_is_drawn():
+    own = RIGS[0]
+    truth = true_poses([own], torch.zeros(6, dtype=torch.int64), ALL)
+    none = RelativePoseEstimate(torch.eye(3).double().expand(6, 3, 3), torch.zeros(6, 3).double(), torch.zeros(6) > 0)
+    wild = RelativePoseEstimate(truth[0], truth[1] * 1e6, torch.arange(6) > 0)
+    figure = rig_figure(own.cameras, own.names, own.points, ALL, {"weight": none, "rig": wild}, "heading")
+    said = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert "no pair was estimated" in said[1]
+    assert "1 of 6 pairs have none" in said[2]
+    assert np.ptp(figure.axes[0].get_xlim()) < 20  # metres: the true rig, not the wild camera
+    assert image(figure).std() > 10
+
+
+def test_sweep_shows_means_bands_and_the_cut():
+    results = {
+        "weight": {m: [10.0, 12.0, 14.0] for m in (10, 20, 40)},
+        "eight_point": {10: [70.0, 90.0, 200.0], 20: [20.0, 30.0, 40.0], 40: [np.inf, 1.0, 1.0]},
+    }
+    figure = frames_sweep(results, "pair (2, 3) on embedded (synthetic) Human3.6M")
+    (axes,) = figure.axes
+    weight, eight = axes.lines
+    np.testing.assert_allclose(weight.get_ydata(), 12)
+    np.testing.assert_allclose(eight.get_ydata(), [CLIP, 30, CLIP])
+    band = axes.collections[0].get_paths()[0].vertices
+    assert (band[:, 1].min(), band[:, 1].max()) == pytest.approx((10, 14))
+    assert axes.collections[1].get_paths()[0].vertices[:, 1].max() <= CLIP
+    assert "synthetic" in axes.get_title()
+    assert len({(line.get_linestyle(), line.get_marker()) for line in axes.lines}) == 2  # told apart without colour
+    assert image(figure).std() > 10
+
+
+def test_sweep_table_has_mean_deviation_and_median():
+    lines = sweep_table({"weight": {10: [10.0, 12.0, 17.0]}, "eight_point": {10: [np.inf, 1.0, 3.0], 20: [2.0]}})
+    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines.splitlines()]
+    assert cells[0] == ["M", "weight", "8-point"]
+    assert cells[2] == ["10", "13.0 ± 3.6 (12.0)", "– ± – (3.0)"]
+    assert cells[3] == ["20", "–", "2.0 ± 0.0 (2.0)"]
+
+
+def test_the_figure_is_of_a_draw_that_is_median(tmp_path):
+    values = content(RIGS, draws=3)
+    truth = values["truth"]
+    factor = 1 + 0.01 * (values["draw"].double()[:, None] * 7 % 6)  # draws 0 to 5: 0 1 2 3 4 5 in another order
+    values["estimates"]["weight"] = RelativePoseEstimate(truth[0], truth[1] * factor, torch.ones(36) > 0)
+    rows = _typical_draw(written(tmp_path, RIGS, values))
+    assert len(rows) == 6
+    assert factor[rows].unique().item() == pytest.approx(1.02)
+
+
+def test_events_hold_the_numbers_of_metrics_json(tmp_path):
+    predictions, metrics = run(tmp_path)
+    before = "matplotlib.pyplot" in sys.modules
+    assert write_pair_events(tmp_path / "events", predictions, metrics) == 0
+    assert ("matplotlib.pyplot" in sys.modules) == before
+    events = EventAccumulator(str(tmp_path / "events"), size_guidance={"images": 0}).Reload()
+    tags = events.Tags()
+    for name, numbers in metrics["selections"].items():
+        for error in ERRORS:
+            assert events.Scalars(f"{error}/{name}")[0].value == pytest.approx(numbers[error], rel=1e-6)
+            pair = events.Scalars(f"{error} 2-4/{name}")[0].value
+            assert pair == pytest.approx(numbers["pairs"]["2-4"][error], rel=1e-6)
+    assert set(tags["images"]) == {"rig"}
+    assert set(tags["histograms"]) == {f"weights/{summary}" for summary in WEIGHTS}
+    assert "final/weight" in tags["scalars"]
+    assert any(tag.startswith("_hparams_") for tag in events.summary_metadata)
+
+
+def test_many_cameras_make_few_scalars(tmp_path):
+    predictions, metrics = run(tmp_path, views=9, draws=1)
+    assert write_pair_events(tmp_path / "events", predictions, metrics) == 0
+    tags = EventAccumulator(str(tmp_path / "events")).Reload().Tags()["scalars"]
+    assert "E_3D/weight" in tags
+    assert not any("1-2" in tag for tag in tags)
+
+
+def test_failures_are_counted_said_once_and_stop_nothing(tmp_path, monkeypatch, caplog):
+    predictions, metrics = run(tmp_path)
+
+    def broken(*_):
+        raise OSError("no space left")
+
+    monkeypatch.setattr("ghpt.report.pair_tensorboard.rig_figure", broken)
+    with caplog.at_level(logging.WARNING, "ghpt"):
+        assert write_pair_events(tmp_path / "events", predictions, metrics) == 1
+    (record,) = caplog.records
+    assert "no space left" in record.getMessage()
+    events = EventAccumulator(str(tmp_path / "events")).Reload()
+    assert "final/weight" in events.Tags()["scalars"]  # what comes after the failing part is there
+    (tmp_path / "file").write_text("")
+    assert write_pair_events(tmp_path / "file" / "events", predictions, metrics) > 0

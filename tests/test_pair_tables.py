@@ -1,0 +1,102 @@
+import io
+from itertools import combinations
+
+import pytest
+import torch
+from rich.console import Console
+
+from ghpt.data.rigs import human36m_rig
+from ghpt.report import paper
+from ghpt.report.pair_evaluate import ALONE, ERRORS, NAMES
+from ghpt.report.pair_tables import comparison, dissection, of_paper, pair_report, print_pair_tables
+
+
+def metrics(data="h36m", source="embedded", split="test", trained="h36m", views=4, names=NAMES) -> dict:
+    """A run whose errors are 1000 times the place of the pair; one pair has no median."""
+    pairs = {}
+    for place, (a, b) in enumerate(combinations(range(views), 2)):
+        errors = dict.fromkeys(ERRORS, 1000.0 * place + 0.5) | {"E_R": 0.0123}
+        pairs[f"{a + 1}-{b + 1}"] = {
+            **errors, "coverage": 0.987, "mean": errors, "deviation": dict.fromkeys(ERRORS),
+            **{part: {"E_2D": 0.4, "E_3D": None} for part in ALONE},
+        }  # fmt: skip
+    pairs["1-2"] = {**pairs["1-2"], "E_3D": None}
+    numbers = {**dict.fromkeys(ERRORS, 12.3), "E_3D": None, "coverage": 0.987, "pairs": pairs}
+    provenance = {"ghpt": "0.1.0", "commit": "abc", "checkpoint": "last.ckpt",
+                  "training": {"data": trained, "source": source}}  # fmt: skip
+    return {
+        "data": data, "source": source, "split": split, "problem": "camera", "frames": 80, "draws": 40, "seed": 0,
+        "cameras": [f"c{i}" for i in range(views)], "provenance": provenance,
+        "selections": dict.fromkeys(names, numbers),
+    }  # fmt: skip
+
+
+def printed(values: dict) -> list[str]:
+    buffer = io.StringIO()
+    print_pair_tables(values, Console(file=buffer, width=80, color_system=None))
+    return buffer.getvalue().splitlines()
+
+
+def test_the_papers_diagonal_pairs_are_the_cameras_that_face_each_other():
+    centre = human36m_rig("S9").cameras.centre[:, :2]
+    direction = centre - centre.mean(dim=0)
+    direction = direction / direction.norm(dim=-1, keepdim=True)
+    for pair in paper.FUNDAMENTAL:
+        a, b = (int(camera) - 1 for camera in paper.fundamental_pair(pair).split("-"))
+        degrees = torch.rad2deg(torch.acos(direction[a] @ direction[b]))
+        assert (degrees > 170) == (pair in ((1, 3), (2, 4))), pair
+    assert len({paper.fundamental_pair(pair) for pair in paper.FUNDAMENTAL}) == 6
+    assert list(paper.FUNDAMENTAL) == list(paper.FUNDAMENTAL_DISSECTION)
+
+
+def test_paper_values_only_where_the_paper_has_them():
+    assert of_paper(metrics(), paper.FUNDAMENTAL)["1-4"]["E_2D"] == 3.7
+    for other in ({"data": "cmu3"}, {"split": "validation"}, {"trained": "cmu3"}, {"views": 3}, {"views": 5}):
+        assert of_paper(metrics(**other), paper.FUNDAMENTAL) == {}, other
+        assert "brackets" not in pair_report(metrics(**other))
+
+
+@pytest.mark.parametrize("views", [2, 4, 5, 7])
+def test_terminal_tables_fit_80_columns(views):
+    lines = printed(metrics(views=views))
+    assert max(map(len, lines)) <= 80
+    assert not any("…" in line for line in lines)
+    text = " ".join(" ".join(lines).split())
+    assert "embedded (synthetic) Human3.6M" in text
+    for name in ("weight", "8-point", "USAC_ACCURATE", "PoseLib", "rig (all views)"):
+        assert any(name in line for line in lines)
+
+
+def test_the_first_table_has_every_pair_with_the_papers_numbers_beside():
+    lines = [line.replace("│", " ").split() for line in printed(metrics()) if line.startswith("│")][:6]
+    assert [line[0] for line in lines] == ["1-4", "2-3", "1-3", "2-4", "3-4", "1-2"]
+    assert lines[0][1:7] == ["12.3", "(17)", "2000", "(23)", "2000", "(3.7)"]
+    assert lines[5][7:9] == ["–", "(4.9)"]  # no median
+
+
+def test_many_pairs_are_summed_up():
+    header, rows = comparison(metrics(views=7))
+    assert header == ["selection", "median", "worst", "its pair", "mean", "cov"]
+    assert rows[0] == ["weight", "11000", "–", "1-2", "–", "98.7"]
+    assert "the 10 worst of 21 pairs" in " ".join(printed(metrics(views=7)))
+    assert "| 6-7 " in pair_report(metrics(views=7))  # the report has all
+
+
+def test_report_has_every_number_of_every_name():
+    text = pair_report(metrics())
+    assert text.startswith("# Relative camera poses on embedded (synthetic) Human3.6M, test split, trained on embedded")
+    blocks = [block for block in text.split("\n\n") if block.startswith("|")]
+    for block in blocks:
+        assert len({line.count("|") for line in block.splitlines()}) == 1
+    assert sum(line.startswith("| usac_magsac".upper()[:13]) for line in text.splitlines()) == 1 + 2 * len(ERRORS)
+    assert "nan" not in text.lower().replace("finan", "")
+    assert "None" not in text
+    real = pair_report(metrics(source="/data/h36m"))
+    assert "synthetic" not in real
+    assert "/data/h36m" in real.splitlines()[0]
+
+
+def test_dissection_is_beside_the_papers():
+    header, rows = dissection(metrics())
+    assert len(header) == 5
+    assert rows[0] == ["1-4", "0.40 (1.2)", "– (10.8)", "0.40 (1.8)", "– (18.2)"]
