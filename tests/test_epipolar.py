@@ -124,7 +124,7 @@ def test_an_exact_scene_gives_the_true_pose_and_depths(seed):
     for found, true in zip(depths(R, t / length, a, b), true_depths, strict=True):
         torch.testing.assert_close(found * length, true, rtol=1e-9, atol=0)
     assert ray_distances(R[None], t[None] / length, a, b).max() < 1e-9
-    assert sampson_error(E, a, b).max() < 1e-10
+    assert sampson_error(E[None], a, b).max() < 1e-10
 
 
 def test_only_the_true_one_of_the_four_has_all_points_in_front():
@@ -148,7 +148,7 @@ def test_noisy_points_give_what_numpy_and_opencv_give(seed):
     squared = [
         cv2.sampsonDistance(x, y, E.numpy()) for x, y in zip(*(homogeneous(p).numpy() for p in (a, b)), strict=True)
     ]
-    np.testing.assert_allclose(sampson_error(E, a, b) ** 2, squared, rtol=1e-8)
+    np.testing.assert_allclose(sampson_error(E[None], a, b)[0] ** 2, squared, rtol=1e-8)
     R, t, ok = pose_in_front(E, a, b, ones(a) > 0)
     assert ok
     _, R_cv, t_cv, _ = cv2.recoverPose(E.numpy(), a.numpy(), b.numpy(), np.eye(3))
@@ -229,9 +229,9 @@ def test_hypotheses_are_a_batch():
     subsets[:, :10] = False
     subsets[:, :10, 5:13] = True  # minimal
     subsets[:, 20, 7:] = False  # too few
-    E, ok = eight_point_subsets(a, b, subsets)
+    E, ok = eight_point_subsets(a, b, subsets.double())
     R, t, front = poses_in_front(E, a, b, subsets & ok[..., None])
-    distances = ray_distances(R, t, a, b)
+    distances, sampson = ray_distances(R, t, a, b), sampson_error(E, a, b)
     for i in range(2):
         for h in range(30):
             E1, ok1 = eight_point(a[i], b[i], subsets[i, h].double())
@@ -244,6 +244,8 @@ def test_hypotheses_are_a_batch():
                 torch.testing.assert_close(x, y, rtol=0, atol=1e-12)
             one = ray_distances(R[i, h][None], t[i, h][None], a[i], b[i])[0]
             torch.testing.assert_close(distances[i, h], one, rtol=1e-9, atol=1e-12)
+            one = sampson_error(E[i, h][None], a[i], b[i])[0]
+            torch.testing.assert_close(sampson[i, h], one, rtol=1e-9, atol=1e-12)
 
 
 def slow_pose(E, a, b, used):
@@ -363,7 +365,7 @@ def test_geometry_never_raises_on_values():
         Rs, ts = decompose(E)
         assert torch.isfinite(Rs).all()
         assert torch.isfinite(ts).all()
-    assert torch.isfinite(sampson_error(torch.zeros_like(nan), a[0], b[0])).all()
+    assert torch.isfinite(sampson_error(torch.zeros_like(nan)[None], a[0], b[0])).all()
     for measure in (partial(ray_distances, EYE[None], ZERO[None]), partial(depths, EYE, ZERO)):
         assert all(torch.isfinite(x).all() for x in measure(a[0], a[0]))
 

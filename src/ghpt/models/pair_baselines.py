@@ -30,7 +30,9 @@ def size_in_image(batch: PairBatch) -> Float[Tensor, " B"]:
     K, pixels, seen = (batch.of_pair(x) for x in (batch.cameras.K, batch.key_points, batch.seen))
     focal = (K[..., 0, 0] + K[..., 1, 1]).double() / 2
     size = person_size(pixels.double(), seen) / focal[..., None]
-    return torch.where(size > 0, size, torch.nan).flatten(1).nanmedian(-1).values.nan_to_num(0.0)
+    size = torch.where(size > 0, size, torch.nan).flatten(1)
+    none = torch.full((len(size), 1), torch.nan, dtype=size.dtype, device=size.device)
+    return torch.cat((size, none), dim=1).nanmedian(-1).values.nan_to_num(0.0)
 
 
 def linear_pose(
@@ -101,7 +103,7 @@ class Ransac(Robust):
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
     ) -> RelativePoseEstimate | None:
         keys = key(self.seed, "pair ransac", sample, device=a.device)
-        chosen = uniform(keys, (self.samples, len(a))).topk(MINIMUM, dim=-1).indices
+        chosen = _distinct(uniform(keys, (self.samples, MINIMUM)), len(a))
         E, ok = eight_point(a[chosen], b[chosen], torch.ones(chosen.shape, dtype=a.dtype, device=a.device))
         error = sampson_error(E, a, b) / (self.threshold * size)
         score = torch.where(ok, (1 - error.square()).clamp_min(0).sum(-1), -1.0)
@@ -179,6 +181,16 @@ class PoseLib(Robust):
         if info["num_inliers"] < MINIMUM or not torch.isfinite(t).all() or not t.any():
             return None
         return RelativePoseEstimate(torch.tensor(found.R), t / t.norm(), torch.tensor(True))
+
+
+def _distinct(draws: Float[Tensor, "S T"], count: int) -> Int[Tensor, "S T"]:
+    """T distinct numbers below ``count`` from T uniform draws, every subset equally likely (Floyd's algorithm)."""
+    chosen = torch.full(draws.shape, -1, dtype=torch.int64, device=draws.device)
+    for i, last in enumerate(range(count - draws.shape[1], count)):
+        candidate = (draws[:, i] * (last + 1)).long()
+        taken = (chosen == candidate[:, None]).any(-1)
+        chosen[:, i] = torch.where(taken, last, candidate)
+    return chosen
 
 
 _LOSSES = ("TRIVIAL", "TRUNCATED", "HUBER", "CAUCHY", "TRUNCATED_LE_ZACH")
