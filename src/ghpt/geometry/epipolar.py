@@ -187,10 +187,13 @@ def ray_distances(
 
 
 def sampson_error(
-    E: Float[Tensor, "*B 3 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
-) -> Float[Tensor, "*B N"]:
-    """First-order distance of each correspondence from the epipolar geometry (normalised image coordinates, >= 0)."""
+    E: Float[Tensor, "*B H 3 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
+) -> Float[Tensor, "*B H N"]:
+    """First-order distance of each correspondence from each of H epipolar geometries (normalised image coordinates,
+    >= 0)."""
     a, b = homogeneous(a), homogeneous(b)
-    Ea, Eb = a @ E.mT, b @ E
-    square = Ea[..., :2].square().sum(-1) + Eb[..., :2].square().sum(-1)
-    return (b * Ea).sum(-1).abs() / square.clamp_min(torch.finfo(E.dtype).tiny).sqrt()
+    residual = E.flatten(-2) @ (b[..., :, None] * a[..., None, :]).flatten(-2).mT
+    Ea = (E[..., :2, :].flatten(-3, -2) @ a.mT).unflatten(-2, (-1, 2))
+    Eb = (E.mT[..., :2, :].flatten(-3, -2) @ b.mT).unflatten(-2, (-1, 2))
+    square = Ea.square().sum(-2) + Eb.square().sum(-2)
+    return residual.abs() / square.clamp_min(torch.finfo(E.dtype).tiny).sqrt()
