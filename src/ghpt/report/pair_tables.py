@@ -13,7 +13,7 @@ from rich.table import Table
 from ghpt.files import atomic_write
 from ghpt.models.selection import SELECTIONS
 from ghpt.report.pair_evaluate import ALONE, ERRORS
-from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_CAMERAS, FUNDAMENTAL_DISSECTION, fundamental_pair
+from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_DISSECTION
 from ghpt.report.tables import NONE, Rows, markdown, title, trained_on
 
 NAMES = {
@@ -38,25 +38,22 @@ _CAPTION = """medians over draws; E_R in 1e-3, E_t and E_3D in mm, E_2D in pixel
 rot, dir: degrees between the rotations, the directions of t"""
 _PAPER = "; in brackets: the paper, real data"
 _ABOUT_THE_PAPER = (
-    "In brackets: the paper, tab:fundamental-evaluation, on the real data set. Its cameras are counted around the "
-    "room, so that its (1, 3) and (2, 4) face each other; in the data set's order these are 1-4 and 2-3, and each "
-    "number of the paper stands at the pair of the same place. Which way around it counts is not said: exchanging 1-2 "
-    "with 1-3 and 3-4 with 2-4 would fit its words as well."
+    "In brackets: the paper, tab:fundamental-evaluation, on the real data set. It calls (1, 3) and (2, 4) diagonal; in "
+    "the data set's order of cameras, in which we read it, these stand side by side, and 1-4 and 2-3 face each other."
 )
 
 
 def pair_order(metrics: Mapping[str, Any]) -> list[str]:
-    """The pairs' names, on Human3.6M in the order of tab:fundamental-evaluation: those that face each other first."""
+    """The pairs' names, those of four cameras in the order of tab:fundamental-evaluation."""
     pairs = list(next(iter(metrics["selections"].values()))["pairs"])
-    paper = [fundamental_pair(pair) for pair in FUNDAMENTAL]
-    return paper if metrics["data"] == "h36m" and set(pairs) == set(paper) else pairs
+    paper = [f"{a}-{b}" for a, b in FUNDAMENTAL]
+    return paper if set(pairs) == set(paper) else pairs
 
 
 def of_paper(metrics: Mapping[str, Any], table: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
     """A table of the paper by pair name; empty unless the run is one on Human3.6M's test split, trained there."""
     here = (trained_on(metrics)[0], metrics["data"], metrics["split"]) == ("h36m", "h36m", "test")
-    whole = len(metrics["cameras"]) == len(FUNDAMENTAL_CAMERAS)
-    return {fundamental_pair(pair): errors for pair, errors in table.items()} if here and whole else {}
+    return {f"{a}-{b}": errors for (a, b), errors in table.items()} if here and len(metrics["cameras"]) == 4 else {}
 
 
 def pair_rows(metrics: Mapping[str, Any], name: str) -> Rows:
