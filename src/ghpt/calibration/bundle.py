@@ -1,0 +1,150 @@
+"""Bundle adjustment of extrinsics and points with constant intrinsics: pycolmap's (Ceres), checked afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pycolmap
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from ghpt.calibration.normal_matrix import Linearised, linearise
+from ghpt.calibration.observations import Observations, check_positive
+from ghpt.calibration.resection import Rig
+
+
+@dataclass(frozen=True)
+class Adjusted:
+    """A rig after bundle adjustment, and what was verified of it."""
+
+    rig: Rig
+    start_cost: float
+    final: Linearised
+    """At the rig's state, by this project's own derivatives."""
+    iterations: int
+    seconds: float
+    converged: bool
+    """Finite, in front of every camera, cost not above the start's, and what a Newton step could still gain at most
+    ``tolerance`` of the cost."""
+
+
+@dataclass(frozen=True)
+class BundleAdjustment:
+    """Cauchy loss of scale ``loss_scale`` (units of noise); at most ``iterations`` steps and ``seconds``;
+    ``tolerance``: see ``Adjusted.converged``."""
+
+    loss_scale: float
+    iterations: int
+    seconds: float
+    tolerance: float
+
+    def __post_init__(self) -> None:
+        check_positive(loss_scale=self.loss_scale, iterations=self.iterations, seconds=self.seconds)
+        check_positive(tolerance=self.tolerance)
+
+    def __call__(self, seen_by: Observations, rig: Rig) -> Adjusted:
+        """Adjust the rig's placed views and its points to their inliers. Never raises on values; a rig that could not
+        be improved comes back as it was, with ``converged`` False where it is not at a minimum."""
+        used = rig.inlier
+        start = self.state(seen_by, rig)
+        solved, report = self._solve(seen_by, rig, used) if start.finite else (rig, None)
+        final = self.state(seen_by, solved)
+        if not (final.finite and final.cost <= start.cost * (1 + 1e-12)):
+            solved, final = rig, start
+        converged = (
+            final.finite and final.in_front and final.gain <= self.tolerance * max(final.cost, 1e-12 * int(used.sum()))
+        )
+        steps = 0 if report is None else report.num_successful_steps + report.num_unsuccessful_steps
+        seconds = 0.0 if report is None else report.total_time_in_seconds
+        return Adjusted(solved, start.cost, final, steps, seconds, bool(converged))
+
+    def state(self, seen_by: Observations, rig: Rig) -> Linearised:
+        """Cost and derivatives of a rig as it is."""
+        return linearise(seen_by, rig, rig.inlier, self.loss_scale)
+
+    def _solve(self, seen_by: Observations, rig: Rig, used: Bool[Tensor, "V N"]) -> tuple[Rig, object | None]:
+        views = torch.nonzero(rig.placed & used.any(1))[:, 0].tolist()
+        chosen = np.flatnonzero(used.any(0).numpy())
+        if len(views) < 2 or not len(chosen):
+            return rig, None
+        model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
+        mask, slot = used[:, chosen].numpy(), np.zeros(len(chosen), dtype=np.int64)
+        joint = seen_by.joint.numpy()[chosen]
+        for j in np.unique(joint):
+            slot[joint == j] = np.arange((joint == j).sum())
+        for v in views:
+            _add_view(model, config, seen_by, rig, v, chosen, joint)
+        ids = []
+        for n, point in enumerate(rig.points.numpy()[chosen]):
+            image = _image_id(np.flatnonzero(mask[:, n]), joint[n])
+            ids.append(model.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(i, slot[n]) for i in image])))
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        report = pycolmap.create_default_bundle_adjuster(self._options(), config, model).solve()
+        R, t, points = rig.R.clone(), rig.t.clone(), rig.points.clone()
+        for v in views:
+            pose = model.frame(v + 1).rig_from_world
+            R[v] = torch.from_numpy(pose.rotation.matrix().copy())
+            t[v] = torch.from_numpy(np.array(pose.translation))
+        points[chosen] = torch.from_numpy(np.stack([model.point3D(i).xyz for i in ids]))
+        return replace(rig, R=R, t=t, points=points), report.ceres_summary
+
+    def _options(self) -> pycolmap.BundleAdjustmentOptions:
+        options = pycolmap.BundleAdjustmentOptions()
+        options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+        options.refine_sensor_from_rig = False
+        options.print_summary = False
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = self.loss_scale
+        solver = options.ceres.solver_options
+        solver.max_num_iterations = self.iterations
+        solver.max_solver_time_in_seconds = self.seconds
+        solver.num_threads = 1  # sums in one order: the same rig on any machine
+        solver.function_tolerance, solver.gradient_tolerance, solver.parameter_tolerance = 1e-10, 1e-12, 1e-10
+        options.ceres.solver_options = solver
+        return options
+
+
+def _image_id(view: np.ndarray | int, joint: int) -> np.ndarray | int:
+    return view * JOINTS + joint + 1
+
+
+JOINTS = 1000
+"""More joints than any body has."""
+
+
+def _add_view(
+    model: pycolmap.Reconstruction,
+    config: pycolmap.BundleAdjustmentConfig,
+    seen_by: Observations,
+    rig: Rig,
+    view: int,
+    chosen: np.ndarray,
+    joint: np.ndarray,
+) -> None:
+    """A view as a pycolmap rig with one pose and a camera for each joint, whose pixel is that joint's noise: so Ceres
+    weighs joints, which it has no other way to do."""
+    body = pycolmap.Rig(rig_id=view + 1)
+    frame = pycolmap.Frame(frame_id=view + 1, rig_id=view + 1)
+    images = []
+    for j in np.unique(joint).tolist():
+        own = chosen[joint == j]
+        focal = 1 / float(seen_by.noise[view, own[0]])
+        number = int(_image_id(view, j))
+        camera = pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0.0, 0.0])
+        model.add_camera(camera)
+        body.add_sensor(camera.sensor_id, pycolmap.Rigid3d()) if images else body.add_ref_sensor(camera.sensor_id)
+        xy = seen_by.xy[view, own].numpy() * focal
+        image = pycolmap.Image(name=str(number), keypoints=xy, camera_id=number, image_id=number)
+        image.frame_id = view + 1
+        frame.add_data_id(image.data_id)
+        images.append(image)
+        config.add_image(number)
+        config.set_constant_cam_intrinsics(number)
+    frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rig.R[view].numpy()), rig.t[view].numpy())
+    model.add_rig(body)
+    model.add_frame(frame)
+    for image in images:
+        model.add_image(image)
+    model.register_frame(view + 1)

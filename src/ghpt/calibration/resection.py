@@ -1,0 +1,148 @@
+"""A first rig: the best-conditioned pair, then view after view against the people that the rig triangulates."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import poselib
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghpt.calibration.observations import Observations, check_positive
+from ghpt.calibration.pairs import PairTable, camera_dict, ransac_options
+from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.triangulation import triangulate, triangulate_subsets
+from ghpt.randomness import key, uniform
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Extrinsics of the views that are ``placed`` (identity elsewhere) and the people they see, in one world."""
+
+    R: Float[Tensor, "V 3 3"]
+    t: Float[Tensor, "V 3"]
+    placed: Bool[Tensor, " V"]
+    points: Float[Tensor, "N 3"]
+    inlier: Bool[Tensor, "V N"]
+    """Observations in placed views that agree with their point; a point has none or at least two."""
+
+
+@dataclass(frozen=True)
+class Resection:
+    """How a rig is begun. ``threshold``: largest reprojection error of an inlier, in units of noise; a view is placed
+    if ``least`` of its points and ``share`` of them agree. ``pairs``: pairs of views tried for each point where the
+    placed ones make more. ``iterations``: the cap of poselib's RANSAC."""
+
+    threshold: float
+    least: int
+    share: float
+    pairs: int
+    iterations: int
+
+    def __post_init__(self) -> None:
+        check_positive(threshold=self.threshold, least=self.least, share=self.share, pairs=self.pairs)
+        check_positive(iterations=self.iterations)
+
+    def begin(self, seen_by: Observations, table: PairTable, edge: int, seed: int) -> Rig:
+        """The rig of a pair alone, with the first view as the world."""
+        a, b = table.views[edge].tolist()
+        views = len(seen_by.seen)
+        R = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
+        t = torch.zeros(views, 3, dtype=torch.float64)
+        placed = torch.zeros(views, dtype=torch.bool)
+        R[b], t[b] = table.R[edge], table.t[edge]
+        placed[[a, b]] = True
+        nothing = torch.zeros(len(seen_by.frame), 3, dtype=torch.float64), torch.zeros_like(seen_by.seen)
+        return self.triangulate(seen_by, Rig(R, t, placed, *nothing), seed)
+
+    def grow(self, seen_by: Observations, table: PairTable, rig: Rig, seed: int) -> Rig:
+        """Place every view that a chain of linked pairs reaches, the one best bound to the placed ones first; a view
+        that fails is tried again when the rig has grown."""
+        failed: set[int] = set()
+        while (view := self._next(table, rig.placed, failed)) is not None:
+            found = self.place(seen_by, rig, view, seed)
+            if found is None:
+                failed.add(view)
+                continue
+            R, t, placed = rig.R.clone(), rig.t.clone(), rig.placed.clone()
+            R[view], t[view] = found
+            placed[view] = True
+            rig = self.triangulate(seen_by, replace(rig, R=R, t=t, placed=placed), seed)
+            failed.clear()
+        return rig
+
+    def _next(self, table: PairTable, placed: Bool[Tensor, " V"], failed: set[int]) -> int | None:
+        inside = placed[table.views]
+        border = table.linked & (inside[:, 0] != inside[:, 1])
+        outside = torch.where(inside[:, 0], table.views[:, 1], table.views[:, 0])
+        for edge in torch.sort(table.expected, stable=True).indices.tolist():
+            if border[edge] and int(outside[edge]) not in failed:
+                return int(outside[edge])
+        return None
+
+    def supported(self, rig: Rig) -> Rig:
+        """The rig without the views that fewer than ``least`` inliers hold; a pair at least stays."""
+        held = rig.placed & (rig.inlier.sum(1) >= self.least)
+        return replace(rig, placed=held, inlier=rig.inlier & held[:, None]) if held.sum() >= 2 else rig
+
+    def place(
+        self, seen_by: Observations, rig: Rig, view: int, seed: int
+    ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]] | None:
+        """A view's R, t from the rig's points by PnP with LO-RANSAC; None where too few agree."""
+        used = seen_by.seen[view] & rig.inlier.any(0)
+        if used.sum() < self.least:
+            return None
+        options = ransac_options(self.threshold, self.iterations, seed, "max_reproj_error")
+        focal = seen_by.focal(view)
+        pose, info = poselib.estimate_absolute_pose(
+            (seen_by.xy[view, used] * focal).numpy(), rig.points[used].numpy(), camera_dict(focal), options,
+            {"loss_type": "CAUCHY", "loss_scale": self.threshold / 2},
+        )  # fmt: skip
+        count = sum(info["inliers"])
+        R, t = torch.from_numpy(np.array(pose.R)), torch.from_numpy(np.array(pose.t))
+        enough = count >= max(self.least, self.share * int(used.sum()))
+        return (R, t) if enough and bool(torch.isfinite(R).all() & torch.isfinite(t).all()) else None
+
+    def triangulate(self, seen_by: Observations, rig: Rig, seed: int) -> Rig:
+        """All points anew from the placed views: of each, the pair of views with which most others agree, and its
+        inliers together."""
+        of = Observations(
+            *(getattr(seen_by, f)[rig.placed] for f in ("xy", "noise", "seen")), seen_by.frame, seen_by.joint
+        )
+        R, t = rig.R[rig.placed], rig.t[rig.placed]
+        K = torch.eye(3, dtype=torch.float64).expand_as(R)
+        subsets = _pairs_of_views(of.seen, self.pairs, seed)
+        points, ok = triangulate_subsets(Cameras(K[None], R[None], t[None]), of.xy[None], of.seen[None], subsets[None])
+        tried = R.expand(len(subsets), -1, -1, -1), t.expand(len(subsets), -1, -1)
+        error = of.error(*tried, points[0]) / self.threshold
+        agree = (error <= 1) & of.seen & ok[0][:, None]
+        rest = torch.where(agree, error, 0.0).sum(1) / (len(of.seen) + 1)
+        best = (agree.sum(1) - rest).argmax(0)
+        agree = agree.gather(0, best[None, None].expand(1, len(of.seen), -1))[0]
+        result = triangulate(Cameras(K, R, t), of.xy, agree.double())
+        return self.agreeing(seen_by, replace(rig, points=result.points), result.ok & (agree.sum(0) >= 2))
+
+    def agreeing(self, seen_by: Observations, rig: Rig, known: Bool[Tensor, " N"]) -> Rig:
+        """The rig with the inliers of its points where they are ``known``."""
+        inlier = (
+            (seen_by.error(rig.R, rig.t, rig.points) <= self.threshold) & seen_by.seen & rig.placed[:, None] & known
+        )
+        return replace(rig, inlier=inlier & (inlier.sum(0) >= 2))
+
+
+def _pairs_of_views(seen: Bool[Tensor, "V N"], most: int, seed: int) -> Bool[Tensor, "H N V"]:
+    """For each point every pair of views, or ``most`` random ones of those that see it."""
+    views, points = seen.shape
+    if views * (views - 1) // 2 <= most:
+        one, other = torch.triu_indices(views, views, offset=1)
+        eye = torch.eye(views, dtype=torch.bool)
+        return (eye[one] | eye[other])[:, None].expand(-1, points, -1)
+    count = seen.sum(0)
+    draw = uniform(key(seed, "pairs of views"), (most, points, 2))
+    one = (draw[..., 0] * count).long()
+    other = (draw[..., 1] * (count - 1)).long()
+    other = other + (other >= one)
+    place = seen.T.cumsum(-1) - 1
+    return seen.T & ((place == one[..., None]) | (place == other[..., None]))

@@ -1,0 +1,212 @@
+"""A whole rig's extrinsics from the people in view: frames, pairs, resection, bundle adjustment, uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Float64, Int
+from torch import Tensor
+
+from ghpt.calibration.bundle import Adjusted, BundleAdjustment
+from ghpt.calibration.diagnosis import Case, Diagnosis, Diagnostics, of_stature
+from ghpt.calibration.observations import Observations, check_positive, choose_frames, observe, reweighted, usable
+from ghpt.calibration.pairs import PairEstimation, PairTable
+from ghpt.calibration.resection import Resection, Rig
+from ghpt.calibration.uncertainty import uncertainty
+from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import Cameras
+
+
+@dataclass(frozen=True)
+class RigEstimate:
+    """A calibrated rig. The world is the frame of the first calibrated camera; the unit of length is the rig's size
+    (the root mean square distance of the cameras from their mean) until ``scaled`` makes it millimetres."""
+
+    names: tuple[str, ...]
+    cameras: Cameras
+    """K, R, t with leading dimension V, float64; identity and t = 0 for a camera that is not calibrated."""
+    calibrated: Bool[Tensor, " V"]
+    covariance: Float64[Tensor, "V 6 6"]
+    """Rotation vector about the world's axes (radians; of camera to world), then centre (world), in the gauge of the
+    rig as a whole (``ghpt.calibration.uncertainty.Uncertainty``); 0 for a camera that is not calibrated."""
+    reprojection: Float64[Tensor, " V"]
+    """Median reprojection error of the key points whose point is known, outliers among them, pixels."""
+    inliers: Float64[Tensor, " V"]
+    """Share of those key points that agree with the rig."""
+    pairs: PairTable
+    frames: Int[Tensor, " T"]
+    """Which frames of the recording were used."""
+    points: Float64[Tensor, "T J 3"]
+    estimated: Bool[Tensor, "T J"]
+    converged: bool
+    iterations: int
+    diagnoses: tuple[Diagnosis, ...]
+
+    @property
+    def rotation_std_deg(self) -> Float64[Tensor, " V"]:
+        """Root mean square over the axes of the standard deviation of a camera's rotation."""
+        return torch.rad2deg((self.covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(-1)).sqrt())
+
+    @property
+    def centre_std(self) -> Float64[Tensor, " V"]:
+        """The same of its centre, in the unit of length."""
+        return (self.covariance.diagonal(dim1=-2, dim2=-1)[:, 3:].mean(-1)).sqrt()
+
+    @property
+    def succeeded(self) -> bool:
+        """Converged, every camera calibrated, and no diagnosis is an error."""
+        return self.converged and bool(self.calibrated.all()) and all(d.severity != "error" for d in self.diagnoses)
+
+    def scaled(self, factor: float) -> RigEstimate:
+        """The rig in millimetres: lengths times ``factor``. Warns of a person who is not of human size."""
+        if not 0 < factor < float("inf"):
+            mend = "Give a body height, segment lengths or a baseline that the recording shows."
+            raise GhptDataError("rig", "scale", f"{factor} mm per unit of length", mend)
+        unit = torch.cat((torch.ones(3), torch.full((3,), factor))).double()
+        points = self.points * factor
+        return replace(
+            self,
+            cameras=Cameras(self.cameras.K, self.cameras.R, self.cameras.t * factor),
+            covariance=self.covariance * unit * unit[:, None],
+            points=points,
+            diagnoses=(*self.diagnoses, *of_stature(points, self.estimated)),
+        )
+
+
+@dataclass(frozen=True)
+class RigCalibration:
+    """Key points and known intrinsics to the extrinsics of all cameras.
+
+    ``frames``: most frames used. ``noise``: first guess of the key points' noise, in sizes of the person in the image.
+    ``seeds``: best-conditioned pairs that the rig is begun from in turn, until one places every linked view with a
+    share of ``good`` inliers; the best is kept. ``rounds``: bundle adjustments, each with the noise of views and joints
+    that the one before has shown and points triangulated anew. ``blocks``: see ``uncertainty``.
+    """
+
+    frames: int
+    noise: float
+    pairs: PairEstimation
+    resection: Resection
+    seeds: int
+    good: float
+    bundle: BundleAdjustment
+    rounds: int
+    blocks: int
+    diagnostics: Diagnostics
+
+    def __post_init__(self) -> None:
+        check_positive(frames=self.frames, noise=self.noise, seeds=self.seeds, good=self.good, rounds=self.rounds)
+        check_positive(blocks=self.blocks)
+
+    @torch.no_grad()
+    def __call__(
+        self,
+        names: Sequence[str],
+        K: Float64[Tensor, "V 3 3"],
+        key_points: Float[Tensor, "T V J 2"],
+        confidence: Float[Tensor, "T V J"],
+        seen: Bool[Tensor, "T V J"],
+        sizes: Int[Tensor, "V 2"] | None,
+        seed: int,
+    ) -> RigEstimate:
+        """Calibrate; ``key_points`` are undistorted pixels. Never raises on values: what is wrong is among the
+        diagnoses. Raises GhptDataError for fewer than two cameras, a name that occurs twice, or arrays that do not
+        belong together."""
+        _check(names, K, key_points)
+        mask = usable(K, key_points, seen)
+        frames = choose_frames(key_points, confidence, mask, self.frames)
+        seen_by = observe(K, key_points[frames], mask[frames], self.noise)
+        table = self.pairs(seen_by, seed)
+        rig = self.begin(seen_by, table, seed)
+        adjusted = None
+        if rig is not None:
+            seen_by, adjusted = self.refine(seen_by, table, rig, seed)
+        case = Case(tuple(names), K, key_points, mask, sizes, frames, seen_by, table, adjusted, self.resection, seed)
+        return self._estimate(case)
+
+    def begin(self, seen_by: Observations, table: PairTable, seed: int) -> Rig | None:
+        """The first rig, from the seed with the most views and the largest share of inliers; None without a pair."""
+        best, merit = None, (-1, -1.0)
+        order = torch.sort(torch.where(table.linked, table.expected, torch.inf), stable=True).indices
+        linked = int(torch.isin(torch.arange(len(seen_by.seen)), table.views[table.linked]).sum())
+        for edge in order[: min(self.seeds, int(table.linked.sum()))].tolist():
+            rig = self.resection.begin(seen_by, table, edge, seed)
+            rig = self.resection.grow(seen_by, table, rig, seed)
+            share = rig.inlier.sum() / (seen_by.seen & rig.placed[:, None]).sum().clamp(min=1)
+            if (int(rig.placed.sum()), float(share)) > merit:
+                best, merit = rig, (int(rig.placed.sum()), float(share))
+            if merit[0] == linked and merit[1] >= self.good:
+                break
+        return best
+
+    def refine(self, seen_by: Observations, table: PairTable, rig: Rig, seed: int) -> tuple[Observations, Adjusted]:
+        """Bundle adjustments in turn with new weights and new points; the last result is not touched any more."""
+        adjusted = self.bundle(seen_by, rig)
+        for _ in range(self.rounds - 1):
+            error = seen_by.error(adjusted.rig.R, adjusted.rig.t, adjusted.rig.points)
+            seen_by = reweighted(seen_by, error, adjusted.rig.inlier)
+            rig = self.resection.triangulate(seen_by, unitised(adjusted.rig), seed)
+            rig = self.resection.grow(seen_by, table, self.resection.supported(rig), seed)
+            adjusted = self.bundle(seen_by, rig)
+        adjusted = replace(adjusted, rig=unitised(adjusted.rig))
+        final = self.bundle.state(seen_by, adjusted.rig)
+        return seen_by, replace(adjusted, final=final)
+
+    def _estimate(self, case: Case) -> RigEstimate:
+        views, (frames, joints) = len(case.names), case.shape
+        eye = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
+        rig = case.rig or Rig(
+            eye, torch.zeros(views, 3, dtype=torch.float64), torch.zeros(views, dtype=torch.bool),
+            torch.zeros(frames * joints, 3, dtype=torch.float64), torch.zeros_like(case.seen_by.seen),
+        )  # fmt: skip
+        placed = rig.placed
+        reprojection, inliers = case.agreement(rig)
+        spread = None if case.adjusted is None else uncertainty(case.seen_by, rig, case.adjusted.final, self.blocks)
+        estimated = rig.inlier.any(0)
+        return RigEstimate(
+            names=case.names,
+            cameras=Cameras(
+                case.K.double(),
+                torch.where(placed[:, None, None], rig.R, eye),
+                torch.where(placed[:, None], rig.t, 0.0),
+            ),
+            calibrated=placed,
+            covariance=torch.zeros(views, 6, 6, dtype=torch.float64) if spread is None else spread.covariance,
+            reprojection=reprojection,
+            inliers=inliers,
+            pairs=case.table,
+            frames=case.frames,
+            points=torch.where(estimated[:, None], rig.points, 0.0).unflatten(0, (frames, joints)),
+            estimated=estimated.unflatten(0, (frames, joints)),
+            converged=case.adjusted is not None and case.adjusted.converged,
+            iterations=0 if case.adjusted is None else case.adjusted.iterations,
+            diagnoses=self.diagnostics(case, spread),
+        )
+
+
+def unitised(rig: Rig) -> Rig:
+    """The rig in the frame of its first placed view, with the size 1."""
+    views = torch.nonzero(rig.placed)[:, 0]
+    centre = -(rig.R.mT @ rig.t[..., None])[..., 0]
+    size = (centre[views] - centre[views].mean(0)).square().sum(-1).mean().sqrt()
+    size = torch.where((size > 0) & torch.isfinite(size), size, 1.0)
+    first = views[0]
+    R = torch.where(rig.placed[:, None, None], rig.R @ rig.R[first].T, rig.R)
+    centre = (centre - centre[first]) @ rig.R[first].T / size
+    t = torch.where(rig.placed[:, None], -(R @ centre[..., None])[..., 0], rig.t)
+    known = rig.inlier.any(0)[:, None]
+    points = torch.where(known, (rig.points @ rig.R[first].T + rig.t[first]) / size, 0.0)
+    return replace(rig, R=R, t=t, points=points)
+
+
+def _check(names: Sequence[str], K: Tensor, key_points: Tensor) -> None:
+    mend = "Give each camera once, with its intrinsics and its key points."
+    if len(names) < 2:
+        raise GhptDataError("rig", "cameras", f"{len(names)} given, a rig has two or more", mend)
+    if twice := [name for name in names if list(names).count(name) > 1]:
+        raise GhptDataError("rig", "cameras", f"{twice[0]!r} occurs twice", mend)
+    if not len(names) == len(K) == key_points.shape[1]:
+        count = f"{len(names)} names, {len(K)} intrinsics, key points of {key_points.shape[1]} cameras"
+        raise GhptDataError("rig", "cameras", count, mend)
