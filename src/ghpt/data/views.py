@@ -12,13 +12,14 @@ from jaxtyping import Bool, Float, Int
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.detections import undistorted
 from ghpt.data.key_points import KeyPoints
-from ghpt.data.skeletons import joints17
+from ghpt.data.skeletons import SKELETONS, joints17
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINTS
 
 _MEND = "Rename them, say which is which (match={view: camera}), or name the views to use (views=[...])."
+_MOST_OUTSIDE = 0.25
 _WORDS = r"[ _.-](json|openpose|pose|keypoints|kpts|body|2d)\b"
 
 
@@ -37,6 +38,12 @@ class Views:
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def part(self, views: Sequence[int]) -> Views:
+        """Some of the views, in this order."""
+        at = list(views)
+        arrays = (self.key_points[:, at], self.confidence[:, at], self.seen[:, at])
+        return Views(self.cameras.select(at), *arrays, self.frame, self.rate_hz)
 
     def recording(self, name: str, cameras: Cameras) -> Recording:
         """The recording as any calibration of its cameras sees it; without a truth."""
@@ -62,11 +69,25 @@ def look_through(
     pairs = matched(points.path, points.views, cameras, match or {}, views)
     at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
     pixels, seen = np.zeros(points.key_points[:, at].shape, np.float32), points.seen[:, at].copy()
+    if points.joints == SKELETONS["mediapipe_33"] and ordered.size is not None:
+        seen &= inside(points.key_points[:, at], seen, ordered.size.numpy())
     for view in range(len(at)):
         K, lens = ordered.K[view].numpy(), ordered.distortion[view].numpy()
         pixels[:, view], seen[:, view] = undistorted(points.key_points[:, at[view]], seen[:, view], K, lens)
     values = joints17(points.path, points.joints, pixels, points.confidence[:, at], seen)
     return Views(ordered, *values, frame=points.frame, rate_hz=points.rate_hz)
+
+
+def inside(
+    pixels: Float[np.ndarray, "T V K 2"], seen: Bool[np.ndarray, "T V K"], size: Int[np.ndarray, "V 2"]
+) -> Bool[np.ndarray, "T V K"]:
+    """Which points lie in their images. MediaPipe places the joints that it does not see too, beyond the edge.
+
+    All of a view's points count as inside where more than a quarter do not: then the image has another size.
+    """
+    within = ((pixels >= -0.5) & (pixels <= size[:, None] - 0.5)).all(-1)
+    outside = (seen & ~within).sum((0, 2)) / seen.sum((0, 2)).clip(1)
+    return within | (outside > _MOST_OUTSIDE)[:, None]
 
 
 def matched(

@@ -1,0 +1,200 @@
+"""Calibration: from key points and intrinsics to a rig in the formats that others read."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict
+
+import numpy as np
+import torch
+from jaxtyping import Bool
+from torch import Tensor
+
+from ghpt.calibration.diagnosis import Diagnosis
+from ghpt.calibration.millimetres import check_scale, in_millimetres, of_scale
+from ghpt.calibration.rig import RigEstimate
+from ghpt.config import build, check_type, suggest
+from ghpt.data.camera_files import CameraFile, read_cameras
+from ghpt.data.key_points import read_key_points
+from ghpt.data.store import prepared
+from ghpt.data.views import Views, look_through
+from ghpt.errors import GhptConfigError, GhptDataError, check
+from ghpt.files import sweep_temporaries
+from ghpt.geometry.cameras import Cameras
+from ghpt.provenance import provenance
+from ghpt.report.calibration import differences, explains, print_calibration
+from ghpt.report.rig_comparison import Similarity, align, triangulate_recording, upright
+from ghpt.report.rig_files import RIG_FILES, camera_numbers, write_numbers, write_poses, write_rig, write_rig_figure
+from ghpt.report.tables import words
+from ghpt.train import shown
+
+_log = logging.getLogger(__name__)
+
+
+class Scale(TypedDict):
+    """What gives millimetres."""
+
+    height: float | None
+    segments: dict[str, float] | None
+    baseline: list[Any] | None
+    assumed_height: float
+
+
+class Settings(TypedDict):
+    """What `calibrate` needs of the configuration."""
+
+    keypoints: str | None
+    cameras: str | None
+    views: list[str] | None
+    match: dict[str, str] | None
+    skeleton: str | None
+    rate_hz: float | None
+    recording: str | None
+    scale: Scale
+    data: dict[str, Any]
+    calibration: dict[str, Any]
+    baselines: dict[str, Any]
+    triangulation: str
+    evaluated_frames: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class Case:
+    """What is calibrated, and what it can be compared with."""
+
+    title: str
+    source: str
+    views: Views
+    reference: str
+    """What ``views.cameras.cameras``, where there are any, are: never used but for the comparison and the gauge."""
+    notes: tuple[Diagnosis, ...] = ()
+
+
+def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
+    """Calibrate the cameras of ``config["keypoints"]``, or of a recording of ``config["data"]``.
+
+    Writes calibration.json, report.md and the figure into ``output``, and of a usable rig ``RIG_FILES``; prints the
+    table. Raises GhptDataError after writing if a diagnosis is an error: then only the cameras that it does not
+    concern are in the rig's files, and with fewer than two there are none. Returns what calibration.json holds.
+    """
+    check_type(config, Settings, "")
+    check(config["evaluated_frames"] >= 1, "evaluated_frames", "is not positive", "Give 1 or more.")
+    check(config["triangulation"] in config["baselines"], "triangulation", f"is {config['triangulation']!r}",
+          suggest(config["triangulation"], config["baselines"]))  # fmt: skip
+    calibration = build(config["calibration"], "calibration")
+    estimator = build(config["baselines"][config["triangulation"]], f"baselines.{config['triangulation']}")
+    case = from_files(config) if config["keypoints"] else from_data(config)
+    cameras, views = case.views.cameras, case.views
+    check_scale(config["scale"], cameras.names)
+    sweep_temporaries(output)
+    for name in RIG_FILES:  # of an earlier run: they must not pass for this one's
+        (output / name).unlink(missing_ok=True)
+
+    estimate: RigEstimate = calibration(
+        cameras.names, cameras.K, torch.from_numpy(views.key_points).double(),
+        torch.from_numpy(views.confidence).double(), torch.from_numpy(views.seen), cameras.size, config["seed"],
+    )  # fmt: skip
+    estimate, scale = in_millimetres(estimate, config["scale"])
+    usable = usable_cameras(estimate)
+    chosen = torch.nonzero(usable)[:, 0].tolist()
+    world, gauge = _gauge(estimate, usable, cameras.cameras, case.reference)
+    moved = gauge.cameras(estimate.cameras)
+    rigs = {"estimated": moved} | ({case.reference: cameras.cameras} if cameras.cameras is not None else {})
+    seen_by = {
+        name: views.part(chosen).recording(case.title, rig.index(chosen)) for name, rig in rigs.items() if chosen
+    }
+    numbers = {
+        "data": case.title, "source": case.source, "cameras_file": cameras.path, "frames": len(views),
+        "seed": config["seed"], "scale": scale, "world": world, "reference": case.reference if len(rigs) > 1 else None,
+        "triangulation": config["triangulation"], "converged": estimate.converged,
+        "usable": [cameras.names[v] for v in chosen],
+        "cameras": camera_numbers(estimate, moved, gauge, cameras),
+        "difference": differences(*seen_by.values()) if len(seen_by) > 1 else None,
+        "explains": explains(seen_by, estimator, config["evaluated_frames"]),
+        "diagnoses": [vars(found) for found in (*case.notes, *estimate.diagnoses, *of_scale(scale))],
+        "provenance": provenance(config["seed"]),
+    }  # fmt: skip
+    points, estimated = gauge.points(estimate.points), estimate.estimated
+    if chosen:
+        points, estimated = triangulate_recording(seen_by["estimated"], estimator)
+        write_rig(output, cameras.select(chosen), moved.index(chosen), numbers)
+        write_poses(output / "poses.npz", seen_by["estimated"], points, estimated, numbers)
+    reference = (case.reference, cameras.cameras) if chosen and cameras.cameras is not None else None
+    covariance = gauge.covariance(estimate.covariance)
+    write_rig_figure(output, numbers, moved, covariance, points, estimated, estimate.calibrated, reference)
+    write_numbers(output, numbers)
+    print_calibration(numbers)
+    _log.info("Report: %s, beside it the rig's files.", shown(output / "report.md"))
+    errors = [d["text"] for d in numbers["diagnoses"] if d["severity"] == "error"]
+    if errors:
+        written = f"only {', '.join(numbers['usable'])} are in the rig's files" if chosen else "no rig is written"
+        raise GhptDataError(case.source, "calibration", f"{errors[0].rstrip('.')}; {written}",
+                            f"See {shown(output / 'report.md')}.")  # fmt: skip
+    return numbers
+
+
+def summary(numbers: dict[str, Any]) -> str:
+    """What `calibrate` returned, in words."""
+    errors = [c["reprojection_px"] for c in numbers["cameras"] if c["calibrated"]]
+    return f"{numbers['data']}: {len(errors)} cameras, {max(errors):.1f} px at most"
+
+
+def from_files(config: Mapping[str, Any]) -> Case:
+    """The user's own key points and cameras."""
+    if not config["cameras"]:
+        raise GhptConfigError("cameras", "is missing", "Name the file of the intrinsics: cameras=intrinsics.toml")
+    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"])
+    views = look_through(points, read_cameras(config["cameras"]), config["match"], config["views"])
+    several = {view: n for view, n in zip(points.views, points.several, strict=True) if n}
+    notes = ()
+    if several:
+        text = "several people in " + ", ".join(f"{n} frames of {view}" for view, n in several.items())
+        text += "; the one tracked best in each view was followed, and must be the same person in all"
+        notes = (Diagnosis("several_people", "warning", tuple(several), text, float(max(several.values()))),)
+    title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
+    return Case(title, str(Path(config["keypoints"]).resolve()), views, "the file's own calibration", notes)
+
+
+def from_data(config: Mapping[str, Any]) -> Case:
+    """One recording of a data set, whose true extrinsics serve the comparison alone."""
+    data = build(config["data"], "data")
+    made = {"source": data.source, "split": data.evaluate}
+    stored = prepared(data.cache, data.key(data.evaluate), lambda: data.make(data.evaluate), made)
+    recordings = {recording.name: recording for recording in stored}
+    name = config["recording"] or ("S9/Walking-1" if "S9/Walking-1" in recordings else next(iter(recordings), ""))
+    if name not in recordings:
+        raise GhptConfigError("recording", f"there is no {name!r}", suggest(name, recordings))
+    found = recordings[name]
+    rig = found.cameras
+    file = CameraFile(
+        path=data.source, format="ghpt", names=found.camera_names, other_names=("",) * len(found.camera_names),
+        K=rig.K, distortion=rig.K.new_zeros(len(rig.K), 5), size=None, R=rig.R, t=rig.t,
+    )  # fmt: skip
+    arrays = (np.array(getattr(found, field)) for field in ("key_points", "confidence", "seen", "frame"))
+    views = Views(file, *arrays, found.rate_hz)
+    return Case(f"{name} of {words(data.name, data.source)}", data.source, views, "the truth")
+
+
+def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
+    """Calibrated cameras that no error concerns; an error that names none, or all, concerns all. Two or more."""
+    usable = estimate.calibrated.clone()
+    for found in estimate.diagnoses:
+        if found.severity == "error":
+            of = [estimate.names.index(name) for name in found.cameras if name in estimate.names]
+            usable[of or slice(None)] = False
+    return usable if int(usable.sum()) >= 2 else torch.zeros_like(usable)
+
+
+def _gauge(
+    estimate: RigEstimate, usable: Bool[Tensor, " V"], reference: Cameras | None, name: str
+) -> tuple[str, Similarity]:
+    """The world that the rig is written in, in words, and the way there."""
+    if reference is not None and usable.any():
+        return f"that of {name}", align(estimate.cameras.index(usable), reference.index(usable), rigid=True)
+    first = usable if usable.any() else torch.ones_like(usable)
+    gauge = upright(estimate.points, estimate.estimated, estimate.cameras.index(first))
+    return "z along the people's upright, x where the first camera looks, the floor at their lowest ankles", gauge
