@@ -85,15 +85,16 @@ def test_a_missing_row_is_an_error_that_says_so(tmp_path):
     assert not (tmp_path / "p.npz").exists()
 
 
-def test_a_pose_that_is_not_finite_is_not_estimated(tmp_path):
+def test_a_pose_that_is_not_finite_or_without_a_length_is_not_estimated(tmp_path):
     values = content(RIGS[:1], draws=1)
     spoilt = values["estimates"]["weight"].t.clone()
     spoilt[2, 1] = torch.inf
+    spoilt[4] = 0
     values["estimates"]["weight"] = RelativePoseEstimate(
         values["estimates"]["weight"].R, spoilt, torch.ones(6, dtype=torch.bool)
     )
     estimate = written(tmp_path, RIGS[:1], values).read(0, 6).estimates["weight"]
-    assert estimate.estimated.tolist() == [True, True, False, True, True, True]
+    assert estimate.estimated.tolist() == [True, True, False, True, False, True]
     assert torch.equal(estimate.R[2], torch.eye(3, dtype=torch.float64))
     assert (estimate.t[2] == 0).all()
 

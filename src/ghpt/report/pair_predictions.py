@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.data.pairs import RigOfSplit
@@ -47,12 +47,12 @@ class PairWriter:
         pair: Int[Tensor, "B 2"],
         weights: Mapping[str, Float[Tensor, " B"]],
     ) -> None:
-        """Write pairs to their row numbers; t in mm. A pose that is not finite is written as not estimated."""
+        """Write pairs to their row numbers; t in mm. A pose that is not finite, or whose t is 0 because nothing
+        gave it a length, is written as not estimated."""
         self._rows.check(estimates, weights)
         values: dict[str, Tensor] = {"truth_R": truth[0], "truth_t": truth[1], "rig": rig, "draw": draw, "pair": pair}
         for name, estimate in estimates.items():
-            finite = estimate.R.isfinite().flatten(-2).all(-1) & estimate.t.isfinite().all(-1)
-            estimated = estimate.estimated & finite
+            estimated = _usable(estimate.R, estimate.t, estimate.estimated)
             values[f"estimated_{name}"] = estimated
             values[f"R_{name}"] = estimate.R.masked_fill(~estimated[..., None, None], torch.nan)
             values[f"t_{name}"] = estimate.t.masked_fill(~estimated[..., None], torch.nan)
@@ -121,7 +121,7 @@ class PairPredictions:
         estimates = {}
         for name in self.names:
             R, t = rows[f"R_{name}"], rows[f"t_{name}"]
-            estimated = rows[f"estimated_{name}"] & R.isfinite().flatten(-2).all(-1) & t.isfinite().all(-1)
+            estimated = _usable(R, t, rows[f"estimated_{name}"])
             R = torch.where(estimated[:, None, None], R, torch.eye(3, dtype=R.dtype))
             estimates[name] = RelativePoseEstimate(R, torch.where(estimated[:, None], t, 0.0), estimated)
         weights = {summary: rows[f"weights_{summary}"] for summary in WEIGHTS}
@@ -155,6 +155,10 @@ def open_pairs(path: str | Path) -> PairPredictions:
     camera_names = tuple(flat[i * views : (i + 1) * views] for i in range(rigs))
     cameras = Cameras(arrays["rig_K"], arrays["rig_R"], arrays["rig_t"])
     return PairPredictions(path, meta, names, tables["rig_name"], camera_names, cameras, arrays["rig_points"], members)
+
+
+def _usable(R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"], estimated: Bool[Tensor, " B"]) -> Bool[Tensor, " B"]:
+    return estimated & R.isfinite().flatten(-2).all(-1) & t.isfinite().all(-1) & (t != 0).any(-1)
 
 
 def _second(members: Mapping[str, Member], name: str) -> int:
