@@ -1,4 +1,4 @@
-"""Figures of the camera problem: a rig with its estimated cameras, and the sweep over the number of frames."""
+"""The figure of the camera problem: a rig with its true and its estimated cameras."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,26 +14,18 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.recording import RelativePoseEstimate
 from ghpt.report.figures import TRUTH, wrapped
 from ghpt.report.pair_evaluate import camera_after
-from ghpt.report.pair_tables import NAMES, NONE
-from ghpt.report.tables import markdown
+from ghpt.report.pair_tables import NAMES
 
 # Okabe and Ito's palette again; told apart in grey print by markers and dashes.
-_STYLES = {
+METHOD_STYLES = {
     "weight": ("#0072B2", "-", "o"), "average": ("#56B4E9", (0, (4, 1)), "v"), "eight_point": ("#D55E00", "--", "s"),
     "ransac": ("#E69F00", "-.", "D"), "usac_magsac": ("#009E73", (0, (1, 1)), "^"),
     "usac_accurate": ("#999999", (0, (5, 1, 1, 1)), "<"), "poselib": ("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"),
     "rig": ("#000000", (0, (6, 2)), "X"),
 }  # fmt: skip
-_OTHER = ("#F0E442", ":", "*")
-_BANDS = ("weight", "eight_point")
-"""The two of the paper's figure; the bands of others are fainter, so that many can be told apart."""
-CLIP = 80.0
-"""mm at which fig:comparison-to-8-point is cut."""
+OTHER_STYLE = ("#F0E442", ":", "*")
 _MANY_CAMERAS = 8
 """With more cameras than these only the estimates from the first camera are drawn."""
-
-Sweep = Mapping[str, Mapping[int, Sequence[float]]]
-"""Method -> M -> E_3D (mm; inf where it failed) of the repeats."""
 
 
 def rig_figure(
@@ -53,7 +45,7 @@ def rig_figure(
     right, forward, up = _axes_of(cameras)
     centre = cameras.centre.numpy()
     extent = float(np.linalg.norm(np.ptp(centre, axis=0)))
-    size = 0.09 * extent
+    size = 0.09 * extent * min(1.0, (_MANY_CAMERAS / len(names)) ** 0.5)
     off = {name: _off(cameras, pair, estimate) for name, estimate in estimates.items()}
     times = _enlargement(np.concatenate([d for _, d in off.values()]), extent)
     figure = Figure(figsize=(10, 5.6), layout="constrained")
@@ -63,7 +55,7 @@ def rig_figure(
         axes.plot(*(points.numpy() @ view.T / 1000).T, ".", color="#DDDDDD", markersize=2, zorder=0)
         _draw(axes, cameras, size, view, TRUTH, "-", 4.5, 1)
         for name, estimate in estimates.items():
-            colour, style, marker = _STYLES.get(name, _OTHER)
+            colour, style, marker = METHOD_STYLES.get(name, OTHER_STYLE)
             _draw(axes, _targets(cameras, pair, estimate), size, view, colour, style, 0.9, 2)
             start, difference = (x @ view.T / 1000 for x in off[name])
             stalks = np.stack((start, start + times * difference), axis=1)
@@ -75,7 +67,7 @@ def rig_figure(
         _name(panels[0], names, centre @ views[0].T / 1000, centre.mean(0) @ views[0].T / 1000, size / 1000)
     handles = [Line2D([], [], color=TRUTH, linewidth=4.5, label="true cameras")]
     for name, estimate in estimates.items():
-        colour, style, marker = _STYLES.get(name, _OTHER)
+        colour, style, marker = METHOD_STYLES.get(name, OTHER_STYLE)
         label = f"{NAMES.get(name, name)}: {_said(estimate, off[name][1])}; stalks: {times} times that"
         handles.append(
             Line2D([], [], color=colour, linestyle=style, linewidth=1.2, marker=marker, markersize=5, label=label)
@@ -83,56 +75,6 @@ def rig_figure(
     figure.legend(handles=handles, loc="outside lower center", ncols=1, frameon=False, fontsize=9)
     figure.suptitle(wrapped(heading, 110), fontsize=10)
     return figure
-
-
-def frames_sweep(results: Sweep, heading: str) -> Figure:
-    """fig:comparison-to-8-point: mean E_3D over the repeats against M, with bands of one standard deviation, cut at
-    ``CLIP`` mm."""
-    figure = Figure(figsize=(6.4, 4.4), layout="constrained")
-    axes = figure.subplots()
-    for name, by_frames in results.items():
-        colour, style, marker = _STYLES.get(name, _OTHER)
-        frames = sorted(by_frames)
-        mean, deviation, _ = np.array([_statistics(by_frames[m]) for m in frames]).T
-        low, high = (np.clip(np.nan_to_num(mean + s * deviation, nan=np.inf, posinf=np.inf), 0, CLIP) for s in (-1, 1))
-        axes.fill_between(frames, low, high, color=colour, alpha=0.2 if name in _BANDS else 0.08, linewidth=0)
-        axes.plot(
-            frames, np.minimum(mean, CLIP), color=colour, linestyle=style, marker=marker, markersize=5,
-            markeredgecolor="white", markeredgewidth=0.6, linewidth=1.8, label=NAMES.get(name, name),
-            zorder=4 if name == "weight" else 3,
-        )  # fmt: skip
-    ticks = sorted({m for by_frames in results.values() for m in by_frames})
-    axes.set(xlabel="frames M", ylabel=f"$E_{{3D}}$, mm (cut at {CLIP:.0f})", xticks=ticks, ylim=(0, CLIP * 1.02))
-    axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
-    axes.set_axisbelow(True)
-    axes.spines[["top", "right"]].set_visible(False)
-    axes.set_title(wrapped(heading, 75), fontsize=10)
-    figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
-    return figure
-
-
-def sweep_table(results: Sweep) -> str:
-    """The sweep in Markdown: M x method, mean ± deviation (median) of E_3D, mm; a dash where a repeat failed."""
-    rows = []
-    for frames in sorted({m for by_frames in results.values() for m in by_frames}):
-        cells = [_cell(by_frames.get(frames, ())) for by_frames in results.values()]
-        rows.append([str(frames), *cells])
-    return markdown(["M", *(NAMES.get(name, name) for name in results)], rows)
-
-
-def _cell(values: Sequence[float]) -> str:
-    mean, deviation, median = (NONE if not np.isfinite(x) else f"{x:.1f}" for x in _statistics(values))
-    return NONE if not len(values) else f"{mean} ± {deviation} ({median})"
-
-
-def _statistics(values: Sequence[float]) -> tuple[float, float, float]:
-    """Mean, deviation (of a sample; NaN where there is none) and median."""
-    array = np.array(values, dtype=np.float64)
-    if not len(array):
-        return np.nan, np.nan, np.nan
-    finite = bool(np.isfinite(array).all())
-    deviation = float(array.std(ddof=1)) if finite and len(array) > 1 else 0.0 if finite else np.nan
-    return float(array.mean()), deviation, float(np.median(array))
 
 
 def _axes_of(cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
