@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from ghpt.recording import RelativePoseEstimate
 from ghpt.report.evaluate import write_metrics
-from ghpt.report.pair_evaluate import ALONE, ERRORS, NAMES, evaluate_pairs
+from ghpt.report.pair_evaluate import ALONE, ERRORS, NAMES, errors_of_pair, evaluate_pairs
 from pair_report import content, moved, rig, written
 
 RIGS = [rig(9), rig(11)]
@@ -159,3 +159,11 @@ def test_chunks_do_not_matter(tmp_path, monkeypatch):
     for name, numbers in again["selections"].items():
         for error in ERRORS:
             assert numbers[error] == pytest.approx(whole["selections"][name][error], rel=1e-9)
+
+
+def test_errors_of_a_pair_are_those_of_its_draws(tmp_path):
+    opened = written(tmp_path, RIGS, content(RIGS, draws=4))
+    errors, metrics = errors_of_pair(opened, (1, 2), "E_3D"), evaluate_pairs(opened)
+    for name, values in errors.items():
+        assert len(values) == 8
+        assert np.median(values) == metrics["selections"][name]["pairs"]["2-3"]["E_3D"]

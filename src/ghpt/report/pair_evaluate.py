@@ -92,6 +92,14 @@ def pair_errors(predictions: PairPredictions, chunk: PairChunk, name: str) -> di
     return {key: torch.where(estimate.estimated, value, torch.inf) for key, value in errors.items()}
 
 
+def errors_of_pair(predictions: PairPredictions, pair: tuple[int, int], error: str) -> dict[str, list[float]]:
+    """One of ``ERRORS`` on a pair of views (from 0) in each draw, by name, in the file's order; inf where a draw was
+    not estimated. A sweep over the number of frames plots these."""
+    errors, pairs, _ = _all_errors(predictions, list(predictions.names))
+    rows = (pairs == pair).all(-1)
+    return {name: values[error][rows].tolist() for name, values in errors.items()}
+
+
 def camera_after(
     reference: Cameras, R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"]
 ) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"]]:
