@@ -13,7 +13,7 @@ from rich.table import Table
 from ghpt.files import atomic_write
 from ghpt.models.selection import SELECTIONS
 from ghpt.report.pair_evaluate import ALONE, ERRORS
-from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_DISSECTION
+from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
 from ghpt.report.tables import NONE, Rows, markdown, title, trained_on
 
 NAMES = {
@@ -51,9 +51,11 @@ def pair_order(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def of_paper(metrics: Mapping[str, Any], table: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
-    """A table of the paper by pair name; empty unless the run is one on Human3.6M's test split, trained there."""
+    """A table of the paper by pair name; empty unless the run is one on Human3.6M's test split, trained there, with as
+    many frames."""
     here = (trained_on(metrics)[0], metrics["data"], metrics["split"]) == ("h36m", "h36m", "test")
-    return {f"{a}-{b}": errors for (a, b), errors in table.items()} if here and len(metrics["cameras"]) == 4 else {}
+    alike = (len(metrics["cameras"]), metrics["frames"]) == (4, FUNDAMENTAL_FRAMES)
+    return {f"{a}-{b}": errors for (a, b), errors in table.items()} if here and alike else {}
 
 
 def pair_rows(metrics: Mapping[str, Any], name: str) -> Rows:
