@@ -18,7 +18,7 @@ from ghpt.calibration.millimetres import check_scale, in_millimetres, of_scale
 from ghpt.calibration.rig import RigEstimate
 from ghpt.config import build, check_type, suggest
 from ghpt.data.camera_files import CameraFile, read_cameras
-from ghpt.data.key_points import read_key_points
+from ghpt.data.key_points import KeyPoints, read_key_points
 from ghpt.data.store import prepared
 from ghpt.data.views import Views, look_through
 from ghpt.errors import GhptConfigError, GhptDataError, check
@@ -39,7 +39,7 @@ class Scale(TypedDict):
 
     height: float | None
     segments: dict[str, float] | None
-    baseline: list[Any] | None
+    baseline: list[str | int | float] | None
     assumed_height: float
 
 
@@ -149,14 +149,20 @@ def from_files(config: Mapping[str, Any]) -> Case:
         raise GhptConfigError("cameras", "is missing", "Name the file of the intrinsics: cameras=intrinsics.toml")
     points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"])
     views = look_through(points, read_cameras(config["cameras"]), config["match"], config["views"])
-    several = {view: n for view, n in zip(points.views, points.several, strict=True) if n}
-    notes = ()
-    if several:
-        text = "several people in " + ", ".join(f"{n} frames of {view}" for view, n in several.items())
-        text += "; the one tracked best in each view was followed, and must be the same person in all"
-        notes = (Diagnosis("several_people", "warning", tuple(several), text, float(max(several.values()))),)
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
-    return Case(title, str(Path(config["keypoints"]).resolve()), views, "the file's own calibration", notes)
+    return Case(
+        title, str(Path(config["keypoints"]).resolve()), views, "the file's own calibration", people_note(points)
+    )
+
+
+def people_note(points: KeyPoints) -> tuple[Diagnosis, ...]:
+    """A warning where one of several people was followed."""
+    several = {view: n for view, n in zip(points.views, points.several, strict=True) if n}
+    if not several:
+        return ()
+    text = "several people in " + ", ".join(f"{n} frames of {view}" for view, n in several.items())
+    text += "; the one tracked best in each view was followed, and must be the same person in all"
+    return (Diagnosis("several_people", "warning", tuple(several), text, float(max(several.values()))),)
 
 
 def from_data(config: Mapping[str, Any]) -> Case:

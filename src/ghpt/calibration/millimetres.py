@@ -10,14 +10,21 @@ import torch
 
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.rig import RigEstimate
-from ghpt.errors import check
+from ghpt.errors import GhptConfigError, check
 from ghpt.models.scale import BodyHeight, SegmentLengths, body_scale
 
 
 def check_scale(scale: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Raise GhptConfigError for more than one source of scale, or a baseline that is not two cameras and mm."""
+    """Raise GhptConfigError for more than one source of scale, or one that cannot be."""
     given = [key for key in ("height", "segments", "baseline") if scale[key] is not None]
     check(len(given) < 2, "scale", f"has {' and '.join(given)}", "Give one of them.")
+    for key in ("height", "assumed_height"):
+        check(scale[key] is None or scale[key] > 0, f"scale.{key}", f"is {scale[key]}", "Give it in millimetres.")
+    if given == ["segments"]:
+        try:
+            SegmentLengths(scale["segments"])
+        except GhptConfigError as error:
+            raise GhptConfigError("scale.segments", error.problem, error.mend) from error
     if given == ["baseline"]:
         baseline = scale["baseline"]
         mend = f"Give two of {', '.join(names)} and their distance in mm: [{names[0]}, {names[-1]}, 3000]."

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.detections import undistorted
 from ghpt.data.key_points import KeyPoints
-from ghpt.data.skeletons import SKELETONS, joints17
+from ghpt.data.skeletons import joints17
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
@@ -69,25 +69,12 @@ def look_through(
     pairs = matched(points.path, points.views, cameras, match or {}, views)
     at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
     pixels, seen = np.zeros(points.key_points[:, at].shape, np.float32), points.seen[:, at].copy()
-    if points.joints == SKELETONS["mediapipe_33"] and ordered.size is not None:
-        seen &= inside(points.key_points[:, at], seen, ordered.size.numpy())
+    _check_sizes(points.path, points.key_points[:, at], seen, ordered)
     for view in range(len(at)):
         K, lens = ordered.K[view].numpy(), ordered.distortion[view].numpy()
         pixels[:, view], seen[:, view] = undistorted(points.key_points[:, at[view]], seen[:, view], K, lens)
     values = joints17(points.path, points.joints, pixels, points.confidence[:, at], seen)
     return Views(ordered, *values, frame=points.frame, rate_hz=points.rate_hz)
-
-
-def inside(
-    pixels: Float[np.ndarray, "T V K 2"], seen: Bool[np.ndarray, "T V K"], size: Int[np.ndarray, "V 2"]
-) -> Bool[np.ndarray, "T V K"]:
-    """Which points lie in their images. MediaPipe places the joints that it does not see too, beyond the edge.
-
-    All of a view's points count as inside where more than a quarter do not: then the image has another size.
-    """
-    within = ((pixels >= -0.5) & (pixels <= size[:, None] - 0.5)).all(-1)
-    outside = (seen & ~within).sum((0, 2)) / seen.sum((0, 2)).clip(1)
-    return within | (outside > _MOST_OUTSIDE)[:, None]
 
 
 def matched(
@@ -136,3 +123,19 @@ def _names(cameras: CameraFile) -> list[tuple[str, ...]]:
 def _unmatched(where: str, views: Sequence[str], cameras: CameraFile, problem: str) -> GhptDataError:
     sides = f"views: {', '.join(views)}; cameras of {cameras.path}: {', '.join('/'.join(n) for n in _names(cameras))}"
     return GhptDataError(where, "views", f"{problem} ({sides})", _MEND)
+
+
+def _check_sizes(where: str, pixels: np.ndarray, seen: np.ndarray, cameras: CameraFile) -> None:
+    """Detectors place some joints beyond the image's edge; many there are those of an image of another size."""
+    if cameras.size is None:
+        return
+    size = cameras.size.numpy()
+    outside = seen & ((pixels < -0.5) | (pixels > size[:, None] - 0.5)).any(-1)
+    share = outside.sum((0, 2)) / seen.sum((0, 2)).clip(1)
+    for view in np.flatnonzero(share > _MOST_OUTSIDE):
+        width, height = size[view]
+        reach = pixels[:, view][seen[:, view]].max(0)
+        image = f"its image of {width} x {height}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
+        problem = f"{share[view]:.0%} of the key points lie outside {image}"
+        mend = "Give the intrinsics of the resolution that the key points were detected in."
+        raise GhptDataError(where, f"view {cameras.names[view]}", problem, mend)

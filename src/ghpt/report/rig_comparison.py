@@ -109,8 +109,9 @@ def held_out_errors(recording: Recording, estimator: Baseline) -> tuple[Float[Te
         points, estimated = triangulate_recording(recording, estimator, without=view)
         one = recording.cameras.index(slice(view, view + 1))
         error = reprojection_error(one, key_points[:, view : view + 1], points)[:, 0]
-        errors.append(torch.where(torch.isfinite(error), error, 0.0))
-        measured.append(estimated & torch.from_numpy(recording.seen[:, view]) & torch.isfinite(error))
+        counted = estimated & torch.from_numpy(recording.seen[:, view]) & torch.isfinite(error)
+        errors.append(torch.where(counted, error, 0.0))
+        measured.append(counted)
     return torch.stack(errors, dim=1), torch.stack(measured, dim=1)
 
 

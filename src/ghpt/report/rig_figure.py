@@ -45,6 +45,8 @@ def rig_figure(
     people = (upright.points(points) / 1000).numpy()
     far = torch.cat([c.centre for c in (shown, other) if c is not None]) / 1000
     length = 0.07 * float((far - far.mean(0)).norm(dim=-1).max().clamp(min=0.1)) * 2
+    deviation = float(spread.diagonal(dim1=-2, dim2=-1).max().clamp(min=0).sqrt())
+    magnified = next((m for m in (1, 10, 100) if _DEVIATIONS * deviation * m > 0.15 * length), 100)
     for axes, (view, (i, j)) in zip(panels, _PANELS, strict=True):
         _people(axes, people[..., [i, j]], estimated.numpy())
         if other is not None:
@@ -52,7 +54,7 @@ def rig_figure(
         _frustums(axes, shown, length, (i, j), ESTIMATED, "-")
         centre = (shown.centre / 1000).numpy()[:, [i, j]]
         for v, name in enumerate(names):
-            _ellipse(axes, centre[v], spread[v][[i, j]][:, [i, j]].numpy())
+            _ellipse(axes, centre[v], spread[v][[i, j]][:, [i, j]].numpy(), magnified)
             axes.annotate(name, centre[v], xytext=(5, 5), textcoords="offset points", fontsize=8)
         axes.set(xlabel="xyz"[i] + ", m", ylabel="xyz"[j] + ", m", aspect="equal")
         axes.set_title(view, fontsize=10)
@@ -60,7 +62,10 @@ def rig_figure(
         axes.set_axisbelow(True)
         axes.margins(0.12)
         axes.spines[["top", "right"]].set_visible(False)
-    handles = [Line2D([], [], color=ESTIMATED, label=f"calibrated; ellipse {_DEVIATIONS:g} standard deviations")]
+    times = f", {magnified} x" if magnified > 1 else ""
+    handles = [
+        Line2D([], [], color=ESTIMATED, label=f"calibrated; ellipse: {_DEVIATIONS:g} standard deviations{times}")
+    ]
     if other is not None:
         handles.append(Line2D([], [], color=REFERENCE, linestyle="--", label=reference_name))
     handles.append(Line2D([], [], color=PEOPLE, marker=".", label="people"))
@@ -82,9 +87,9 @@ def _frustums(axes: Axes, cameras: Cameras, length: float, plane: tuple[int, int
     axes.plot(*tops[:, 0].T, "o", color=colour, markersize=3)
 
 
-def _ellipse(axes: Axes, centre: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"]) -> None:
+def _ellipse(axes: Axes, centre: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"], magnified: int) -> None:
     values, vectors = np.linalg.eigh(covariance)
-    width, height = 2 * _DEVIATIONS * np.sqrt(values.clip(0))[::-1]
+    width, height = 2 * magnified * _DEVIATIONS * np.sqrt(values.clip(0))[::-1]
     angle = np.degrees(np.arctan2(*vectors[::-1, 1]))
     axes.add_patch(Ellipse(tuple(centre), width, height, angle=angle, color=ESTIMATED, alpha=0.25, linewidth=0))
 

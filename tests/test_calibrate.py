@@ -1,0 +1,244 @@
+"""calibrate.py as a user meets it: what it writes and says, with and without a scale, and how it fails."""
+
+import json
+import logging
+import os
+import re
+import sys
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from ghpt.app import run
+from ghpt.calibrate import calibrate, people_note, summary
+from ghpt.calibration.diagnosis import Diagnosis
+from ghpt.data.camera_files import read_cameras
+from ghpt.data.camera_writers import write_pose2sim
+from ghpt.data.embedded import motion
+from ghpt.data.key_points import KeyPoints, write_key_points
+from ghpt.data.lens import distort
+from ghpt.data.rigs import human36m_rig
+from ghpt.geometry.cameras import Cameras, project
+from ghpt.report.rig_comparison import rig_difference
+from ghpt.skeleton import JOINT, JOINTS
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTPUTS = {
+    "calibration.json", "report.md", "rig.png", "rig.svg", "rig.toml", "rig_anipose.toml", "intri.yml", "extri.yml",
+    "poses.npz",
+}  # fmt: skip
+
+
+@pytest.fixture
+def command(monkeypatch, capfd):
+    """``command(*words)`` runs calibrate.py in this process: (exit status, stdout, stderr)."""
+    handlers, level = list(logging.root.handlers), logging.root.level
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+    monkeypatch.setenv("COLUMNS", "120")
+
+    def call(*words):
+        os.environ["HYDRA_FULL_ERROR"] = "0"
+        monkeypatch.setattr(sys, "argv", ["calibrate.py", *map(str, words)])
+        status = 0
+        capfd.readouterr()
+        try:
+            run(ROOT / "conf", "calibrate", calibrate, summary)
+        except SystemExit as stop:
+            status = stop.code
+            if isinstance(status, str):
+                print(status, file=sys.stderr)
+                status = 1
+        finally:
+            for handler in set(logging.root.handlers) - set(handlers):
+                handler.close()
+            logging.root.handlers[:] = handlers
+            logging.root.setLevel(level)
+        return (status, *capfd.readouterr())
+
+    return call
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A walking person before Human3.6M's cameras, through their lenses, with 2 px of noise; the truth with it."""
+    rig = human36m_rig("S9")
+    truth = motion(0, "S9", "S9/Walking-1", "Walking", 400, 50.0)[::5]
+    pixels, _ = project(rig.cameras, torch.from_numpy(truth).double())
+    seen_by_lens = distort(pixels.transpose(0, 1).flatten(1, 2), rig.cameras.K, rig.distortion)
+    values = seen_by_lens.unflatten(1, truth.shape[:2]).transpose(0, 1).numpy()
+    values = values + np.random.default_rng(0).normal(0, 2, values.shape)
+    shape = values.shape[:-1]
+    points = KeyPoints("", tuple(f"cam{i}_json" for i in range(4)), JOINTS, np.arange(len(truth)), values,
+                       np.ones(shape), np.ones(shape, bool), 10.0, (0,) * 4)  # fmt: skip
+    return replace(rig, names=tuple(f"cam_{i:02d}" for i in range(len(rig)))), points, truth
+
+
+def write(folder, scene, extrinsics: bool = True):
+    rig, points, _ = scene
+    if not extrinsics:
+        same = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
+        rig = replace(rig, cameras=Cameras(rig.cameras.K, *same))
+    write_pose2sim(folder / "cameras.toml", rig, {})
+    write_key_points(folder / "points.npz", points)
+    return f"keypoints={folder / 'points.npz'}", f"cameras={folder / 'cameras.toml'}", f"output={folder / 'rig'}"
+
+
+def test_intrinsics_and_a_height_give_the_rig_in_every_format(command, scene, tmp_path):
+    rig, _, truth = scene
+    thigh = float(np.median(np.linalg.norm(truth[:, JOINT["left_hip"]] - truth[:, JOINT["left_knee"]], axis=-1)))
+    status, said, errors = command(*write(tmp_path, scene, extrinsics=False), f"scale.segments={{left_thigh: {thigh}}}")
+    assert status == 0, errors
+    output = tmp_path / "rig"
+    assert {file.name for file in output.iterdir()} >= OUTPUTS
+    found = read_cameras(output / "rig.toml")
+    apart = rig_difference(found.cameras, rig.cameras)
+    assert float(apart.rotation_deg.max()) < 0.3
+    assert float(apart.centre_mm.max()) < 30
+    assert apart.scale == pytest.approx(1, abs=0.01)
+    for name in ("rig_anipose.toml", "intri.yml"):
+        same = read_cameras(output / name)
+        assert same.names == found.names
+        torch.testing.assert_close(same.R, found.R, rtol=0, atol=1e-9)
+        torch.testing.assert_close(same.t, found.t, rtol=1e-12, atol=1e-9)
+        torch.testing.assert_close(same.distortion, rig.distortion, rtol=0, atol=0)
+    numbers = json.loads((output / "calibration.json").read_text())
+    assert numbers["reference"] is None
+    assert numbers["difference"] is None
+    assert numbers["scale"]["from"] == "segments"
+    assert 1 < numbers["explains"]["estimated"]["held_out"]["median"] < 5
+    assert "scale" in tomllib.loads((output / "rig.toml").read_text())["metadata"]
+    assert "cam_00" in said
+    # z is up and the floor at 0
+    with np.load(output / "poses.npz") as poses:
+        points = poses["points"]
+        assert poses["joints"].tolist() == list(JOINTS)
+        assert np.isfinite(points).all()
+        assert np.nanmedian(points[:, JOINT["head_top"], 2]) > 1200
+        assert abs(np.nanmedian(points[:, [0, 5], 2].min(1))) < 150
+    limb = np.linalg.norm(points[:, JOINT["left_hip"]] - points[:, JOINT["left_knee"]], axis=-1)
+    assert np.median(limb) == pytest.approx(thigh, rel=0.02)
+    image = cv2.imread(str(output / "rig.png"))
+    assert image.shape[0] > 500
+
+
+def test_extrinsics_in_the_file_are_compared_with_and_not_used(command, scene, tmp_path):
+    rig, _, _ = scene
+    write(tmp_path, scene)
+    words = write(tmp_path, scene)
+    status, said, errors = command(*words, "scale.baseline=[cam_00,cam_03,3000]")
+    assert status == 0, errors
+    numbers = json.loads((tmp_path / "rig" / "calibration.json").read_text())
+    assert numbers["reference"] == "the file's own calibration"
+    assert max(numbers["difference"]["rotation_deg"].values()) < 0.3
+    true = float((rig.cameras.centre[0] - rig.cameras.centre[3]).norm())
+    assert numbers["difference"]["scale"] == pytest.approx(true / 3000, rel=0.02)
+    centre = np.array([camera["centre_mm"] for camera in numbers["cameras"]])
+    assert np.linalg.norm(centre[0] - centre[3]) == pytest.approx(3000, rel=1e-6)
+    ours, own = (numbers["explains"][n]["held_out"] for n in ("estimated", "the file's own calibration"))
+    assert ours["count"] == own["count"] > 0
+    assert ours["median"] < 1.1 * own["median"]
+    # the same key points with no extrinsics in the file: the same rig, but for the world
+    other = tmp_path / "other"
+    other.mkdir()
+    assert command(*write(other, scene, extrinsics=False), "scale.baseline=[cam_00,cam_03,3000]")[0] == 0
+    apart = rig_difference(*(read_cameras(folder / "rig" / "rig.toml").cameras for folder in (tmp_path, other)))
+    assert float(apart.rotation_deg.max()) < 1e-5
+    assert float(apart.centre_mm.max()) < 1e-3
+    assert "Δ turn" in said
+
+
+def test_an_assumed_scale_is_said_everywhere(command, scene, tmp_path):
+    status, said, _ = command(*write(tmp_path, scene))
+    assert status == 0
+    assert "warning: Scale assumed" in said
+    for file in ("report.md", "rig.toml", "rig_anipose.toml", "calibration.json"):
+        assert "assumed" in (tmp_path / "rig" / file).read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["cameras=null"], "cameras: is missing"),
+        (["keypoints=nowhere"], "nowhere: : |there is no such file"),
+        (["cameras=nowhere.toml"], "there is no such file"),
+        (["scale.height=1750", "scale.baseline=[cam_00,cam_03,3000]"], "scale: has height and baseline"),
+        (["scale.baseline=[cam_00,cam_00,3000]"], "scale.baseline: is"),
+        (["scale.baseline=[cam_00,front,3000]"], "Give two of cam_00"),
+        (["scale.segments={tail: 30}"], r"scale\.segments: names 'tail', which is no part of the body"),
+        (["scale.height=-3"], r"scale\.height: is -3"),
+        (["triangulation=guess"], "triangulation: is 'guess'"),
+        (["views=[cam_00,cam_07]"], "there is no view cam_07"),
+        (["views=[cam_00]"], "triangulation needs at least two|fewer than two|1 given"),
+        (["skeleton=body_25"], "body_25 has 25 joints and the key points have 17"),
+        (["evaluated_frames=0"], "evaluated_frames"),
+    ],
+)  # fmt: skip
+def test_bad_input_ends_in_one_line(words, says, command, scene, tmp_path):
+    status, _, errors = command(*write(tmp_path, scene), *words)
+    assert status == 1
+    line = errors.strip().splitlines()[-1]
+    assert line.startswith("error: ")
+    assert re.search(says, line), line
+    assert not any((tmp_path / "rig" / name).exists() for name in OUTPUTS)
+
+
+def test_a_camera_that_an_error_concerns_is_in_no_file(command, scene, tmp_path):
+    """Its key points are another person's: noise."""
+    rig, points, _ = scene
+    values = points.key_points.copy()
+    values[:, 2] = np.random.default_rng(1).uniform(100, 900, values[:, 2].shape)
+    write(tmp_path, scene)
+    assert command(*write(tmp_path, scene))[0] == 0  # an earlier run, whose files must not survive
+    status, _, errors = command(*write(tmp_path, (rig, replace(points, key_points=values), None)))
+    assert status == 1
+    assert "only cam_00, cam_01, cam_03 are in the rig's files" in errors
+    for name in ("rig.toml", "rig_anipose.toml", "intri.yml"):
+        assert read_cameras(tmp_path / "rig" / name).names == ("cam_00", "cam_01", "cam_03")
+    numbers = json.loads((tmp_path / "rig" / "calibration.json").read_text())
+    assert [camera["calibrated"] for camera in numbers["cameras"]] == [True, True, False, True]
+    assert numbers["cameras"][2]["R"] is None
+
+
+def test_without_a_usable_rig_there_is_none(command, scene, tmp_path):
+    rig, points, _ = scene
+    noise = np.random.default_rng(1).uniform(100, 900, points.key_points.shape)
+    assert command(*write(tmp_path, scene))[0] == 0
+    status, said, errors = command(*write(tmp_path, (rig, replace(points, key_points=noise), None)))
+    assert status == 1
+    assert "no rig is written" in errors
+    left = {file.name for file in (tmp_path / "rig").iterdir()} & OUTPUTS
+    assert left == {"calibration.json", "report.md"}
+    assert "error" in said
+
+
+def test_the_followed_person_is_mentioned(scene):
+    points = replace(scene[1], views=("a", "b", "c", "d"), several=(3, 0, 0, 0))
+    (note,) = people_note(points)
+    assert isinstance(note, Diagnosis)
+    assert "3 frames of a;" in note.text
+    assert people_note(replace(points, several=(0,) * 4)) == ()
+
+
+def test_the_real_recording_is_explained_better_than_by_its_own_calibration(command, shared_data, tmp_path):
+    folder, better = shared_data / "pose2sim_single", 0.7
+    status, _, errors = command(f"keypoints={folder / 'pose'}", f"cameras={folder / 'Calib_qualisys.toml'}",
+                                f"output={tmp_path / 'rig'}", "scale.height=1750")  # fmt: skip
+    assert status == 0, errors
+    numbers = json.loads((tmp_path / "rig" / "calibration.json").read_text())
+    ours, own = (numbers["explains"][n]["held_out"] for n in ("estimated", "the file's own calibration"))
+    assert ours["median"] < better * own["median"]
+    assert ours["p90"] < better * own["p90"]
+    assert max(numbers["difference"]["rotation_deg"].values()) < 2
+    assert max(numbers["difference"]["centre_mm"].values()) < 80
+
+
+def test_the_seated_person_is_said_not_to_do(command, shared_data, tmp_path):
+    folder = shared_data / "caliscope"
+    _, said, _ = command(f"keypoints={folder / 'xy_HOLISTIC.csv'}", f"cameras={folder / 'camera_array.toml'}",
+                         f"output={tmp_path / 'rig'}")  # fmt: skip
+    assert "too little" in said
