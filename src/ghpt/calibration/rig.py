@@ -10,7 +10,8 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from ghpt.calibration.bundle import Adjusted, BundleAdjustment
-from ghpt.calibration.diagnosis import Case, Diagnosis, Diagnostics, of_stature
+from ghpt.calibration.diagnosis import Case, Diagnosis, of_stature
+from ghpt.calibration.diagnostics import Diagnostics
 from ghpt.calibration.observations import Observations, check_positive, choose_frames, observe, reweighted, usable
 from ghpt.calibration.pairs import PairEstimation, PairTable
 from ghpt.calibration.resection import Resection, Rig
@@ -123,7 +124,9 @@ class RigCalibration:
         adjusted = None
         if rig is not None:
             seen_by, adjusted = self.refine(seen_by, table, rig, seed)
-        case = Case(tuple(names), K, key_points, mask, sizes, frames, seen_by, table, adjusted, self.resection, seed)
+        case = Case(
+            tuple(names), K, key_points, mask, sizes, frames, seen_by, table, adjusted, self.resection, self.noise, seed
+        )
         return self._estimate(case)
 
     def begin(self, seen_by: Observations, table: PairTable, seed: int) -> Rig | None:

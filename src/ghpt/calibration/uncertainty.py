@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghpt.calibration.normal_matrix import Linearised
+from ghpt.calibration.normal_matrix import BEHIND, Linearised
 from ghpt.calibration.observations import Observations
 from ghpt.calibration.resection import Rig
 from ghpt.geometry.epipolar import cross_matrix
@@ -62,7 +62,7 @@ def uncertainty(seen_by: Observations, rig: Rig, state: Linearised, blocks: int)
     scores = torch.zeros(count, len(own), dtype=torch.float64).index_add(0, block, state.scores[:, own]) @ basis
     scores = scores - scores.mean(0)
     scatter = float((scores @ inverse * scores).sum()) / len(values) * count / max(count - 1, 1)
-    error = seen_by.error(rig.R, rig.t, rig.points)[rig.inlier]
+    error = seen_by.error(rig.R, rig.t, rig.points)[rig.inlier].clamp(max=BEHIND)
     weight = 1 / (1 + (error / state.scale) ** 2)
     freedom = 2 * len(error) - 3 * int(rig.inlier.any(0).sum()) - len(values)
     model = float((weight * error).square().sum()) / max(freedom, 1) / float(weight.mean())
