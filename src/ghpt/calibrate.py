@@ -25,6 +25,7 @@ from ghpt.errors import GhptConfigError, GhptDataError, check
 from ghpt.files import sweep_temporaries
 from ghpt.geometry.cameras import Cameras
 from ghpt.provenance import provenance
+from ghpt.recording import Recording
 from ghpt.report.calibration import differences, explains, print_calibration
 from ghpt.report.rig_comparison import Similarity, align, triangulate_recording, upright
 from ghpt.report.rig_files import RIG_FILES, camera_numbers, write_numbers, write_poses, write_rig, write_rig_figure
@@ -99,14 +100,12 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
         torch.from_numpy(views.confidence).double(), torch.from_numpy(views.seen), cameras.size, config["seed"],
     )  # fmt: skip
     estimate, scale = in_millimetres(estimate, config["scale"])
-    usable = usable_cameras(estimate)
-    chosen = torch.nonzero(usable)[:, 0].tolist()
-    world, gauge = _gauge(estimate, usable, cameras.cameras, case.reference)
+    placed = torch.nonzero(estimate.calibrated)[:, 0].tolist() if int(estimate.calibrated.sum()) >= 2 else []
+    chosen = torch.nonzero(usable_cameras(estimate))[:, 0].tolist()
+    world, gauge = _gauge(estimate, placed, cameras.cameras, case.reference)
     moved = gauge.cameras(estimate.cameras)
     rigs = {"estimated": moved} | ({case.reference: cameras.cameras} if cameras.cameras is not None else {})
-    seen_by = {
-        name: views.part(chosen).recording(case.title, rig.index(chosen)) for name, rig in rigs.items() if chosen
-    }
+    seen_by = {name: _through(case, placed, rig) for name, rig in rigs.items() if placed}
     numbers = {
         "data": case.title, "source": case.source, "cameras_file": cameras.path, "frames": len(views),
         "seed": config["seed"], "scale": scale, "world": world, "reference": case.reference if len(rigs) > 1 else None,
@@ -120,15 +119,16 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     }  # fmt: skip
     points, estimated = gauge.points(estimate.points), estimate.estimated
     if chosen:
-        points, estimated = triangulate_recording(seen_by["estimated"], estimator)
+        recording = _through(case, chosen, moved)
+        points, estimated = triangulate_recording(recording, estimator)
         write_rig(output, cameras.select(chosen), moved.index(chosen), numbers)
-        write_poses(output / "poses.npz", seen_by["estimated"], points, estimated, numbers)
-    reference = (case.reference, cameras.cameras) if chosen and cameras.cameras is not None else None
+        write_poses(output / "poses.npz", recording, points, estimated, numbers)
+    reference = (case.reference, cameras.cameras) if cameras.cameras is not None else None
     covariance = gauge.covariance(estimate.covariance)
     write_rig_figure(output, numbers, moved, covariance, points, estimated, estimate.calibrated, reference)
     write_numbers(output, numbers)
     print_calibration(numbers)
-    _log.info("Report: %s, beside it the rig's files.", shown(output / "report.md"))
+    _log.info("Report: %s, beside it the figure%s.", shown(output / "report.md"), " and the rig" * bool(chosen))
     errors = [d["text"] for d in numbers["diagnoses"] if d["severity"] == "error"]
     if errors:
         written = f"only {', '.join(numbers['usable'])} are in the rig's files" if chosen else "no rig is written"
@@ -195,12 +195,13 @@ def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
     return usable if int(usable.sum()) >= 2 else torch.zeros_like(usable)
 
 
-def _gauge(
-    estimate: RigEstimate, usable: Bool[Tensor, " V"], reference: Cameras | None, name: str
-) -> tuple[str, Similarity]:
+def _gauge(estimate: RigEstimate, placed: list[int], reference: Cameras | None, name: str) -> tuple[str, Similarity]:
     """The world that the rig is written in, in words, and the way there."""
-    if reference is not None and usable.any():
-        return f"that of {name}", align(estimate.cameras.index(usable), reference.index(usable), rigid=True)
-    first = usable if usable.any() else torch.ones_like(usable)
-    gauge = upright(estimate.points, estimate.estimated, estimate.cameras.index(first))
+    if reference is not None and placed:
+        return f"that of {name}", align(estimate.cameras.index(placed), reference.index(placed), rigid=True)
+    gauge = upright(estimate.points, estimate.estimated, estimate.cameras.index(placed or slice(None)))
     return "z along the people's upright, x where the first camera looks, the floor at their lowest ankles", gauge
+
+
+def _through(case: Case, views: list[int], cameras: Cameras) -> Recording:
+    return case.views.part(views).recording(case.title, cameras.index(views))

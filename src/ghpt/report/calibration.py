@@ -171,5 +171,5 @@ def _known(values: Float[Tensor, " N"], known: Bool[Tensor, " N"]) -> Sequence[f
     return [v if k else None for v, k in zip(values.tolist(), known.tolist(), strict=True)]
 
 
-def _number(value: float | None, digits: int, factor: float = 1) -> str:
+def _number(value: float | None, digits: int, factor: int = 1) -> str:
     return NONE if value is None else f"{factor * value:.{digits}f}"
