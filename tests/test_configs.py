@@ -26,18 +26,15 @@ def compose(name: str, *overrides: str) -> dict[str, Any]:
 
 def test_the_groups_hold_the_issue_s_choices():
     assert {"cmu1", "cmu2", "cmu3", "cmu4", "h36m"} <= set(choices("data"))
-    assert choices("model") == ["pose"]
+    assert choices("model") == ["camera", "pose"]
     assert choices("experiment") == ["coordinates_only", "lengths_only", "no_gumbel", "selection_stochastic"]
 
 
 @pytest.mark.parametrize("experiment", [None, *choices("experiment")])
-@pytest.mark.parametrize("model", choices("model"))
 @pytest.mark.parametrize("data", choices("data"))
-def test_every_choice_composes_and_builds(data, model, experiment):
+def test_every_choice_composes_and_builds(data, experiment):
     small = ["model.scorer.layers=[2]"]  # only the widths, for the time
-    config = compose(
-        "train", f"data={data}", f"model={model}", *small, *([f"experiment={experiment}"] * bool(experiment))
-    )
+    config = compose("train", f"data={data}", "model=pose", *small, *([f"experiment={experiment}"] * bool(experiment)))
     assert build(config["data"], "data").name == data
     built = build(config["model"], "model")
     assert built.problem.feature_size == {"coordinates_only": 51, "lengths_only": 16}.get(experiment, 67)
@@ -48,11 +45,34 @@ def test_every_choice_composes_and_builds(data, model, experiment):
 
 
 @pytest.mark.parametrize("data", choices("data"))
+def test_the_camera_problem_builds_on_every_arrangement(data):
+    config = compose("train", f"data={data}", "model=camera", "model.scorer.layers=[2]")
+    served = build(config["data"], "data")
+    problem = build(config["model"], "model").problem
+    served.serve(problem)
+    assert served.pairs == problem.pairs
+    assert problem.feature_size == config["model"]["problem"]["features"]
+
+
+def test_the_camera_s_numbers_are_those_of_the_paper_s_table_of_hyperparameters():
+    model = compose("train", "model=camera")["model"]
+    assert model["optimizer"] == {"_target_": "torch.optim.Adam", "_partial_": True, "lr": 1e-4}
+    assert model["temperature"] == 1.2
+    assert [model["loss"][name] for name in ("alpha", "beta", "gamma")] == [1.0, 0.01, 0.0]
+    assert model["scorer"]["layers"] == [1000, 900, 900]
+    assert model["hypotheses"] == 100
+    assert model["problem"]["frames"] == 80
+
+
+@pytest.mark.parametrize("data", choices("data"))
 def test_every_test_configuration_builds(data):
     config = compose("test", f"data={data}")
     assert build(config["data"], "data").name == data
     assert sorted(build(config["baselines"], "baselines")) == [
         "linear", "lo_ransac", "m_estimator", "ransac", "weighted_linear",
+    ]  # fmt: skip
+    assert sorted(build(config["camera_baselines"], "camera_baselines")) == [
+        "eight_point", "poselib", "ransac", "rig", "usac_accurate", "usac_magsac",
     ]  # fmt: skip
 
 

@@ -229,7 +229,7 @@ def test_hypotheses_are_a_batch():
     subsets[:, :10] = False
     subsets[:, :10, 5:13] = True  # minimal
     subsets[:, 20, 7:] = False  # too few
-    E, ok = eight_point_subsets(a, b, subsets)
+    E, ok = eight_point_subsets(a, b, subsets.double())
     R, t, front = poses_in_front(E, a, b, subsets & ok[..., None])
     distances, sampson = ray_distances(R, t, a, b), sampson_error(E, a, b)
     for i in range(2):

@@ -99,10 +99,10 @@ class BatchOrder(Sampler[list[int]]):
             yield order[batch * self.batch_size : (batch + 1) * self.batch_size][self.rank :: self.world].tolist()
 
 
-class FrameLoader(DataLoader[KeyPointBatch]):
+class FrameLoader(DataLoader[Any]):
     """Loads batches in a ``BatchOrder``. It has no state to save, since the order knows where to go on."""
 
-    def __init__(self, frames: Frames, order: BatchOrder, workers: int) -> None:
+    def __init__(self, frames: Dataset[Any], order: BatchOrder, workers: int) -> None:
         pin = torch.cuda.is_available()
         super().__init__(frames, sampler=order, batch_size=None, num_workers=workers, pin_memory=pin)
 

@@ -20,6 +20,8 @@ joints 1e-8 (one sample in thousands falls below the limit and is lost). Key-poi
 3 pixels they too give 1e-5 to 1e-3, so this eigenvalue cannot tell them, and the pose that comes of them means nothing.
 """
 
+_OUTLIER = 3.0
+
 
 def normalise(K: Float[Tensor, "*B 3 3"], pixels: Float[Tensor, "*B N 2"]) -> Float[Tensor, "*B N 2"]:
     """Pixels as normalised image coordinates, float64; K is upper triangular with last row (0, 0, 1)."""
@@ -73,20 +75,42 @@ def eight_point(
 
 
 def eight_point_subsets(
-    a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], subsets: Bool[Tensor, "*B H N"]
+    a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], weights: Float[Tensor, "*B H N"]
 ) -> tuple[Float[Tensor, "*B H 3 3"], Bool[Tensor, "*B H"]]:
-    """``eight_point`` of H subsets of the same points, which must be finite: one product of matrices for all.
+    """``eight_point`` under each of H weightings of the same points, which must be finite: one product of matrices.
 
-    The points are normalised once, by all that are in any subset.
+    The points are normalised once, by all that any weighting uses.
     """
-    anywhere = subsets.any(-2).double()
+    weights = weights.double()
+    anywhere = (weights > 0).any(-2).double()
     (a, Ta), (b, Tb) = _hartley(a.double(), anywhere), _hartley(b.double(), anywhere)
     rows = (homogeneous(b)[..., :, None] * homogeneous(a)[..., None, :]).flatten(-2)
     i, j = torch.triu_indices(9, 9, device=rows.device)
-    normal = torch.empty((*subsets.shape[:-1], 9, 9), dtype=rows.dtype, device=rows.device)
-    normal[..., i, j] = subsets.double() @ (rows[..., i] * rows[..., j])
+    normal = torch.empty((*weights.shape[:-1], 9, 9), dtype=rows.dtype, device=rows.device)
+    normal[..., i, j] = weights @ (rows[..., i] * rows[..., j])
     normal[..., j, i] = normal[..., i, j]
-    return _smallest(normal, subsets.sum(-1), Ta[..., None, :, :], Tb[..., None, :, :])
+    return _smallest(normal, (weights > 0).sum(-1), Ta[..., None, :, :], Tb[..., None, :, :])
+
+
+def robust_weights(
+    E: Float[Tensor, "*B H 3 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B N"]
+) -> Float[Tensor, "*B H N"]:
+    """Weights of (b^T E a)^2 that make it the squared Sampson distance r^2 under Geman and McClure's loss,
+    ``1 / (1 + (r / s)^2)^2`` with s three times the median of r, about four
+    standard deviations of what is no outlier; the
+    largest is 1, of unused points 0."""
+    ha, hb = homogeneous(a), homogeneous(b)
+    residual = E.flatten(-2) @ (hb[..., :, None] * ha[..., None, :]).flatten(-2).mT
+    gradient = (E[..., :2, :].flatten(-3, -2) @ ha.mT).square().unflatten(-2, (-1, 2)).sum(-2)
+    gradient += (E.mT[..., :2, :].flatten(-3, -2) @ hb.mT).square().unflatten(-2, (-1, 2)).sum(-2)
+    tiny = torch.finfo(E.dtype).tiny
+    gradient = gradient.clamp_min(tiny)
+    square = residual.square() / gradient
+    few = slice(None, None, -(-a.shape[-2] // 256))  # a median needs no more
+    some = torch.where(used[..., None, few], square[..., few], torch.nan)
+    scale = (_OUTLIER**2 * some.nanmedian(dim=-1, keepdim=True).values).nan_to_num(1.0).clamp_min(tiny)
+    weights = torch.where(used[..., None, :], 1 / ((1 + square / scale).square() * gradient), 0.0)
+    return weights / weights.amax(dim=-1, keepdim=True).clamp_min(tiny)
 
 
 def _smallest(normal: Tensor, count: Tensor, Ta: Tensor, Tb: Tensor) -> tuple[Tensor, Tensor]:
@@ -112,8 +136,8 @@ def decompose(E: Float[Tensor, "*B 3 3"]) -> tuple[Float[Tensor, "*B 4 3 3"], Fl
 
 
 def depths(
-    R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
-) -> tuple[Float[Tensor, "*B N"], Float[Tensor, "*B N"]]:
+    R: Float[Tensor, "*#B 3 3"], t: Float[Tensor, "*#B 3"], a: Float[Tensor, "*#B N 2"], b: Float[Tensor, "*#B N 2"]
+) -> tuple[Float[Tensor, "*#B N"], Float[Tensor, "*#B N"]]:
     """Depths, in units of t: in a of the point of a's ray nearest to b's, in b of that of b's ray; 0 for parallel rays.
 
     These points are at ``alpha R a`` and ``beta b - t`` in b's axes (all from a's centre).
@@ -129,8 +153,8 @@ def depths(
 
 
 def in_front(
-    R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
-) -> Bool[Tensor, "*B N"]:
+    R: Float[Tensor, "*#B 3 3"], t: Float[Tensor, "*#B 3"], a: Float[Tensor, "*#B N 2"], b: Float[Tensor, "*#B N 2"]
+) -> Bool[Tensor, "*#B N"]:
     """Which points lie in front of both cameras."""
     alpha, beta = depths(R, t, a, b)
     return (alpha > 0) & (beta > 0)

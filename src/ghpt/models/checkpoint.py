@@ -68,8 +68,8 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
 def load_model(path: str | Path, **changes: Any) -> tuple[StochasticEstimator, dict[str, Any]]:
     """The model that a checkpoint describes, with its weights, and what the checkpoint says of itself.
 
-    ``changes`` replace settings of the model (such as ``hypotheses``, or ``problem.frames``); None leaves one. Only classes of ghpt and
-    torch's optimisers can be named by a checkpoint. Raises GhptCheckpointError.
+    ``changes`` replace settings of the model (such as ``hypotheses``, or ``problem.frames``); None leaves one as it is.
+    Only classes of ghpt and torch's optimisers can be named by a checkpoint. Raises GhptCheckpointError.
     """
     checkpoint = read_checkpoint(path)
     ours = checkpoint[FIELD]

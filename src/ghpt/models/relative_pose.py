@@ -22,6 +22,7 @@ from ghpt.geometry.epipolar import (
     normalise,
     poses_in_front,
     ray_distances,
+    robust_weights,
 )
 from ghpt.geometry.rotations import average_rotation
 from ghpt.recording import PairBatch, RelativePoseEstimate
@@ -49,9 +50,11 @@ class RelativePoseHypotheses:
 class RelativePose:
     """Generate, describe, combine and measure relative camera poses.
 
-    ``sample``: T of a hypothesis, as a share of the correspondences that both cameras see (8 at least). ``features``: number of quantiles of the ray distances.
-    ``frames``, ``draws``, ``points``: see ``PairSettings``. ``scale``: what gives t its length. ``largest_error``: mm,
-    no point counts for more (one almost at infinity would drown the pool).
+    ``frames``, ``draws``, ``points``: see ``PairSettings``. ``sample``: T, the correspondences of a hypothesis; at most
+    half of those that both cameras see, but 8 at least. ``refine``: how often all correspondences, weighted by how well
+    the hypothesis explains them, are solved again (0: the paper). ``features``: number of quantiles of the ray
+    distances. ``scale``: what gives t its length. ``largest_error``: mm, no point counts for more (one almost at
+    infinity would drown the pool).
     """
 
     measures = "E_3D"
@@ -61,27 +64,31 @@ class RelativePose:
         frames: int,
         draws: int,
         points: int,
-        sample: float,
+        sample: int,
+        refine: int,
         features: int,
         scale: Callable[[RelativePoseEstimate, PairBatch], Tensor],
         largest_error: float,
     ) -> None:
-        check(0 < sample <= 1, "sample", f"is {sample}", "It is a share: more than 0, at most 1.")
+        check(sample >= MINIMUM, "sample", f"is {sample}", f"The 8-point algorithm needs {MINIMUM}.")
+        check(refine >= 0, "refine", f"is {refine}", "It must be >= 0 (0: the paper).")
         check(features >= 2, "features", f"is {features}", "It must be >= 2.")
         check(largest_error > 0, "largest_error", f"is {largest_error}", "It must be > 0 (mm).")
         self.pairs = PairSettings(frames, draws, points)
-        self.sample, self.feature_size, self.scale = sample, features, scale
+        self.sample, self.refine, self.feature_size, self.scale = sample, refine, features, scale
         self.largest_error = largest_error
 
     @torch.no_grad()
     def generate(self, batch: PairBatch, count: int, keys: Int[Tensor, " B"]) -> RelativePoseHypotheses:
-        """The normalised 8-point algorithm on T random correspondences.
+        """The normalised 8-point algorithm on T random correspondences, then ``refine`` times on all, reweighted.
 
         Where they are degenerate or no pose has most points in front, all correspondences stand in for them.
         """
         a, b, both = batch.correspondences()
         subsets = torch.cat((random_subsets(both, count, self.sample, keys), both[:, None]), dim=1)
-        E, determined = eight_point_subsets(a, b, subsets)
+        E, determined = eight_point_subsets(a, b, subsets.double())
+        for _ in range(self.refine):
+            E, determined = eight_point_subsets(a, b, robust_weights(E, a, b, both) * determined[..., None])
         some = slice(None, None, -(-a.shape[1] // CHEIRALITY))
         R, t, ok = poses_in_front(E, a[:, some], b[:, some], both[:, None, some] & determined[..., None])
         R = torch.where(ok[..., None, None], R, R[:, -1:])[:, :-1]
@@ -140,12 +147,10 @@ class RelativePose:
         return error, measured & (estimate.estimated.flatten(1).all(-1) if extra else estimate.estimated)
 
 
-def random_subsets(
-    both: Bool[Tensor, "B N"], count: int, share: float, keys: Int[Tensor, " B"]
-) -> Bool[Tensor, "B H N"]:
-    """For each hypothesis a random ``share`` of the usable correspondences, 8 at least (all where there are fewer)."""
+def random_subsets(both: Bool[Tensor, "B N"], count: int, size: int, keys: Int[Tensor, " B"]) -> Bool[Tensor, "B H N"]:
+    """For each hypothesis ``size`` random usable correspondences: at most half of them, 8 at least, all if fewer."""
     number = both.shape[-1]
-    size = (both.sum(-1) * share).ceil().clamp_min(MINIMUM).clamp_max(number)
+    size = (both.sum(-1) // 2).clamp(MINIMUM, max(size, MINIMUM)).clamp_max(number)
     # a hash of 64 bits makes two numbers to order the correspondences by
     order = randomness.bits(keys, (count, -(-number // 2))).view(torch.int32)[..., :number]
     order = torch.where(both[:, None], order, torch.iinfo(torch.int32).max)
