@@ -10,6 +10,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from damage import damage
 from ghpt.data.camera_files import read_cameras
 from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.data.rigs import Rig, human36m_rig, panoptic_rig
@@ -251,3 +252,9 @@ def test_json_with_a_strange_camera_is_named(tmp_path):
     path.write_text(json.dumps({"cameras": cameras}))
     with pytest.raises(GhptDataError, match="camera 00_01, matrix: is not 9 finite numbers"):
         read_cameras(path)
+
+
+@pytest.mark.parametrize(("form", "file"), [("pose2sim", "rig.toml"), ("opencv", "intri.yml"), ("opencv", "extri.yml")])
+def test_a_damaged_file_is_read_or_named(form, file, tmp_path):
+    path = written(form, tmp_path, many(2))
+    damage(tmp_path / file, lambda _: read_cameras(path), 150)

@@ -1,11 +1,13 @@
 """Our own npz, the matching of views to cameras by name, and what stands between a detector and a calibration."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+from damage import damage
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.key_points import KeyPoints, read_key_points, write_key_points
 from ghpt.data.lens import distort
@@ -157,3 +159,19 @@ def test_the_lens_is_undone_before_means_are_taken():
     np.testing.assert_allclose(views.key_points[0, :, 8], mean, atol=1e-3)
     assert views.seen.all()
     assert views.recording("x", scene.cameras.index(0)).truth_seen.sum() == 0
+
+
+def test_a_damaged_npz_is_read_or_named(tmp_path):
+    """Whatever byte is lost, and wherever the file ends."""
+    path = tmp_path / "p.npz"
+    write_key_points(path, key_points(frames=2))
+    damage(path, read_key_points, 150)
+
+
+def test_a_damaged_json_is_read_or_named(tmp_path):
+    body = np.concatenate([np.random.default_rng(0).uniform(0, 400, (25, 2)), np.full((25, 1), 0.5)], -1)
+    for view in ("a", "b"):
+        (tmp_path / view).mkdir()
+        content = {"people": [{"pose_keypoints_2d": body.ravel().tolist()}]}
+        (tmp_path / view / "x_000000000001.json").write_text(json.dumps(content))
+    damage(tmp_path / "a" / "x_000000000001.json", lambda _: read_key_points(tmp_path, "body_25"), 150)

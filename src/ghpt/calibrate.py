@@ -39,7 +39,7 @@ class Scale(TypedDict):
     """What gives millimetres."""
 
     height: float | None
-    segments: dict[str, float] | None
+    segments: dict[str, Any] | None
     baseline: list[str | int | float] | None
     assumed_height: float
 

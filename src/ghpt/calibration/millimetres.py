@@ -22,7 +22,7 @@ def check_scale(scale: Mapping[str, Any], names: Sequence[str]) -> None:
         check(scale[key] is None or scale[key] > 0, f"scale.{key}", f"is {scale[key]}", "Give it in millimetres.")
     if given == ["segments"]:
         try:
-            SegmentLengths(scale["segments"])
+            _segments(scale["segments"])
         except GhptConfigError as error:
             raise GhptConfigError("scale.segments", error.problem, error.mend) from error
     if given == ["baseline"]:
@@ -45,12 +45,12 @@ def in_millimetres(estimate: RigEstimate, scale: Mapping[str, Any]) -> tuple[Rig
             "text": f"from the distance of {estimate.names[a]} and {estimate.names[b]}, {mm:g} mm",
         }
     elif scale["segments"] is not None:
-        lengths = SegmentLengths(scale["segments"]).lengths
+        lengths = _segments(scale["segments"]).lengths
         listed = ", ".join(f"{name.replace('_', ' ')} {mm:g} mm" for name, mm in scale["segments"].items())
         found = {"from": "segments", "text": f"from measured segments: {listed}"}
         factor = _body_factor(estimate, lengths)
     else:
-        mm = scale["height"] if scale["height"] is not None else scale["assumed_height"]
+        mm = float(scale["assumed_height"] if scale["height"] is None else scale["height"])
         given = scale["height"] is not None
         text = "from a body height of {:g} mm (limbs of an average adult of that height, about 3 %)"
         if not given:
@@ -61,6 +61,10 @@ def in_millimetres(estimate: RigEstimate, scale: Mapping[str, Any]) -> tuple[Rig
         text = f"unknown: the recording does not show it ({found['text']})"
         return estimate, found | {"factor": None, "text": text}
     return estimate.scaled(factor), found | {"factor": factor}
+
+
+def _segments(lengths: Mapping[str, float]) -> SegmentLengths:
+    return SegmentLengths({name: float(mm) for name, mm in lengths.items()})
 
 
 def _body_factor(estimate: RigEstimate, lengths: Sequence[float]) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
 
 _MOST_VALUES = 1 << 31
+_LONGEST_NAMES = 1 << 20
 _FORMATS = (
     "Known: a folder with OpenPose's JSON files in a folder for each camera; caliscope's xy_*.csv; "
     "an npz file of ghpt (docs/calibration.md)."
@@ -135,10 +137,10 @@ def _own(path: Path, skeleton: str | None) -> KeyPoints:
         "confidence": (shape, "f"), "seen": (shape, "b"), "frame": ((frames,), "iu"), "rate_hz": ((), "fiu"),
     }  # fmt: skip
     more = read_npz(path, {field: form for field, form in forms.items() if field in there})
-    views = _texts(path, "views", there)
+    views = _texts(path, "views")
     if skeleton is None and "skeleton" in there:
-        skeleton = _texts(path, "skeleton", there)[0]
-    joints = _texts(path, "joints", there) if skeleton is None and "joints" in there else ()
+        skeleton = _texts(path, "skeleton")[0]
+    joints = _texts(path, "joints") if skeleton is None and "joints" in there else ()
     finite = np.isfinite(values).all(-1)
     seen = finite & more.get("seen", finite)
     values = np.where(seen[..., None], values, 0)
@@ -158,21 +160,29 @@ def _own(path: Path, skeleton: str | None) -> KeyPoints:
                      (0,) * count_views)  # fmt: skip
 
 
+_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError)
+"""What zipfile raises for a damaged archive, or one of a kind that it does not know."""
+
+
 def _members(path: Path) -> set[str]:
     try:
         with zipfile.ZipFile(path) as archive:
             return {name.removesuffix(".npy") for name in archive.namelist()}
-    except (zipfile.BadZipFile, OSError) as error:
+    except _DAMAGED as error:
         raise GhptDataError(path, "", f"is not a whole npz file ({error})", "Write it again.") from error
 
 
-def _texts(path: Path, field: str, there: set[str]) -> tuple[str, ...]:
-    with zipfile.ZipFile(path) as archive, archive.open(f"{field}.npy") as member:
-        size = archive.getinfo(f"{field}.npy").file_size
-        shape, _, dtype = npy_header(path, field, member, size)
-        if dtype.kind != "U" or len(shape) > 1 or size > 1 << 20:
-            raise GhptDataError(path, field, "is not a list of texts", "Write it with numpy.array([...], dtype=str).")
-        return tuple(map(str, np.frombuffer(member.read(), dtype).reshape(-1)))
+def _texts(path: Path, field: str) -> tuple[str, ...]:
+    try:
+        with zipfile.ZipFile(path) as archive, archive.open(f"{field}.npy") as member:
+            size = archive.getinfo(f"{field}.npy").file_size
+            shape, _, dtype = npy_header(path, field, member, size)
+            if dtype.kind != "U" or len(shape) > 1 or size > _LONGEST_NAMES:
+                mend = "Write it with numpy.array([...], dtype=str)."
+                raise GhptDataError(path, field, "is not a list of texts", mend)
+            return tuple(map(str, np.frombuffer(member.read(), dtype).reshape(-1)))
+    except (*_DAMAGED, UnicodeError) as error:
+        raise GhptDataError(path, field, f"is damaged ({error})", "Write it again.") from error
 
 
 def _joints_for(where: Path, skeleton: str, count: int) -> tuple[str, ...]:

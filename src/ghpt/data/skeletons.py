@@ -50,7 +50,11 @@ _SOURCES: dict[str, tuple[tuple[str, ...], ...]] = {joint: ((joint,),) for joint
 """The means that may stand for a joint; the first whose parts the skeleton has is taken."""
 
 _BONES = (
-    ("shoulder", "elbow"), ("elbow", "wrist"), ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle"),
+    ("nose", "left_eye"), ("nose", "right_eye"),
+    *((f"{side}_{a}", f"{side}_{b}") for side in ("left", "right") for a, b in (
+        ("shoulder", "elbow"), ("elbow", "wrist"), ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle"),
+        ("eye", "ear"), ("ankle", "heel"), ("heel", "big_toe"),
+    )),
 )  # fmt: skip
 _CLEARLY = 0.8
 """A skeleton is told from another when its bones have less than this part of the other's length."""
@@ -117,7 +121,7 @@ def joints17(
 
 
 def recognise(where: object, key_points: Float[np.ndarray, "N K 2"], seen: Bool[np.ndarray, "N K"]) -> str:
-    """The name of the skeleton of N people: of those with K joints the one whose limbs are shortest in the images.
+    """The name of the skeleton of N people: of those with K joints the one whose bones are shortest in the images.
 
     Raises GhptDataError if none has K joints, or if two of them are as good.
     """
@@ -128,7 +132,7 @@ def recognise(where: object, key_points: Float[np.ndarray, "N K 2"], seen: Bool[
         raise GhptDataError(where, "skeleton", problem, f"Known: {known}.")
     if len(choices) == 1:
         return choices[0]
-    lengths = sorted((_limb_length(SKELETONS[name], key_points, seen), name) for name in choices)
+    lengths = sorted((_bone_length(SKELETONS[name], key_points, seen), name) for name in choices)
     (shortest, name), (second, other) = lengths[0], lengths[1]
     if not shortest < _CLEARLY * second:
         problem = f"it may be {name} or {other}: both have {key_points.shape[1]} joints"
@@ -136,14 +140,10 @@ def recognise(where: object, key_points: Float[np.ndarray, "N K 2"], seen: Bool[
     return name
 
 
-def _limb_length(joints: tuple[str, ...], key_points: np.ndarray, seen: np.ndarray) -> float:
-    """Mean over the limbs of their median length, pixels; inf for one that is never seen."""
-    medians = []
-    for side in ("left", "right"):
-        for a, b in _BONES:
-            i, j = joints.index(f"{side}_{a}"), joints.index(f"{side}_{b}")
-            both = seen[:, i] & seen[:, j]
-            length = np.linalg.norm(key_points[both, i] - key_points[both, j], axis=-1)
-            medians.append(np.median(length) if len(length) else np.inf)
-    finite = [value for value in medians if np.isfinite(value)]
-    return float(np.mean(finite)) if finite else np.inf
+def _bone_length(joints: tuple[str, ...], key_points: np.ndarray, seen: np.ndarray) -> float:
+    """Mean over the bones of their median length, pixels; inf if none is ever seen."""
+    bones = [[joints.index(a), joints.index(b)] for a, b in _BONES if a in joints and b in joints]
+    a, b = np.array(bones).T
+    length = np.where(seen[:, a] & seen[:, b], np.linalg.norm(key_points[:, a] - key_points[:, b], axis=-1), np.nan)
+    measured = ~np.isnan(length).all(0)
+    return float(np.nanmedian(length[:, measured], axis=0).mean()) if measured.any() else np.inf
