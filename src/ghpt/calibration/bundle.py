@@ -48,6 +48,7 @@ class BundleAdjustment:
         """Adjust the rig's placed views and its points to their inliers. Never raises on values; a rig that could not
         be improved comes back as it was, with ``converged`` False where it is not at a minimum."""
         used = rig.inlier
+        rig = replace(rig, points=torch.where(used.any(0)[:, None], rig.points, 0.0))
         start = self.state(seen_by, rig)
         solved, report = self._solve(seen_by, rig, used) if start.finite else (rig, None)
         final = self.state(seen_by, solved)
@@ -56,7 +57,8 @@ class BundleAdjustment:
         converged = (
             final.finite and final.in_front and final.gain <= self.tolerance * max(final.cost, 1e-12 * int(used.sum()))
         )
-        steps = 0 if report is None else report.num_successful_steps + report.num_unsuccessful_steps
+        # Ceres counts the start as a successful step
+        steps = 0 if report is None else max(report.num_successful_steps + report.num_unsuccessful_steps - 1, 0)
         seconds = 0.0 if report is None else report.total_time_in_seconds
         return Adjusted(solved, start.cost, final, steps, seconds, bool(converged))
 
@@ -78,8 +80,8 @@ class BundleAdjustment:
             _add_view(model, config, seen_by, rig, v, chosen, joint)
         ids = []
         for n, point in enumerate(rig.points.numpy()[chosen]):
-            image = _image_id(np.flatnonzero(mask[:, n]), joint[n])
-            ids.append(model.add_point3D(point, pycolmap.Track([pycolmap.TrackElement(i, slot[n]) for i in image])))
+            track = [pycolmap.TrackElement(_image(v, joint[n]), slot[n]) for v in np.flatnonzero(mask[:, n])]
+            ids.append(model.add_point3D(point, pycolmap.Track(track)))
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         report = pycolmap.create_default_bundle_adjuster(self._options(), config, model).solve()
         R, t, points = rig.R.clone(), rig.t.clone(), rig.points.clone()
@@ -106,8 +108,8 @@ class BundleAdjustment:
         return options
 
 
-def _image_id(view: np.ndarray | int, joint: int) -> np.ndarray | int:
-    return view * JOINTS + joint + 1
+def _image(view: int | np.integer, joint: int | np.integer) -> int:
+    return int(view) * JOINTS + int(joint) + 1
 
 
 JOINTS = 1000
@@ -131,11 +133,12 @@ def _add_view(
     for j in np.unique(joint).tolist():
         own = chosen[joint == j]
         focal = 1 / float(seen_by.noise[view, own[0]])
-        number = int(_image_id(view, j))
+        number = _image(view, j)
         camera = pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0.0, 0.0])
         model.add_camera(camera)
         body.add_sensor(camera.sensor_id, pycolmap.Rigid3d()) if images else body.add_ref_sensor(camera.sensor_id)
-        xy = seen_by.xy[view, own].numpy() * focal
+        # what is not used may be anything
+        xy = torch.where(rig.inlier[view, own][:, None], seen_by.xy[view, own], 0.0).numpy() * focal
         image = pycolmap.Image(name=str(number), keypoints=xy, camera_id=number, image_id=number)
         image.frame_id = view + 1
         frame.add_data_id(image.data_id)

@@ -51,6 +51,10 @@ class Diagnostics:
             found += self._agreement(case, case.rig)
             found += self._geometry(case, case.rig)
             found += self._determined(case, case.rig, spread)
+        suspects = {name for d in found if d.code in _SUSPICIOUS for name in d.cameras}
+        for view, name in enumerate(case.names):
+            if name in suspects:
+                found += case.repaired(view)
         return tuple(found)
 
     def _recording(self, case: Case) -> Iterator[Diagnosis]:
@@ -113,7 +117,6 @@ class Diagnostics:
                 f"{name} cannot be linked to the other cameras: at best {common} common key points with one of them, "
                 f"{agree} of which agree; check its intrinsics, its synchronisation, and that it sees the same person"
             ), float(agree))  # fmt: skip
-            yield from case.repaired(v)
 
     def _agreement(self, case: Case, rig: Rig) -> Iterator[Diagnosis]:
         pixels, inliers = case.agreement(rig)
@@ -131,7 +134,6 @@ class Diagnostics:
                     f"{off:.1%} of the person's size (median of the cameras: {usual:.1%}); check its intrinsics, its "
                     "synchronisation and its key points"
                 ), float(inliers[v]))  # fmt: skip
-                yield from case.repaired(v)
             elif off > self.noise:
                 yield Diagnosis("large_residuals", "warning", (name,), (
                     f"key points of {name} are off by {off:.1%} of the person's size ({pixels[v]:.1f} px), detectors' "
@@ -201,3 +203,7 @@ def _motion(key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]) -
     low, high = place.nanquantile(torch.tensor([0.1, 0.9], dtype=torch.float64), dim=0)
     spread = ((high - low).norm(dim=-1) / 2).nanmedian(-1).values / size
     return float(spread.nan_to_num(0.0).max())
+
+
+_SUSPICIOUS = ("resolution", "unlinked", "disagreement")
+"""Diagnoses that one of the user's mistakes may explain."""

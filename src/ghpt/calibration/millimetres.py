@@ -63,8 +63,10 @@ def in_millimetres(estimate: RigEstimate, scale: Mapping[str, Any]) -> tuple[Rig
     return estimate.scaled(factor), found | {"factor": factor}
 
 
-def _segments(lengths: Mapping[str, float]) -> SegmentLengths:
-    return SegmentLengths({name: float(mm) for name, mm in lengths.items()})
+def _segments(lengths: Mapping[str, Any]) -> SegmentLengths:
+    for name, mm in lengths.items():
+        check(type(mm) in (int, float), "lengths", f"says {name} is {mm!r}", "Give lengths in millimetres.")
+    return SegmentLengths({str(name): float(mm) for name, mm in lengths.items()})
 
 
 def _body_factor(estimate: RigEstimate, lengths: Sequence[float]) -> float:

@@ -30,9 +30,9 @@ class Linearised:
     gain: float
     """What a full Gauss-Newton step would gain: half the squared length of the gradient in the inverse normal
     matrix. It is 0 at a minimum and the same in any gauge and unit."""
-    matrix: Float[Tensor, "6V 6V"]
-    """Normal matrix of the views' parameters, points eliminated; singular in the 7 directions of the gauge."""
-    scores: Float[Tensor, "T 6V"]
+    matrix: Float[Tensor, "P P"]
+    """Normal matrix of the P = 6 V parameters of the views, points eliminated; singular in the 7 directions of the gauge."""
+    scores: Float[Tensor, "T P"]
     """Gradient of each frame's cost by the views' parameters, points eliminated."""
 
 
@@ -87,14 +87,13 @@ def linearise(seen_by: Observations, rig: Rig, used: Bool[Tensor, "V N"], scale:
 def _inverse(H: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, "N 3 3"], Bool[Tensor, " N"]]:
     """Inverses of points' normal matrices; 0 where a point's rays do not fix it."""
     trace = H.diagonal(dim1=-2, dim2=-1).sum(-1)
-    scaled = H / torch.where(trace > 0, trace, 1.0)[:, None, None]
+    safe = torch.where(trace > 0, trace, 1.0)[:, None, None]
+    scaled = H / safe
     solvable = (trace > 0) & (torch.linalg.det(scaled) > 1e-18)
     eye = torch.eye(3, dtype=H.dtype)
-    inverse = (
-        torch.linalg.inv(torch.where(solvable[:, None, None], scaled, eye))
-        / torch.where(trace > 0, trace, 1.0)[:, None, None]
-    )
-    return torch.where(solvable[:, None, None], inverse, 0.0), solvable
+    inverse, failed = torch.linalg.inv_ex(torch.where(solvable[:, None, None], scaled, eye))
+    solvable = solvable & (failed == 0)
+    return torch.where(solvable[:, None, None], inverse / safe, 0.0), solvable
 
 
 def preconditioned(

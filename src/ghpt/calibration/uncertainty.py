@@ -29,7 +29,7 @@ class Uncertainty:
     small, and errors that joints of a frame and frames of a time share."""
 
 
-def gauge(R: Float[Tensor, "V 3 3"], centre: Float[Tensor, "V 3"]) -> Float[Tensor, "6V 7"]:
+def gauge(R: Float[Tensor, "V 3 3"], centre: Float[Tensor, "V 3"]) -> Float[Tensor, "P 7"]:
     """The changes of the views' parameters that change no image: common rotation, translation, scale."""
     eye = torch.eye(3, dtype=centre.dtype).expand(len(centre), 3, 3)
     rotation = torch.cat((eye, -cross_matrix(centre)), dim=1)
