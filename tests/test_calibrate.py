@@ -175,6 +175,7 @@ def test_an_assumed_scale_is_said_everywhere(command, scene, tmp_path):
         (["scale.baseline=[cam_00,cam_00,3000]"], "scale.baseline: is"),
         (["scale.baseline=[cam_00,front,3000]"], "Give two of cam_00"),
         (["scale.segments={tail: 30}"], r"scale\.segments: names 'tail', which is no part of the body"),
+        (["scale.segments={thigh: long}"], r"scale\.segments: says thigh is 'long'"),
         (["scale.height=-3"], r"scale\.height: is -3"),
         (["triangulation=guess"], "triangulation: is 'guess'"),
         (["views=[cam_00,cam_07]"], "there is no view cam_07"),

@@ -135,6 +135,9 @@ def test_the_user_says_which_is_which_and_which_to_use():
     pairs = matched("pose", ["1", "2", "top"], cameras, {"1": "back", "2": "front"}, None)
     assert pairs == [(1, 0), (0, 1), (2, 2)]
     assert matched("pose", ["front", "top", "x"], cameras, {}, ["top", "front"]) == [(0, 0), (1, 2)]
+    for wrong in ({"3": "back"}, {"1": "side"}):
+        with pytest.raises(GhptDataError, match=r"match says .*, of which one is not there \(views: 1, 2, top;"):
+            matched("pose", ["1", "2", "top"], cameras, wrong, None)
     with pytest.raises(GhptDataError, match="there is no view back with a camera"):
         matched("pose", ["front", "top"], cameras, {}, ["top", "back"])
 

@@ -86,6 +86,10 @@ def matched(
     are the same but for case, separators, leading zeros and words like json (``cam1_json`` is ``cam_01``). Raises
     GhptDataError, listing both sides, where that is not one to one.
     """
+    known = {name for names in _names(cameras) for name in names}
+    for view, camera in match.items():
+        if view not in views or camera not in known:
+            raise _unmatched(where, views, cameras, f"match says {view}: {camera}, of which one is not there")
     found: list[tuple[int, int]] = []
     for index, view in enumerate(views):
         own = [i for i, names in enumerate(_names(cameras)) if match.get(view, view) in names]
