@@ -133,18 +133,20 @@ class RelativePose:
         pixels, depth = project(cameras, batch.points)
         x = normalise(cameras.K, pixels)
         truth = batch.points @ cameras.R[:, 0].mT + cameras.t[:, 0, None]
+        # linear triangulation counts a ray's distance by its camera's focal length
+        focal = torch.linalg.det(cameras.K)
+        share_a = (focal[:, 0] / focal.sum(-1))[:, None, None]
         extra = (None,) * (estimate.t.dim() - 2)
-        a, b, truth = (v[:, *extra] for v in (x[:, 0], x[:, 1], truth))
+        a, b, truth, share_a = (v[:, *extra] for v in (x[:, 0], x[:, 1], truth, share_a))
         alpha, beta = depths(estimate.R, estimate.t, a, b)
-        back = (homogeneous(b) * beta[..., None] - estimate.t[..., None, :]) @ estimate.R
-        middle = (homogeneous(a) * alpha[..., None] + back) / 2
-        distance = (middle - truth).norm(dim=-1).clamp(max=self.largest_error)
+        on_a = homogeneous(a) * alpha[..., None]
+        on_b = (homogeneous(b) * beta[..., None] - estimate.t[..., None, :]) @ estimate.R
+        distance = (share_a * on_a + (1 - share_a) * on_b - truth).norm(dim=-1).clamp(max=self.largest_error)
         distance = torch.where((alpha > 0) & (beta > 0), distance, self.largest_error)
         visible = (depth > 0).all(dim=1)
         share = visible / visible.sum(-1, keepdim=True).clamp_min(1)
         error = (distance * share[:, *extra]).sum(-1)
-        measured = visible.any(-1)
-        return error, measured & (estimate.estimated.flatten(1).all(-1) if extra else estimate.estimated)
+        return error, visible.any(-1) & estimate.estimated.reshape(len(batch), -1).all(-1)
 
 
 def random_subsets(both: Bool[Tensor, "B N"], count: int, size: int, keys: Int[Tensor, " B"]) -> Bool[Tensor, "B H N"]:
