@@ -155,6 +155,17 @@ def test_what_determines_no_pose_is_said_and_does_not_spoil_its_neighbours():
     assert cameras.generate(same, 20, keys(batch)).estimated.tolist() == [False, True, True]
 
 
+def test_an_empty_share_of_a_batch_goes_through():
+    full = batch_of([0, 1, 2])
+    empty = PairBatch(**{f: (full.cameras.index(slice(0)) if f == "cameras" else getattr(full, f)[:0])
+                         for f in PairBatch.__dataclass_fields__})  # fmt: skip
+    cameras = problem()
+    h = cameras.generate(empty, 10, keys(empty))
+    assert cameras.describe(h).shape == (0, 10, 16)
+    assert cameras.error(cameras.expand(h), empty)[0].shape == (0, 10)
+    assert cameras.combine(h, torch.zeros(0, 10)).R.shape == (0, 3, 3)
+
+
 def test_one_weight_selects_and_equal_weights_average_whatever_the_quaternions_signs():
     batch, cameras = batch_of([8], noise=5.0), problem()
     h = cameras.generate(batch, 3, keys(batch))

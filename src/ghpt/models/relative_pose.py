@@ -146,7 +146,7 @@ class RelativePose:
         visible = (depth > 0).all(dim=1)
         share = visible / visible.sum(-1, keepdim=True).clamp_min(1)
         error = (distance * share[:, *extra]).sum(-1)
-        return error, visible.any(-1) & estimate.estimated.reshape(len(batch), -1).all(-1)
+        return error, visible.any(-1) & (estimate.estimated.all(-1) if extra else estimate.estimated)
 
 
 def random_subsets(both: Bool[Tensor, "B N"], count: int, size: int, keys: Int[Tensor, " B"]) -> Bool[Tensor, "B H N"]:
