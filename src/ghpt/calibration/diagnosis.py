@@ -64,11 +64,9 @@ class Case:
 
     def repaired(self, view: int) -> Iterator[Diagnosis]:
         """The user's mistake that explains why a view does not agree with the others, if one does."""
-        if self.rig is None:
-            return
         chosen = self.key_points[self.frames], self.usable[self.frames]
         repair = find_repair(
-            self.names, self.K, *chosen, self.sizes, self.noise, self.rig, view, self.resection, self.seed
+            self.names, self.K, *chosen, self.sizes, self.noise, self.table, view, self.resection, self.seed
         )
         if repair is not None:
             text = f"{repair.text} ({repair.share:.0%} of its key points then agree)"

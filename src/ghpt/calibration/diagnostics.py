@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.calibration.diagnosis import Case, Diagnosis
-from ghpt.calibration.observations import check_positive
+from ghpt.calibration.observations import check_positive, typical_size
 from ghpt.calibration.resection import Rig
 from ghpt.calibration.uncertainty import Uncertainty
-from ghpt.models.baselines import person_size
 from ghpt.models.scale import average_lengths, part_scales
 
 
@@ -120,8 +119,7 @@ class Diagnostics:
 
     def _agreement(self, case: Case, rig: Rig) -> Iterator[Diagnosis]:
         pixels, inliers = case.agreement(rig)
-        size = person_size(case.key_points[case.frames].double(), case.usable[case.frames])
-        size = torch.where(size > 0, size, torch.nan).nanmedian(0).values.nan_to_num(1.0)
+        size = typical_size(case.key_points[case.frames].double(), case.usable[case.frames]).nan_to_num(1.0)
         focal = (case.K[:, 0, 0] * case.K[:, 1, 1]).double().sqrt()
         noise = (case.seen_by.noise.median(-1).values * focal / size).nan_to_num(0.0)
         usual = float(noise[rig.placed].median())
@@ -195,8 +193,7 @@ class Diagnostics:
 def _motion(key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]) -> float:
     """Median over the joints of the spread (half the range of the middle 80 %) of their place, in persons' sizes, in
     the view with most."""
-    size = person_size(key_points.double(), seen)
-    size = torch.where(size > 0, size, torch.nan).nanmedian(0).values
+    size = typical_size(key_points.double(), seen)
     place = torch.where(seen[..., None], key_points.double(), torch.nan)
     if not len(place):
         return 0.0

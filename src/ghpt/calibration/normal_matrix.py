@@ -31,7 +31,7 @@ class Linearised:
     """What a full Gauss-Newton step would gain: half the squared length of the gradient in the inverse normal
     matrix. It is 0 at a minimum and the same in any gauge and unit."""
     matrix: Float[Tensor, "P P"]
-    """Normal matrix of the P = 6 V parameters of the views, points eliminated; singular in the 7 directions of the gauge."""
+    """Normal matrix of the P = 6 V parameters of the views, points eliminated; singular along the gauge's 7."""
     scores: Float[Tensor, "T P"]
     """Gradient of each frame's cost by the views' parameters, points eliminated."""
 

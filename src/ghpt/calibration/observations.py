@@ -55,6 +55,13 @@ def usable(
     return seen & torch.isfinite(key_points).all(-1) & valid[:, None]
 
 
+def typical_size(key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]) -> Float[Tensor, " V"]:
+    """Median over the frames of the person's size in each view, pixels; NaN where nobody is seen."""
+    size = person_size(key_points, seen)
+    missing = torch.full_like(size[:0].sum(0), torch.nan)
+    return torch.where(size > 0, size, torch.nan).nanmedian(0).values if len(size) else missing
+
+
 def choose_frames(
     key_points: Float[Tensor, "T V J 2"], confidence: Float[Tensor, "T V J"], seen: Bool[Tensor, "T V J"], most: int
 ) -> Int[Tensor, " F"]:
@@ -72,7 +79,7 @@ def choose_frames(
     # stable: among equals the first, so the choice is the same on any machine
     order = frames[torch.sort(score[frames], descending=True, stable=True).indices]
     order = order[_rank(order * (4 * most) // len(key_points)) == 0]
-    size = torch.where(seen.any(2), person_size(key_points.double(), seen), torch.nan).nanmedian(0).values
+    size = typical_size(key_points.double(), seen)
     count = seen.sum(2).clamp(min=1)[..., None]
     middle = torch.where(seen[..., None], key_points.double(), 0.0).sum(2) / count
     place = (middle / size.nan_to_num(1.0).clamp(min=1e-9)[:, None]).floor().clamp(-1e6, 1e6).long()
@@ -97,8 +104,7 @@ def observe(
 ) -> Observations:
     """The chosen frames' key points, with ``noise`` x the median size of the person in the view as their noise."""
     key_points = torch.where(seen[..., None], key_points.double(), 0.0)
-    size = person_size(key_points, seen)
-    size = torch.where(size > 0, size, torch.nan).nanmedian(0).values
+    size = typical_size(key_points, seen)
     known = torch.isfinite(size)
     sane = torch.where(known[:, None, None], K.double(), torch.eye(3, dtype=torch.float64))
     focal = (sane[:, 0, 0] * sane[:, 1, 1]).sqrt()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import poselib
@@ -31,6 +31,11 @@ class PairTable:
     """Median angle between corresponding rays, radians in [0, pi/2]."""
     linked: Bool[Tensor, " P"]
     """Whether the pair may carry the rig: enough inliers, enough of the common ones."""
+
+    def among(self, views: Bool[Tensor, " V"]) -> PairTable:
+        """The pairs of some of the views."""
+        inside = views[self.views].all(-1)
+        return PairTable(*(getattr(self, field.name)[inside] for field in fields(self)))
 
 
 def camera_dict(focal: float) -> dict:

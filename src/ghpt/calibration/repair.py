@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.calibration.observations import Observations, observe
+from ghpt.calibration.pairs import PairTable
 from ghpt.calibration.resection import Resection, Rig
 from ghpt.skeleton import MIRROR
 
@@ -28,18 +29,16 @@ class Repair:
 
 def find_repair(
     names: tuple[str, ...], K: Float[Tensor, "V 3 3"], key_points: Float[Tensor, "T V J 2"],
-    seen: Bool[Tensor, "T V J"], sizes: Int[Tensor, "V 2"] | None, noise: float, rig: Rig, view: int,
+    seen: Bool[Tensor, "T V J"], sizes: Int[Tensor, "V 2"] | None, noise: float, table: PairTable, view: int,
     resection: Resection, seed: int,
 ) -> Repair | None:  # fmt: skip
     """The mistake whose undoing makes the view agree best with the people that the other views triangulate, if its
     squared errors (cut off at the threshold) are then half of what they are as it stands and most of its key points
     agree. Needs two other placed views. ``noise``: share of the person's size."""
-    others = rig.placed.clone()
-    others[view] = False
-    if others.sum() < 2:
-        return None
     plain = observe(K, key_points, seen, noise)
-    rest = resection.triangulate(plain, replace(rig, placed=others), seed)
+    rest = _rest(plain, table, {view}, resection, seed)
+    if rest is None:
+        return None
     cost = _fit(plain, rest, view, resection, seed)[0]
     best = None
     for code, text, intrinsics, pixels in _undone(names, K, key_points, sizes, view):
@@ -47,7 +46,41 @@ def find_repair(
         new, share = _fit(replace(plain, **_of_view(plain, tried, view)), rest, view, resection, seed)
         if share >= 0.6 and new < 0.5 * cost:
             best, cost = Repair(code, text, share), 2 * new
-    return best
+    return best or _exchange(names, K, plain, key_points, seen, noise, table, view, resection, seed)
+
+
+def _rest(seen_by: Observations, table: PairTable, without: set[int], resection: Resection, seed: int) -> Rig | None:
+    """The rig of the other views alone, which these cannot have spoilt; None where no two are linked."""
+    kept = torch.tensor([view not in without for view in range(len(seen_by.seen))])
+    table = table.among(kept)
+    if not table.linked.any():
+        return None
+    edge = int(torch.where(table.linked, table.expected, torch.inf).argmin())
+    return resection.grow(seen_by, table, resection.begin(seen_by, table, edge, seed), seed)
+
+
+def _exchange(
+    names: tuple[str, ...], K: Tensor, plain: Observations, key_points: Tensor, seen: Tensor, noise: float,
+    table: PairTable, view: int, resection: Resection, seed: int,
+) -> Repair | None:  # fmt: skip
+    """Two cameras with each other's intrinsics, judged together against the rest: each spoils what judges the other."""
+    for other, whose in enumerate(names):
+        both = K[[view, other]]
+        valid = bool(torch.isfinite(both).all() & (both.diagonal(dim1=-2, dim2=-1) > 0).all())
+        if other == view or not valid or torch.allclose(K[other], K[view], rtol=0.01):
+            continue
+        swapped = K.clone()
+        swapped[[view, other]] = K[[other, view]]
+        tried = observe(swapped, key_points, seen, noise)
+        people = _rest(plain, table, {view, other}, resection, seed)
+        if people is None:
+            continue
+        before, after = ([_fit(x, people, v, resection, seed) for v in (view, other)] for x in (plain, tried))
+        share = min(fit[1] for fit in after)
+        if share >= 0.6 and sum(fit[0] for fit in after) < 0.75 * sum(fit[0] for fit in before):
+            text = f"key points of {names[view]} fit the intrinsics of {whose}, and the reverse; exchange the two names"
+            return Repair("names_swapped", text, share)
+    return None
 
 
 _LABELS = ("sides_swapped", "mirrored_image")
@@ -99,9 +132,3 @@ def _undone(
         scaled[view, :2] *= ratio
         text = f"intrinsics of {name} fit its key points when scaled by {ratio:.3g}; give both at one resolution"
         yield "resolution", text, scaled, key_points
-    for other, whose in enumerate(names):
-        if other != view and not torch.allclose(K[other], K[view], rtol=0.01):
-            exchanged = K.clone()
-            exchanged[view] = K[other]
-            text = f"key points of {name} fit the intrinsics of {whose}; the two cameras' names may be exchanged"
-            yield "names_swapped", text, exchanged, key_points

@@ -165,7 +165,8 @@ class RigCalibration:
             torch.zeros(frames * joints, 3, dtype=torch.float64), torch.zeros_like(case.seen_by.seen),
         )  # fmt: skip
         placed = rig.placed
-        reprojection, inliers = case.agreement(rig)
+        nothing = torch.zeros(views, dtype=torch.float64)
+        reprojection, inliers = case.agreement(rig) if placed.any() else (nothing, nothing)
         spread = None if case.adjusted is None else uncertainty(case.seen_by, rig, case.adjusted.final, self.blocks)
         estimated = rig.inlier.any(0)
         return RigEstimate(
