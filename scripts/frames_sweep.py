@@ -125,7 +125,8 @@ def main() -> None:
     print(f"\nE_3D in mm of pair {name}: mean ± deviation (median); {data}\n\n{sweep_table(results[PAPER_PAIR])}")
     print(f"\nMedian E_3D in mm, weight / {' / '.join(TARGETS)}, * where weight is not below both; {data}\n")
     print(comparison(results, options.frames))
-    draw(frames_sweep(results[PAPER_PAIR], f"Cameras {name} of {data}"), folder / "frames_sweep")
+    heading = f"Cameras {name} of embedded (synthetic) Human3.6M, {2 * options.draws} draws of M frames"
+    draw(frames_sweep(results[PAPER_PAIR], heading), folder / "frames_sweep")
     print(f"\nFigure: {folder / 'frames_sweep.svg'}, and .png")
 
 

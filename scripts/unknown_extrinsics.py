@@ -208,10 +208,11 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=5, help="of M frames of each rig")
     parser.add_argument("--frames", type=int, default=80, help="M")
     parser.add_argument("--stride", type=int, default=64, help="every so many frames are tested")
+    parser.add_argument("--camera", type=Path, help="checkpoint of the camera model (runs/camera/last.ckpt)")
     options = parser.parse_args()
     logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
     warnings.simplefilter("ignore")
-    camera = trained("camera", ["data=h36m", "model=camera"])
+    camera = options.camera or trained("camera", ["data=h36m", "model=camera"])
     poses = {name: trained(name, [f"data={name}"]) for name in NAMES}
     experiment = Experiment(camera, poses, options.draws, options.frames, options.stride)
     about = f"cameras from {options.frames} frames; mean ± deviation over {options.draws} draws (increase over known)"
