@@ -24,7 +24,7 @@ from matplotlib.figure import Figure
 from ghpt.config import plain
 from ghpt.files import atomic_write
 from ghpt.models.checkpoint import FIELD, read_checkpoint
-from ghpt.report.pair_evaluate import errors_of_pair, pair_name
+from ghpt.report.pair_evaluate import pair_errors, pair_name
 from ghpt.report.pair_predictions import open_pairs
 from ghpt.report.sweep import Sweep, frames_sweep, sweep_table
 from ghpt.report.tables import markdown
@@ -71,10 +71,11 @@ def run(checkpoint: Path, frames: list[int], draws: int, rig: bool) -> tuple[dic
             with contextlib.redirect_stdout(io.StringIO()):  # its table; the numbers are read from the file
                 test(config, output)
         predictions = open_pairs(output / "predictions.npz")
-        for pair in PAIRS:
-            errors = errors_of_pair(predictions, pair, "E_3D")
-            for method in methods:
-                results[pair][method][count] = errors[method]
+        rows = predictions.read(0, len(predictions))
+        for method in methods:
+            errors = pair_errors(predictions, rows, method)["E_3D"]
+            for pair in PAIRS:
+                results[pair][method][count] = errors[(rows.pair == torch.tensor(pair)).all(-1)].tolist()
     return results, folder
 
 
