@@ -1,0 +1,9 @@
+"""Predict: ``python predict.py keypoints=pose/ cameras=Calib.toml output=out/``; ``--help`` says more."""
+
+from pathlib import Path
+
+from ghpt.app import run
+from ghpt.predict import predict, summary
+
+if __name__ == "__main__":
+    run(Path(__file__).parent / "conf", "predict", predict, summary)

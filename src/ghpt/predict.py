@@ -1,0 +1,200 @@
+"""Prediction: from a folder of 2D key points and calibrated cameras to 3D poses."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import logging
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict
+
+import torch
+
+from ghpt.calibrate import from_data, people_note
+from ghpt.config import build, check_type, suggest
+from ghpt.data.camera_files import read_cameras
+from ghpt.data.key_points import read_key_points
+from ghpt.errors import GhptCheckpointError, GhptConfigError, check
+from ghpt.files import atomic_write, sweep_temporaries
+from ghpt.models.checkpoint import load_model
+from ghpt.models.pose import PoseTriangulation
+from ghpt.prediction.frames import Frames, frames_of_files, frames_of_recording
+from ghpt.prediction.gaps import Gaps, after, gap_frames
+from ghpt.prediction.report import prediction_report, print_prediction
+from ghpt.prediction.run import Predictor, predict_shards
+from ghpt.prediction.stand_in import WRITERS, Classical, Learned
+from ghpt.prediction.statistics import Estimate, counts, evaluate
+from ghpt.provenance import provenance
+from ghpt.reconstruction import About, State
+from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.report.tables import NAMES
+from ghpt.skeleton import JOINTS
+from ghpt.train import shown
+
+SHARDS = ".shards"
+"""The folder of the shards, within the output. It may be deleted: the next run then starts anew."""
+_log = logging.getLogger(__name__)
+
+
+class Settings(TypedDict):
+    """What `predict` needs of the configuration."""
+
+    keypoints: str | None
+    cameras: str | None
+    views: list[str] | None
+    match: dict[str, str] | None
+    skeleton: str | None
+    rate_hz: float | None
+    recording: str | None
+    ckpt: str | None
+    hypotheses: int | None
+    estimator: str
+    fill: int | str | None
+    interpolation: str
+    smooth: float | None
+    formats: list[str]
+    compare: list[str]
+    evaluated_frames: int
+    shard_frames: int
+    batch: int
+    progress_bar: bool
+    data: dict[str, Any]
+    baselines: dict[str, Any]
+    trainer: dict[str, Any]
+    seed: int
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """The estimator of a prediction."""
+
+    name: str
+    text: str
+    """In words, for people."""
+    predictor: Predictor
+    weights: torch.nn.Module | None
+    identity: dict[str, Any]
+    """What its results depend on, as plain data."""
+
+
+def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
+    """Predict the 3D joints of ``config["keypoints"]``, or of a recording of ``config["data"]``.
+
+    Writes poses.<format>, prediction.json and report.md into ``output`` and prints the tables; the shards that an
+    interrupted run left are gone on with. Returns what prediction.json holds.
+    """
+    check_type(config, Settings, "")
+    _check(config)
+    chosen = choose(config)
+    compared = {name: build(config["baselines"][name], f"baselines.{name}") for name in config["compare"]}
+    frames = from_files(config) if config["keypoints"] else _from_data(config)
+    gaps = Gaps(gap_frames(config["fill"], frames.rate_hz), config["interpolation"], config["smooth"], frames.rate_hz)
+    origin = provenance(config["seed"])
+    about = About(
+        name=frames.title, source=frames.source, estimator=chosen.name, joints=JOINTS, camera_names=frames.camera_names,
+        rate_hz=frames.rate_hz, smoothed=config["smooth"] is not None,
+        provenance=origin | {"estimator": chosen.text, "settings": chosen.identity, "fill_frames": gaps.longest,
+                             "interpolation": gaps.interpolation, "smooth_hz": gaps.cut_off_hz},
+    )  # fmt: skip
+    _log.info("%s: %d frames, %d views, by %s.", frames.title, len(frames), len(frames.camera_names), chosen.text)
+    sweep_temporaries(output)
+    key = _key(frames, chosen, origin)
+    shards, first = predict_shards(frames, chosen.predictor, chosen.weights, output / SHARDS, key, config)
+    if not first:
+        return {}
+    with after(gaps, shards, len(JOINTS), output) as chunks:
+        for name in config["formats"]:
+            WRITERS[name](output / f"poses.{name}", about, chunks)
+        found = counts(chunks(), about.joints, about.camera_names)
+    estimates: dict[str, Estimate] = {chosen.name: _estimate(chosen.predictor)}
+    estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
+    numbers = {
+        "data": frames.title, "source": frames.source, "cameras": list(frames.camera_names),
+        "estimator": chosen.name, "estimator_text": chosen.text, "rate_hz": frames.rate_hz,
+        "fill_frames": gaps.longest, "smooth_hz": gaps.cut_off_hz, **found,
+        "evaluation": evaluate(frames, estimates, config["evaluated_frames"], config["batch"]),
+        "formats": config["formats"], "provenance": about.provenance,
+    }  # fmt: skip
+    with atomic_write(output / "prediction.json", "w") as handle:
+        json.dump(numbers, handle, indent=1)
+        handle.write("\n")
+    with atomic_write(output / "report.md", "w") as handle:
+        handle.write(prediction_report(numbers))
+    print_prediction(numbers)
+    files = ", ".join(f"poses.{name}" for name in config["formats"])
+    _log.info("Written: %s and report.md in %s.", files, shown(output))
+    return numbers
+
+
+def summary(numbers: dict[str, Any]) -> str:
+    """What `predict` returned, in words."""
+    if not numbers:
+        return "done by the first process"
+    return f"{numbers['data']}: {numbers['frames']} frames, {100 * numbers['share']['observed']:.1f} % observed"
+
+
+def choose(config: dict[str, Any]) -> Chosen:
+    """The checkpoint's model, or without one the classical estimator. Raises GhptCheckpointError for a model that does
+    not predict poses."""
+    if not config["ckpt"]:
+        name = config["estimator"]
+        settings = config["baselines"][name]
+        text = f"{NAMES.get(name, name.replace('_', ' '))}, a classical estimator (no ckpt was given)"
+        predictor = Classical(build(settings, f"baselines.{name}"))
+        return Chosen(name, text, predictor, None, settings)
+    model, trained = load_model(config["ckpt"], hypotheses=config["hypotheses"], seed=config["seed"])
+    if not isinstance(model.problem, PoseTriangulation):
+        problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
+        raise GhptCheckpointError(config["ckpt"], problem, "Give one that train.py model=pose wrote.")
+    model.eval()
+    digest = hashlib.sha256(Path(config["ckpt"]).read_bytes()).hexdigest()
+    data = trained["provenance"].get("data", "unknown data")
+    text = f"the learned model of {Path(config['ckpt']).name}, trained on {data}"
+    identity = {"ckpt_sha256": digest, "hypotheses": model.hypotheses, "seed": config["seed"]}
+    return Chosen("weight", text, Learned(model), model, identity)
+
+
+def from_files(config: dict[str, Any]) -> Frames:
+    """The user's own key points and cameras."""
+    if not config["cameras"]:
+        raise GhptConfigError("cameras", "is missing", "Name the file of the calibrated cameras: cameras=Calib.toml")
+    cameras = read_cameras(config["cameras"])
+    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"])
+    for note in people_note(points):
+        _log.warning("%s: %s.", note.severity, note.text)
+    title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
+    return frames_of_files(points, cameras, config["match"], config["views"], title)
+
+
+def _from_data(config: dict[str, Any]) -> Frames:
+    case = from_data(config)
+    cameras = case.views.cameras.cameras
+    assert cameras is not None  # those of a data set are calibrated
+    return frames_of_recording(case.views.recording(case.title, cameras), case.source, case.title)
+
+
+def _estimate(predictor: Predictor) -> Estimate:
+    def estimate(batch: KeyPointBatch) -> PoseEstimate:
+        found = predictor(batch)
+        return PoseEstimate(found.points, found.state == State.OBSERVED)
+
+    return estimate
+
+
+def _key(frames: Frames, chosen: Chosen, origin: dict[str, Any]) -> str:
+    """What shards depend on, in one word."""
+    made = {name: value for name, value in origin.items() if name != "command"}
+    parts = {"frames": frames.stamp(), "estimator": chosen.name, "settings": chosen.identity, "made": made}
+    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _check(config: dict[str, Any]) -> None:
+    for name in ("evaluated_frames", "shard_frames", "batch"):
+        check(config[name] >= 1, name, f"is {config[name]}", "Give 1 or more.")
+    for key, names, existing in (
+        ("estimator", [config["estimator"]], config["baselines"]), ("compare", config["compare"], config["baselines"]),
+        ("formats", config["formats"], WRITERS),
+    ):  # fmt: skip
+        for name in names:
+            check(name in existing, key, f"there is no {name!r}", suggest(name, existing))
