@@ -1,0 +1,36 @@
+"""Writers of reconstructions: one function for each format, all called alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from ghpt.export.c3d import write_c3d
+from ghpt.export.npz import read_reconstruction, write_npz
+from ghpt.export.stream import Chunks
+from ghpt.export.table import write_csv, write_parquet
+from ghpt.export.trc import write_trc
+
+__all__ = ["WRITERS", "Chunks", "Writer", "read_reconstruction"]
+
+
+@dataclass(frozen=True)
+class Writer:
+    """How a format is written: ``write(path, about, chunks, **settings)``.
+
+    Atomic, at a memory that does not grow with the recording. Raises GhptConfigError for what the format needs and
+    does not have (a rate, a package) and GhptDataError for frames or names that it cannot hold.
+    """
+
+    file: str
+    """Its name in the output folder."""
+    write: Callable[..., None]
+
+
+WRITERS = {
+    "npz": Writer("poses.npz", write_npz),
+    "csv": Writer("poses.csv", write_csv),
+    "parquet": Writer("poses.parquet", write_parquet),
+    "trc": Writer("poses.trc", write_trc),
+    "c3d": Writer("poses.c3d", write_c3d),
+}
