@@ -15,16 +15,19 @@ from ghpt.calibrate import from_data, people_note
 from ghpt.config import build, check_type, suggest
 from ghpt.data.camera_files import read_cameras
 from ghpt.data.key_points import read_key_points
+from ghpt.data.views import look_through
 from ghpt.errors import GhptCheckpointError, GhptConfigError, check
+from ghpt.export import WRITERS
 from ghpt.files import atomic_write, sweep_temporaries
 from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
-from ghpt.prediction.frames import Frames, frames_of_files, frames_of_recording
+from ghpt.prediction.frames import Frames, calibrated, frames_of_views
 from ghpt.prediction.gaps import Gaps, after, gap_frames
 from ghpt.prediction.report import prediction_report, print_prediction
 from ghpt.prediction.run import Predictor, predict_shards
-from ghpt.prediction.stand_in import WRITERS, Classical, Learned
+from ghpt.prediction.stand_in import Classical, Learned
 from ghpt.prediction.statistics import Estimate, counts, evaluate
+from ghpt.prediction.stored import frames_of_stored, open_stored
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, State
 from ghpt.recording import KeyPointBatch, PoseEstimate
@@ -34,6 +37,9 @@ from ghpt.train import shown
 
 SHARDS = ".shards"
 """The folder of the shards, within the output. It may be deleted: the next run then starts anew."""
+_ALL = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if name in WRITERS)
+"""The formats that need no further package."""
+_TIMED = ("trc", "c3d")
 _log = logging.getLogger(__name__)
 
 
@@ -53,7 +59,8 @@ class Settings(TypedDict):
     fill: int | str | None
     interpolation: str
     smooth: float | None
-    formats: list[str]
+    formats: list[str] | None
+    trc: dict[str, Any]
     compare: list[str]
     evaluated_frames: int
     shard_frames: int
@@ -97,6 +104,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
         provenance=origin | {"estimator": chosen.text, "settings": chosen.identity, "fill_frames": gaps.longest,
                              "interpolation": gaps.interpolation, "smooth_hz": gaps.cut_off_hz},
     )  # fmt: skip
+    formats = _formats(config, frames)
     _log.info("%s: %d frames, %d views, by %s.", frames.title, len(frames), len(frames.camera_names), chosen.text)
     sweep_temporaries(output)
     key = _key(frames, chosen, origin)
@@ -104,8 +112,8 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     if not first:
         return {}
     with after(gaps, shards, len(JOINTS), output) as chunks:
-        for name in config["formats"]:
-            WRITERS[name](output / f"poses.{name}", about, chunks)
+        for name in formats:
+            WRITERS[name].write(output / WRITERS[name].file, about, chunks, **config.get(name, {}))
         found = counts(chunks(), about.joints, about.camera_names)
     estimates: dict[str, Estimate] = {chosen.name: _estimate(chosen.predictor)}
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
@@ -114,7 +122,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
         "estimator": chosen.name, "estimator_text": chosen.text, "rate_hz": frames.rate_hz,
         "fill_frames": gaps.longest, "smooth_hz": gaps.cut_off_hz, **found,
         "evaluation": evaluate(frames, estimates, config["evaluated_frames"], config["batch"]),
-        "formats": config["formats"], "provenance": about.provenance,
+        "formats": formats, "provenance": about.provenance,
     }  # fmt: skip
     with atomic_write(output / "prediction.json", "w") as handle:
         json.dump(numbers, handle, indent=1)
@@ -122,7 +130,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     with atomic_write(output / "report.md", "w") as handle:
         handle.write(prediction_report(numbers))
     print_prediction(numbers)
-    files = ", ".join(f"poses.{name}" for name in config["formats"])
+    files = ", ".join(WRITERS[name].file for name in formats)
     _log.info("Written: %s and report.md in %s.", files, shown(output))
     return numbers
 
@@ -160,18 +168,21 @@ def from_files(config: dict[str, Any]) -> Frames:
     if not config["cameras"]:
         raise GhptConfigError("cameras", "is missing", "Name the file of the calibrated cameras: cameras=Calib.toml")
     cameras = read_cameras(config["cameras"])
+    calibrated(str(config["cameras"]), cameras)
+    title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
+    stored = open_stored(config["keypoints"], config["skeleton"], config["rate_hz"])
+    if stored is not None:
+        return frames_of_stored(stored, cameras, config["match"], config["views"], title)
     points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"])
     for note in people_note(points):
         _log.warning("%s: %s.", note.severity, note.text)
-    title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
-    return frames_of_files(points, cameras, config["match"], config["views"], title)
+    views = look_through(points, cameras, config["match"], config["views"])
+    return frames_of_views(views, str(Path(config["keypoints"]).resolve()), title)
 
 
 def _from_data(config: dict[str, Any]) -> Frames:
     case = from_data(config)
-    cameras = case.views.cameras.cameras
-    assert cameras is not None  # those of a data set are calibrated
-    return frames_of_recording(case.views.recording(case.title, cameras), case.source, case.title)
+    return frames_of_views(case.views, case.source, case.title)
 
 
 def _estimate(predictor: Predictor) -> Estimate:
@@ -189,12 +200,23 @@ def _key(frames: Frames, chosen: Chosen, origin: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
+def _formats(config: dict[str, Any], frames: Frames) -> list[str]:
+    """Those that are asked for; without any all that are there, but for those that need a rate that is not known."""
+    if frames.rate_hz:
+        return config["formats"] or list(_ALL)
+    for name in config["formats"] or ():
+        check(name not in _TIMED, "rate_hz", f"is unknown, and {name} needs it", "Give rate_hz=60, say.")
+    if config["formats"] is None:
+        _log.warning("The files do not tell the frame rate: no %s. Give rate_hz=60, say.", " and ".join(_TIMED))
+    return config["formats"] or [name for name in _ALL if name not in _TIMED]
+
+
 def _check(config: dict[str, Any]) -> None:
     for name in ("evaluated_frames", "shard_frames", "batch"):
         check(config[name] >= 1, name, f"is {config[name]}", "Give 1 or more.")
     for key, names, existing in (
         ("estimator", [config["estimator"]], config["baselines"]), ("compare", config["compare"], config["baselines"]),
-        ("formats", config["formats"], WRITERS),
+        ("formats", config["formats"] or [], WRITERS),
     ):  # fmt: skip
         for name in names:
             check(name in existing, key, f"there is no {name!r}", suggest(name, existing))

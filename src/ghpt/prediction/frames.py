@@ -3,30 +3,27 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
 from ghpt.data.camera_files import CameraFile
-from ghpt.data.detections import undistorted
-from ghpt.data.key_points import KeyPoints
-from ghpt.data.skeletons import joints17
-from ghpt.data.views import look_through, matched
+from ghpt.data.views import Views
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import KeyPointBatch, Recording
+from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import JOINTS
 
-_CHECKED = 2000
-"""Frames, evenly spread, on which the views are checked against their cameras."""
 _STAMPED = 4096
+"""Frames that are read at a time for the stamp."""
 _MEND = "Calibrate first (python calibrate.py keypoints=... cameras=...), and give the rig.toml that it writes."
 
-Seen = tuple[Float[np.ndarray, "T V J 2"], Float[np.ndarray, "T V J"], Bool[np.ndarray, "T V J"]]
-"""Undistorted pixels, confidences and what is seen, of the 17 joints."""
+Seen = tuple[Float[np.ndarray, "N V J 2"], Float[np.ndarray, "N V J"], Bool[np.ndarray, "N V J"]]
+"""Undistorted pixels (float32), confidences and what is seen, of the 17 joints."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +40,7 @@ class Frames:
     """The recording's own numbers, rising."""
     rate_hz: float | None
     read: Callable[[Int[np.ndarray, " N"]], Seen]
-    """The key points of some rows."""
+    """The key points of some rows, which rise."""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -59,11 +56,15 @@ class Frames:
             truth=torch.zeros(count, len(JOINTS), 3), truth_seen=torch.zeros(count, len(JOINTS), dtype=torch.bool),
         )  # fmt: skip
 
+    def spread(self, most: int) -> Int[np.ndarray, " N"]:
+        """At most so many rows, evenly spread."""
+        return np.unique(np.linspace(0, len(self) - 1, min(most, len(self))).astype(np.int64))
+
     def stamp(self) -> str:
-        """SHA-256 of everything that a prediction depends on."""
+        """SHA-256 of all that is known of the recording: cameras, numbers and key points."""
         digest = hashlib.sha256(repr((self.camera_names, len(self), self.rate_hz)).encode())
         for value in (self.cameras.K, self.cameras.R, self.cameras.t):
-            digest.update(value.double().numpy().tobytes())
+            digest.update(value.double().contiguous().numpy().tobytes())
         digest.update(self.frame.astype(np.int64).tobytes())
         for start in range(0, len(self), _STAMPED):
             for values in self.read(np.arange(start, min(start + _STAMPED, len(self)))):
@@ -71,43 +72,22 @@ class Frames:
         return digest.hexdigest()
 
 
-def frames_of_files(
-    points: KeyPoints, cameras: CameraFile, match: Mapping[str, str] | None, views: Sequence[str] | None, title: str,
-) -> Frames:  # fmt: skip
-    """A user's key points before their cameras. Raises GhptDataError for views without cameras (and the reverse),
-    fewer than two, cameras without extrinsics, and images of another size than the cameras'."""
-    pairs = matched(points.path, points.views, cameras, match or {}, views)
-    at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
-    if len(at) < 2:
+def frames_of_views(views: Views, source: str, title: str) -> Frames:
+    """Of key points in memory. Raises GhptDataError for less than two views, and for cameras without extrinsics."""
+
+    def read(rows: Int[np.ndarray, " N"]) -> Seen:
+        return views.key_points[rows], views.confidence[rows], views.seen[rows]
+
+    rate = None if views.rate_hz is None or math.isnan(views.rate_hz) else float(views.rate_hz)
+    rig = calibrated(source, views.cameras)
+    return Frames(title, source, views.cameras.names, rig, views.frame.astype(np.int64), rate, read)
+
+
+def calibrated(where: str, cameras: CameraFile) -> Cameras:
+    """The cameras that the views have. Raises GhptDataError unless they are two or more with extrinsics."""
+    if len(cameras) < 2:
         mend = "A place in space takes two views or more of the same moment."
-        raise GhptDataError(points.path, "views", f"there is only {', '.join(ordered.names) or 'none'}", mend)
-    if ordered.cameras is None:
-        raise GhptDataError(cameras.path, "rotation, translation", "there are no extrinsics of all cameras", _MEND)
-    count = len(points.frame)
-    spread = np.unique(np.linspace(0, count - 1, min(_CHECKED, count)).astype(int))
-    look_through(_rows(points, spread), cameras, match, views)
-
-    def read(rows: Int[np.ndarray, " N"]) -> Seen:
-        part = _rows(points, rows)
-        pixels, seen = np.zeros((*part.seen[:, at].shape, 2), np.float32), part.seen[:, at].copy()
-        for view, of in enumerate(at):
-            K, lens = ordered.K[view].numpy(), ordered.distortion[view].numpy()
-            pixels[:, view], seen[:, view] = undistorted(part.key_points[:, of], seen[:, view], K, lens)
-        return joints17(points.path, points.joints, pixels, part.confidence[:, at], seen)
-
-    return Frames(title, points.path, ordered.names, ordered.cameras, points.frame, points.rate_hz, read)
-
-
-def frames_of_recording(recording: Recording, source: str, title: str) -> Frames:
-    """A recording of a data set; its truth is left behind."""
-
-    def read(rows: Int[np.ndarray, " N"]) -> Seen:
-        return tuple(np.array(getattr(recording, field)[rows]) for field in ("key_points", "confidence", "seen"))
-
-    frame = np.array(recording.frame, dtype=np.int64)
-    return Frames(title, source, recording.camera_names, recording.cameras, frame, recording.rate_hz, read)
-
-
-def _rows(points: KeyPoints, rows: Int[np.ndarray, " N"]) -> KeyPoints:
-    parts = {name: getattr(points, name)[rows] for name in ("frame", "key_points", "confidence", "seen")}
-    return replace(points, **parts)
+        raise GhptDataError(where, "views", f"there is only {', '.join(cameras.names) or 'none'}", mend)
+    if cameras.cameras is None:
+        raise GhptDataError(cameras.path, "rotation, translation", "not all cameras have extrinsics", _MEND)
+    return cameras.cameras

@@ -82,12 +82,12 @@ def prediction_report(numbers: Numbers) -> str:
         "\n".join(f"- {line}" for line in summary_lines(numbers)),
         "## Errors by view",
         f"On {evaluation['frames']} frames, evenly spread; median and 90 %, pixels. *Reprojection* is the distance of "
-        "every key point from its joint; *left out*, from the joint that the other views alone give. A key point that is far off "
-        "counts in both.",
+        "every key point from its joint, those that the estimator set aside among them; *left out*, from the joint that "
+        "the other views alone give.",
         markdown(*error_rows(numbers)),
         "## Estimators",
-        "On the same key points; left-out views on the joints that all of them estimate without the view. *Segm.*: "
-        "the median over the body's parts of how much their lengths vary over the frames; *joints*: those with a position.",
+        "On the same key points; left-out views on the joints that all of them estimate without the view. *Segm.*: the "
+        "median over the body's parts of how much their lengths vary over the frames; *joints*: those with a position.",
         markdown(*comparison_rows(numbers)),
         "## Joints",
         "Frames in which each joint is observed, %.",

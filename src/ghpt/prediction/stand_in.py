@@ -50,23 +50,3 @@ class Learned:
         import dataclasses
 
         return dataclasses.replace(base, points=est.points)
-
-
-def _npz(path, about, chunks):
-    import dataclasses
-    import zipfile
-
-    from ghpt.files import atomic_write
-    from ghpt.report.stored_npz import add_member
-
-    parts = list(chunks())
-    with atomic_write(path) as handle, zipfile.ZipFile(handle, "w") as archive:
-        for f in dataclasses.fields(Reconstruction):
-            v = torch.cat([getattr(p, f.name) for p in parts])
-            if f.name == "points":
-                v = v.masked_fill((torch.cat([p.state for p in parts]) > 1)[..., None], torch.nan)
-            v = v.numpy()
-            add_member(archive, f.name, v.dtype, v.shape, v.tobytes())
-
-
-WRITERS = {"npz": _npz}

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -39,7 +38,7 @@ def counts(chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: t
 def evaluate(frames: Frames, estimates: Mapping[str, Estimate], most: int, size: int) -> Numbers:
     """For each estimator, on at most so many frames, evenly spread: reprojection errors by view; errors in views that
     were left out, on the joints that all of them estimate without that view; variation of the segments' lengths."""
-    rows = np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).astype(int))
+    rows = frames.spread(most)
     parts = [frames.batch(rows[start : start + size]) for start in range(0, len(rows), size)]
     own = {name: [estimate(part) for part in parts] for name, estimate in estimates.items()}
     held = {name: [_held_out(part, estimate) for part in parts] for name, estimate in estimates.items()}
