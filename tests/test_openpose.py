@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ghpt.data.key_points import read_key_points
-from ghpt.data.openpose import follow, read_people
+from ghpt.data.openpose import follow, read_view
 from ghpt.data.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
 
@@ -131,7 +131,7 @@ def test_a_bad_file_is_named(name, content, says, tmp_path):
     write(tmp_path, [[person()]] * 3)
     (tmp_path / name).write_text(content)
     with pytest.raises(GhptDataError, match=says):
-        read_people(tmp_path)
+        read_view(tmp_path)
 
 
 def test_the_real_recording(shared_data):

@@ -1,13 +1,16 @@
-"""People's own camera files: Pose2Sim, aniposelib, caliscope, freemocap, OpenCV, EasyMocap and Panoptic.
+"""People's own camera files: Pose2Sim, aniposelib, caliscope, freemocap, OpenCV, EasyMocap, Panoptic, Human3.6M and
+COLMAP.
 
-All are read as world to camera, mm; the TOML and yml formats are in metres, Panoptic in centimetres.
+All are read as world to camera, mm; the TOML and yml formats are in metres, Panoptic in centimetres, Human3.6M in mm;
+COLMAP's models have a unit of their own.
 """
 
 from __future__ import annotations
 
+import logging
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +19,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ghpt.data.colmap import is_colmap, read_colmap
 from ghpt.data.opencv_yml import read_yml
 from ghpt.data.validate import check_cameras, open_input, read_json
 from ghpt.errors import GhptDataError
@@ -29,8 +33,9 @@ _MOST_CAMERAS = 10_000
 _FIELDS = ("matrix", "distortions", "rotation", "translation")
 _FORMATS = (
     "Known: TOML of Pose2Sim, aniposelib, caliscope or freemocap; intri.yml (with extri.yml beside it) of OpenCV or "
-    "EasyMocap; calibration JSON of CMU Panoptic."
+    "EasyMocap; calibration JSON of CMU Panoptic; camera-parameters.json of Human3.6M; a folder with a COLMAP model."
 )
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,8 @@ class CameraFile:
     R: Float[Tensor, "V 3 3"] | None
     """World to camera; None, with ``t``, unless the file has both for all cameras and they are not all the same."""
     t: Float[Tensor, "V 3"] | None
+    unit_known: bool = True
+    """False where the file has no unit of length and nobody gave one: then ``t`` is in mm by a guess."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -67,7 +74,7 @@ class CameraFile:
             for field in ("K", "distortion", "size", "R", "t")
         }
         names, other = (tuple(v[i] for i in at) for v in (self.names, self.other_names))
-        return CameraFile(self.path, self.format, names, other, **tensors)
+        return replace(self, names=names, other_names=other, **tensors)
 
 
 @dataclass(frozen=True)
@@ -84,22 +91,35 @@ class _Entry:
     t: Any = None
 
 
-def read_cameras(path: str | Path) -> CameraFile:
-    """The cameras of a file, or of a folder with intri.yml; its format is recognised by its content.
+def read_cameras(path: str | Path, subject: str | None = None, unit_mm: int | float | None = None) -> CameraFile:
+    """The cameras of a file, or of a folder with intri.yml or a COLMAP model; the format is recognised by content.
 
-    Raises GhptDataError, naming file, field and mend, for anything that is not a pinhole camera with the lens of
-    ``ghpt.data.lens``: fisheye lenses among it.
+    ``subject`` chooses of a Human3.6M file, which has other extrinsics for each. ``unit_mm`` is the length of the
+    file's unit where that is not the format's own: COLMAP's models have none, and are taken to be in metres with a
+    warning. Raises GhptDataError, naming file, field and mend, for anything that is not a pinhole camera with the lens
+    of ``ghpt.data.lens``: fisheye lenses among it.
     """
     path = Path(path)
+    if unit_mm is not None and not 0 < unit_mm < float("inf"):
+        raise GhptDataError(path, "unit_mm", f"is {unit_mm}", "Give the length of the file's unit in mm.")
+    if path.is_dir() and is_colmap(path):
+        if unit_mm is None:
+            _log.warning("%s: a COLMAP model has no unit of length: it is taken to be in metres; unit_mm= says how "
+                         "many mm its unit is.", path)  # fmt: skip
+        entries = [_Entry(c.name, c.other, c.K, c.distortion, c.size, c.R, c.t) for c in read_colmap(path)]
+        return replace(_checked(path, "COLMAP", entries, unit_mm or _MM_PER_M), unit_known=unit_mm is not None)
     if path.is_dir():
         path = path / "intri.yml"
     with open_input(path) as handle:
         start = handle.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
     if start.startswith(b"%YAML"):
-        return _checked(path, "OpenCV", _opencv(path), _MM_PER_M)
-    if start.startswith(b"{"):
-        return _checked(path, "Panoptic", _panoptic(path), _MM_PER_CM)
-    return _checked(path, *_toml(path), _MM_PER_M)
+        return _checked(path, "OpenCV", _opencv(path), unit_mm or _MM_PER_M)
+    if start.startswith((b"{", b"\xff\xfe{", b"\xfe\xff\0{")):
+        content = read_json(path)
+        if isinstance(content, dict) and "intrinsics" in content:
+            return _checked(path, "Human3.6M", _human36m(path, content, subject), unit_mm or 1.0)
+        return _checked(path, "Panoptic", _panoptic(path, content), unit_mm or _MM_PER_CM)
+    return _checked(path, *_toml(path), unit_mm or _MM_PER_M)
 
 
 def _toml(path: Path) -> tuple[str, list[_Entry]]:
@@ -154,8 +174,32 @@ def _opencv(path: Path) -> list[_Entry]:
     return entries
 
 
-def _panoptic(path: Path) -> list[_Entry]:
-    content = read_json(path)
+def _human36m(path: Path, content: Mapping[str, Any], subject: str | None) -> list[_Entry]:
+    """karfly's file: R and t take the world (mm) to the camera, unlike those of the data set's own XML."""
+    intrinsics, extrinsics = content["intrinsics"], content.get("extrinsics", {})
+    for field, value in (("intrinsics", intrinsics), ("extrinsics", extrinsics)):
+        if not isinstance(value, dict) or not all(isinstance(part, dict) for part in value.values()):
+            raise GhptDataError(path, field, "is not an object of objects", "Get the file again.")
+    if subject is None and len(extrinsics) == 1:
+        subject = next(iter(extrinsics))
+    if subject not in extrinsics and (extrinsics or subject is not None):
+        problem = "the extrinsics are different for each subject" if subject is None else f"there is no {subject!r}"
+        raise GhptDataError(path, "subject", problem, f"Choose one of {', '.join(extrinsics)}: subject=...")
+    poses = extrinsics[subject] if subject is not None else {}
+    entries = []
+    for name, camera in intrinsics.items():
+        pose = poses.get(name, {})
+        for field in ("calibration_matrix", "distortion"):
+            if field not in camera:
+                raise GhptDataError(path, f"intrinsics.{name}.{field}", "is missing", "Get the file again.")
+        if not isinstance(pose, dict):
+            raise GhptDataError(path, f"extrinsics.{subject}.{name}", "is not an object", "Get the file again.")
+        entries.append(_Entry(name, "", camera["calibration_matrix"], camera["distortion"], None, pose.get("R"),
+                              pose.get("t")))  # fmt: skip
+    return entries
+
+
+def _panoptic(path: Path, content: Any) -> list[_Entry]:
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
         raise GhptDataError(path, "cameras", "is not a list of cameras", _FORMATS)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import codecs
 import csv
 import io
+import re
 import warnings
 from pathlib import Path
 
@@ -21,10 +23,19 @@ _WRITE = "It must be an xy_*.csv that caliscope wrote."
 _JOINTS = len(SKELETONS["mediapipe_33"])
 
 
-def is_caliscope(start: bytes) -> bool:
-    """Whether a file that starts so is one of caliscope's 2D tables."""
-    header = start.splitlines()[0].decode("utf-8", "replace").split(",") if start else []
-    return set(COLUMNS) <= {name.strip() for name in header}
+def opening(start: bytes) -> str:
+    """The text that a file begins with, whatever its encoding's mark says (UTF-8 without one)."""
+    marks = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
+    for mark, encoding in marks:
+        if start.startswith(mark):
+            return start[len(mark) :].decode(encoding, "replace").lstrip()
+    return start.decode("utf-8", "replace").lstrip()
+
+
+def is_caliscope(text: str) -> bool:
+    """Whether a file that starts so is one of caliscope's 2D tables, its columns parted by commas or not."""
+    header = text.splitlines()[0] if text else ""
+    return set(COLUMNS) <= {name.strip().strip('"') for name in re.split("[,;\t]", header)}
 
 
 def read_caliscope(
@@ -57,19 +68,30 @@ def read_caliscope(
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:
     if path.stat().st_size > _LARGEST:
         raise GhptDataError(path, "", f"has more than {_LARGEST >> 30} GiB", "Split the recording.")
-    with open_input(path) as raw, io.TextIOWrapper(raw, encoding="utf-8", errors="replace", newline="") as handle:
-        try:
-            header = [name.strip() for name in next(csv.reader([handle.readline()]))]
-            columns = [header.index(name) for name in COLUMNS]
-            # an empty cell is a point that was not found
-            empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", UserWarning)  # of a table without rows
-                table = np.loadtxt(handle, delimiter=",", usecols=columns, converters=empty, ndmin=2)
-        except (ValueError, StopIteration, csv.Error) as error:
-            raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
-    table = table.reshape(-1, len(COLUMNS))
+    with open_input(path) as raw:
+        utf16 = raw.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        encoding = "utf-16" if utf16 else "utf-8-sig"
+        with io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline="") as handle:
+            table = _rows(path, handle)
     whole = table[:, :3][np.isfinite(table[:, :3])]
     if not (np.abs(np.nan_to_num(table)) < 1e12).all() or (whole != np.round(whole)).any():
         raise GhptDataError(path, "", "holds an index that is not whole, or a number beyond 1e12", _WRITE)
     return table
+
+
+def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
+    line = handle.readline(1 << 16)
+    if ";" in line or "\t" in line:
+        mend = "Save it with commas between the columns and points in the numbers (a spreadsheet may have changed it)."
+        raise GhptDataError(path, "", "has columns that commas do not part", mend)
+    try:
+        header = [name.strip() for name in next(csv.reader([line]))]
+        columns = [header.index(name) for name in COLUMNS]
+        # an empty cell is a point that was not found
+        empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a table without rows
+            table = np.loadtxt(handle, delimiter=",", usecols=columns, converters=empty, ndmin=2)
+    except (ValueError, StopIteration, csv.Error) as error:
+        raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
+    return table.reshape(-1, len(COLUMNS))

@@ -41,7 +41,8 @@ def _node(path: Path, key: str, value: Any) -> Node | None:
     if isinstance(value, dict) and {"rows", "cols", "data"} <= set(value):
         return _matrix(path, key, value)
     if isinstance(value, list):
-        return [str(item) for item in value]
+        # lists within lists may stand for more than memory holds: a few lines of aliases double at each line
+        return [item for item in value if isinstance(item, str)]
     if isinstance(value, str):
         try:
             return float(value)

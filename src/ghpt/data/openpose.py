@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -10,18 +11,29 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ghpt.data.people import MOST_PEOPLE, Detections, People, gather, triples
 from ghpt.data.validate import read_json
 from ghpt.errors import GhptDataError
 
 _LAYOUT = "It must hold a folder for each camera, each with a JSON file for each frame: cam1/cam1_000000000012.json."
 _MOST_FILES = 2_000_000
-_MOST_PEOPLE = 64
-"""In a view of a frame; more are no people."""
 _JUMP = 2.0
 """How much of a person's quality (at most 1) a jump by their own size costs."""
 
-People = list[Float[np.ndarray, "_ K 3"]]
+Frames = list[Float[np.ndarray, "_ K 3"]]
 """For each frame the people in it: x, y, confidence of their joints; pixels."""
+
+
+def read_openpose(root: Path, skeleton: str | None) -> People:
+    """Everybody in OpenPose's files, or those of other detectors in its layout. Raises GhptDataError.
+
+    A ``person_id`` that all people of all views have, from 0 on, is taken as the person's number in all views; OpenPose
+    itself writes -1.
+    """
+    found = [read_view(folder) for folder in camera_folders(root)]
+    if not all((view.identity >= 0).all() for view in found):
+        found = [replace(view, identity=np.full_like(view.identity, -1)) for view in found]
+    return gather(root, found, None, skeleton)
 
 
 def camera_folders(root: Path) -> list[Path]:
@@ -33,61 +45,68 @@ def camera_folders(root: Path) -> list[Path]:
     return folders
 
 
-def read_people(folder: Path) -> tuple[Int[np.ndarray, " T"], People]:
-    """One camera's frame numbers, in order, and the people of each; all have the same number of joints.
+def frame_number(path: Path) -> int:
+    """The last number in the file's name. Raises GhptDataError for a name without one."""
+    digits = re.findall(r"\d+", path.stem)
+    if not digits or len(digits[-1]) > 15:
+        raise GhptDataError(path, "", "its name has no frame number", "Name the files like cam1_000012.json.")
+    return int(digits[-1])
+
+
+def read_view(folder: Path) -> Detections:
+    """One camera's people; all have the same number of joints.
 
     The frame number is the last number in the file's name, so a file that is missing shifts nothing. Raises
     GhptDataError for a name without a number, a number that is there twice, and a damaged file.
     """
     files: dict[int, Path] = {}
     for path in sorted(folder.glob("*.json")):
-        digits = re.findall(r"\d+", path.stem)
-        if not digits or len(digits[-1]) > 15:
-            raise GhptDataError(path, "", "its name has no frame number", "Name the files like cam1_000012.json.")
-        number = int(digits[-1])
+        number = frame_number(path)
         if number in files:
             problem = f"has the frame number {number}, as {files[number].name} has"
             raise GhptDataError(path, "", problem, "Keep one file for each frame.")
         files[number] = path
     if len(files) > _MOST_FILES:
         raise GhptDataError(folder, "", f"holds {len(files)} files", f"At most {_MOST_FILES} are read.")
-    frames = sorted(files)
-    people: People = []
-    joints = 0
-    for frame in frames:
-        found = _people(files[frame])
-        if found.shape[0]:
-            if joints not in (0, found.shape[1]):
-                problem = f"has people of {found.shape[1]} joints, the files before of {joints}"
-                raise GhptDataError(files[frame], "people", problem, "Detect all frames with one model.")
-            joints = found.shape[1]
-        people.append(found)
-    return np.array(frames, np.int64), [p if len(p) else np.zeros((0, joints, 3)) for p in people]
+    found: list[Float[np.ndarray, "P K 3"]] = []
+    numbers, identities, joints = [], [], 0
+    for number in sorted(files):
+        people, identity = _people(files[number])
+        if len(people):
+            if joints not in (0, people.shape[1]):
+                problem = f"has people of {people.shape[1]} joints, the files before of {joints}"
+                raise GhptDataError(files[number], "people", problem, "Detect all frames with one model.")
+            joints = people.shape[1]
+            found.append(people)
+            numbers += [number] * len(people)
+            identities += identity
+    values = np.concatenate(found) if found else np.zeros((0, 0, 3))
+    frames = np.array(sorted(files), np.int64)
+    return Detections(folder.name, frames, np.array(numbers, np.int64), values, np.array(identities, np.int64))
 
 
-def _people(path: Path) -> Float[np.ndarray, "P K 3"]:
+def _people(path: Path) -> tuple[Float[np.ndarray, "P K 3"], list[int]]:
+    """The people of a file and their ``person_id``, -1 without one."""
     content = read_json(path)
     people = content.get("people") if isinstance(content, dict) else None
     if not isinstance(people, list) or not all(isinstance(person, dict) for person in people):
         raise GhptDataError(path, "people", "is not a list of people", "This must be a file that OpenPose wrote.")
-    if len(people) > _MOST_PEOPLE:
-        raise GhptDataError(path, "people", f"{len(people)} are listed", f"At most {_MOST_PEOPLE} are read.")
-    found = [_joints(path, index, person) for index, person in enumerate(people)]
-    found = [person for person in found if len(person)]
-    if len({person.shape for person in found}) > 1:
+    if len(people) > MOST_PEOPLE:
+        raise GhptDataError(path, "people", f"{len(people)} are listed", f"At most {MOST_PEOPLE} are read.")
+    found = [triples(path, f"people[{i}].pose_keypoints_2d", person.get("pose_keypoints_2d"))
+             for i, person in enumerate(people)]  # fmt: skip
+    kept = [i for i, person in enumerate(found) if len(person)]
+    if len({found[i].shape for i in kept}) > 1:
         raise GhptDataError(path, "people", "do not have the same number of joints", "Detect them with one model.")
-    return np.stack(found) if found else np.zeros((0, 0, 3))
+    if not kept:
+        return np.zeros((0, 0, 3)), []
+    return np.stack([found[i] for i in kept]), [_identity(people[i].get("person_id")) for i in kept]
 
 
-def _joints(path: Path, index: int, person: dict[str, Any]) -> Float[np.ndarray, "K 3"]:
-    field = f"people[{index}].pose_keypoints_2d"
-    flat = person.get("pose_keypoints_2d")
-    if not isinstance(flat, list) or len(flat) % 3 or not all(type(x) in (int, float) for x in flat):
-        raise GhptDataError(path, field, "is not a list of x, y, confidence", "Detect this frame again.")
-    joints = np.array([min(max(x, -1e300), 1e300) for x in flat], dtype=np.float64).reshape(-1, 3)
-    if not (np.abs(joints) < 1e6).all():
-        raise GhptDataError(path, field, "holds a number beyond 1e6", "Detect this frame again.")
-    return joints
+def _identity(value: Any) -> int:
+    if isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    return value if type(value) is int and 0 <= value < 1 << 31 else -1
 
 
 def seen_joints(people: Float[np.ndarray, "*B K 3"]) -> Bool[np.ndarray, "*B K"]:
@@ -95,7 +114,19 @@ def seen_joints(people: Float[np.ndarray, "*B K 3"]) -> Bool[np.ndarray, "*B K"]
     return people[..., 2] > 0
 
 
-def follow(people: People) -> Int[np.ndarray, " T"]:
+def follow_views(people: People) -> Int[np.ndarray, "T V"]:
+    """The index of the one person who is followed through each view by itself (`follow`), -1 where there is nobody."""
+    chosen = people.first()
+    several = people.counts() > 1
+    for view in np.flatnonzero(several.any(0)):
+        of = np.flatnonzero(people.view == view)
+        rows, starts = np.unique(people.row[of], return_index=True)
+        values = np.concatenate([people.key_points[of], np.where(people.seen, people.confidence, 0)[of, :, None]], -1)
+        chosen[rows, view] = of[starts + follow(np.split(values, starts[1:]))]
+    return chosen
+
+
+def follow(people: Frames) -> Int[np.ndarray, " T"]:
     """For each frame the index of the one person that is followed through it, -1 where there is nobody.
 
     Of all ways to choose one person in each frame, the one with the greatest sum of qualities less jumps

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -147,3 +148,26 @@ def _bone_length(joints: tuple[str, ...], key_points: np.ndarray, seen: np.ndarr
     length = np.where(seen[:, a] & seen[:, b], np.linalg.norm(key_points[:, a] - key_points[:, b], axis=-1), np.nan)
     measured = ~np.isnan(length).all(0)
     return float(np.nanmedian(length[:, measured], axis=0).mean()) if measured.any() else np.inf
+
+
+_OTHER_WORDS = {
+    "root": "pelvis", "hip": "mid_hip", "hip_center": "mid_hip", "neck_base": "neck", "head": "head_top",
+    "top_head": "head_top", "right_foot": "right_ankle", "left_foot": "left_ankle",
+}  # fmt: skip
+
+
+def canonical(names: Sequence[str]) -> tuple[str, ...]:
+    """A file's own names of joints in the words of ``SKELETONS``: ``Left Elbow``, ``LElbow`` and ``leftElbow`` are
+    ``left_elbow``; what is not known stays as it is. MMPose's ``h36m`` calls the nose the base of the neck."""
+    found = tuple(_canonical(name) for name in names)
+    return tuple("nose" if name == "neck" and "thorax" in found and "nose" not in found else name for name in found)
+
+
+def _canonical(name: str) -> str:
+    word = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=^[LR])(?=[A-Z][a-z])|[ .-]+", "_", name.strip()).lower()
+    word = re.sub(r"^l_", "left_", re.sub(r"^r_", "right_", word))
+    word = re.sub(r"^(.+)_(left|right|l|r)$", lambda m: f"{_SIDES.get(m[2], m[2])}_{m[1]}", word)
+    return _OTHER_WORDS.get(word, word)
+
+
+_SIDES = {"l": "left", "r": "right"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,15 +10,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ghpt.data.association import associate
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.detections import undistorted
-from ghpt.data.key_points import KeyPoints
+from ghpt.data.openpose import follow_views
+from ghpt.data.people import KeyPoints, People
 from ghpt.data.skeletons import joints17
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINTS
 
+_log = logging.getLogger(__name__)
 _MEND = "Rename them, say which is which (match={view: camera}), or name the views to use (views=[...])."
 _MOST_OUTSIDE = 0.25
 _WORDS = r"[ _.-](json|openpose|pose|keypoints|kpts|body|2d)\b"
@@ -56,18 +60,22 @@ class Views:
 
 
 def look_through(
-    points: KeyPoints,
+    points: KeyPoints | People,
     cameras: CameraFile,
     match: Mapping[str, str] | None = None,
     views: Sequence[str] | None = None,
+    person: int = 0,
 ) -> Views:
     """Key points with their cameras: lens distortion undone, then the detector's joints mapped to the 17.
 
     ``views`` names those to use (by the view's or the camera's name); without it every view must have its camera and
-    every camera its view. ``match`` gives the camera of a view where names do not tell. Raises GhptDataError.
+    every camera its view. ``match`` gives the camera of a view where names do not tell. Of several people that one is
+    taken who `who` says. Raises GhptDataError.
     """
     pairs = matched(points.path, points.views, cameras, match or {}, views)
     at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
+    if isinstance(points, People):
+        points = points.pick(who(points, ordered, at, person))
     pixels, seen = np.zeros(points.key_points[:, at].shape, np.float32), points.seen[:, at].copy()
     _check_sizes(points.path, points.key_points[:, at], seen, ordered)
     for view in range(len(at)):
@@ -75,6 +83,65 @@ def look_through(
         pixels[:, view], seen[:, view] = undistorted(points.key_points[:, at[view]], seen[:, view], K, lens)
     values = joints17(points.path, points.joints, pixels, points.confidence[:, at], seen)
     return Views(ordered, *values, frame=points.frame, rate_hz=points.rate_hz)
+
+
+def who(people: People, cameras: CameraFile, at: Sequence[int], person: int = 0) -> Int[np.ndarray, "T V"]:
+    """The index of one person's detection in each frame and view, -1 where there is none.
+
+    ``cameras`` are those of the views ``at``. Where all detections have an identity, the person is who has the most of
+    them (``person`` = 0), or the next. Otherwise, where nobody is ever beside another, everybody is one person; else,
+    where the cameras have extrinsics, people are told apart across the views (`ghpt.data.association.associate`); and
+    where they have none, or no two views agree in half of the frames, each view follows its own person
+    (`ghpt.data.openpose.follow`), with a warning. Raises GhptDataError if there is no such person.
+    """
+    of = np.isin(people.view, list(at))
+    if len(people.identity) and (people.identity >= 0).all():
+        numbers, counts = np.unique(people.identity[of], return_counts=True)
+        order = numbers[np.argsort(-counts, kind="stable")]
+        found = [people.of(np.flatnonzero(of & (people.identity == number))) for number in order]
+        return _person(people, found, person)
+    if not (people.counts()[:, at] > 1).any():
+        return _person(people, [people.first()], person)
+    if cameras.cameras is not None:
+        found = _across(people, cameras, at)
+        two = ((people.counts()[:, at] > 0).sum(1) >= 2).sum()
+        if found and 2 * sum((chosen >= 0).any(1).sum() for chosen in found[:1]) >= two:
+            return _person(people, found, person)
+        doubt = "check the extrinsics of %s, and that frames have the same numbers in all views"
+        words = f"%s: the views agree on nobody: {doubt}. Each view follows the person that it tracks best."
+        _log.warning(words, people.path, cameras.path)
+    return _person(people, [follow_views(people)], person)
+
+
+def _person(people: People, found: Sequence[np.ndarray], person: int) -> Int[np.ndarray, "T V"]:
+    if not 0 <= person < len(found):
+        mend = f"Give a number below {len(found)}; 0 is who is seen most."
+        raise GhptDataError(people.path, "person", f"there is no person {person}: {len(found)} can be told apart", mend)
+    return found[person]
+
+
+def _across(people: People, cameras: CameraFile, at: Sequence[int]) -> list[Int[np.ndarray, "T V"]]:
+    """Everybody who can be told apart across the views ``at``."""
+    chosen, pixels, seen = [], [], []
+    for place, view in enumerate(at):
+        of = np.flatnonzero(people.view == view)
+        K, lens = cameras.K[place].numpy(), cameras.distortion[place].numpy()
+        points, there = undistorted(people.key_points[of], people.seen[of], K, lens)
+        chosen.append(of)
+        pixels.append(points)
+        seen.append(there)
+    index = np.concatenate(chosen)
+    values = joints17(people.path, people.joints, np.concatenate(pixels)[:, None], people.confidence[index][:, None],
+                      np.concatenate(seen)[:, None])  # fmt: skip
+    points, sure, there = (value[:, 0] for value in values)
+    place = np.repeat(np.arange(len(at)), [len(of) for of in chosen])
+    found = associate(cameras.cameras, len(people.frame), people.row[index], place, points, there, sure)
+    people_of = []
+    for one in found:
+        whole = np.full((len(people.frame), len(people.views)), -1)
+        whole[:, at] = np.where(one >= 0, index[one], -1)
+        people_of.append(whole)
+    return people_of
 
 
 def matched(
