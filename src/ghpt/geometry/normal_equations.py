@@ -7,6 +7,9 @@ weighted by pixels, and the matrix ``a a^T + b b^T`` holds no length: its condit
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import NamedTuple
+
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -40,13 +43,13 @@ def usable_views(cameras: Cameras, key_points: Float[Tensor, "*B V J 2"]) -> Boo
     return (key_points.abs() <= LARGEST).all(-1) & valid_cameras(cameras)[..., None]
 
 
-def local_cameras(cameras: Cameras) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
+def local_cameras(cameras: Cameras, valid: Bool[Tensor, "*B V"] | None = None) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
     """Float64 cameras in a world whose origin is the rig's (component-wise median) centre, and that origin.
 
     Far from the world's origin the squares of coordinates would cost digits, and a median is not moved by one
-    camera with absurd numbers. Invalid cameras are replaced by one at the origin.
+    camera with absurd numbers. Invalid cameras are replaced by one at the origin. ``valid``: ``valid_cameras``.
     """
-    valid = valid_cameras(cameras)
+    valid = valid_cameras(cameras) if valid is None else valid
     K, R, t = (x.to(torch.float64) for x in (cameras.K, cameras.R, cameras.t))
     identity = torch.eye(3, dtype=torch.float64, device=K.device)
     K = torch.where(valid[..., None, None], K, identity)
@@ -57,27 +60,68 @@ def local_cameras(cameras: Cameras) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
     return Cameras(K, R, t + (R @ origin[..., None, :, None])[..., 0]), origin
 
 
-def view_rows(
-    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"]
-) -> tuple[Float[Tensor, "*B V J 2 3"], Float[Tensor, "*B V J 2"]]:
-    """The two rows of each view and joint and their right-hand sides; residuals are depth x pixel error."""
-    K, R, t = cameras.K, cameras.R, cameras.t
-    offset = key_points - K[..., None, :2, 2]
-    rows = offset[..., None] * R[..., None, 2:, :] - (K[..., :2, :2] @ R[..., :2, :])[..., None, :, :]
-    right = (K[..., :2, :2] @ t[..., :2, None])[..., None, :, 0] - offset * t[..., None, 2:]
-    return rows, right
+class Views(NamedTuple):
+    """Cameras and key points with their components apart and the frames last, so that each operation runs along
+    memory: key points are [V, J, B], what is a camera's is [V, 1, B]; float64."""
+
+    first: tuple[Tensor, Tensor, Tensor]
+    """The first row of ``K[:2, :2] R[:2]``."""
+    second: tuple[Tensor, Tensor, Tensor]
+    axis: tuple[Tensor, Tensor, Tensor]
+    """The optical axis, r_3."""
+    shift: tuple[Tensor, Tensor, Tensor]
+    """``K[:2, :2] t[:2]`` and t_3."""
+    u: Tensor
+    """Horizontal pixels from the principal point; 0 where the view is not usable."""
+    v: Tensor
+
+    def rows(self) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+        """The rows a and b of each view and joint, their right-hand sides the last of four."""
+        (p, q, tz) = self.shift
+        a = [self.u * r - k for r, k in zip(self.axis, self.first, strict=True)]
+        b = [self.v * r - k for r, k in zip(self.axis, self.second, strict=True)]
+        return (*a, p - self.u * tz), (*b, q - self.v * tz)
+
+    def depth(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+        """Of points [J, B] in each view, mm."""
+        (rx, ry, rz), shift = self.axis, self.shift[2]
+        return torch.addcmul(torch.addcmul(torch.addcmul(shift, rx, x), ry, y), rz, z)
+
+
+def views_of(cameras: Cameras, key_points: Float[Tensor, "B V J 2"], usable: Bool[Tensor, "V J B"]) -> Views:
+    """``cameras`` are used as they are: pass valid ones near the origin, [B, V] or [1, V] for all frames."""
+    R, t = cameras.R.permute(2, 3, 1, 0)[..., None, :].contiguous(), cameras.t.permute(2, 1, 0)[..., None, :]
+    K = cameras.K.permute(2, 3, 1, 0)[:2, :, :, None].contiguous()
+    pixels = torch.where(usable, key_points.permute(3, 1, 2, 0).to(torch.float64), 0.0)
+    u, v = (torch.where(usable, pixels[i] - K[i, 2], 0.0) for i in range(2))
+    first, second = (tuple(K[i, 0] * R[0, j] + K[i, 1] * R[1, j] for j in range(3)) for i in range(2))
+    shift = tuple(K[i, 0] * t[0] + K[i, 1] * t[1] for i in range(2))
+    return Views(first, second, tuple(R[2]), (*shift, t[2].contiguous()), u, v)
+
+
+def products(a: Sequence[Tensor], b: Sequence[Tensor]) -> Float[Tensor, "V 9 J B"]:
+    """Normal equations of each view alone from its two rows: the matrix (xx xy xz yy yz zz) and its right-hand side
+    (3)."""
+    pairs = [(i, j) for i in range(3) for j in range(i, 3)] + [(i, 3) for i in range(3)]
+    return torch.stack([torch.addcmul(a[i] * a[j], b[i], b[j]) for i, j in pairs], dim=1)
+
+
+def weighted_sum(equations: Float[Tensor, "V E J B"], weights: Float[Tensor, "V J B"]) -> Float[Tensor, "E J B"]:
+    """Over the views, in their order: each frame's sum is the same in any batch, as ``torch.sum``'s is not."""
+    total = equations.new_zeros(equations.shape[1:])
+    for equation, weight in zip(equations, weights, strict=True):
+        total = torch.addcmul(total, equation, weight)
+    return total
 
 
 def view_equations(
-    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"], usable: Bool[Tensor, "*B V J"]
-) -> Float[Tensor, "*B V J 9"]:
+    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], usable: Bool[Tensor, "B V J"]
+) -> Float[Tensor, "B V J 9"]:
     """Normal equations of each view alone, float64: the matrix (xx xy xz yy yz zz) and its right-hand side (3);
     all 0 where the view is not usable. ``cameras`` are used as they are: pass valid ones near the origin."""
-    safe = torch.where(usable[..., None], key_points.to(torch.float64), 0.0)
-    rows, right = view_rows(cameras, safe)
-    x, y, z = rows.unbind(-1)
-    columns = (x * x, x * y, x * z, y * y, y * z, z * z, x * right, y * right, z * right)
-    return torch.where(usable[..., None], torch.stack(columns, dim=-1).sum(-2), 0.0)
+    usable = usable.permute(1, 2, 0)
+    each = products(*views_of(cameras, key_points, usable).rows())
+    return torch.where(usable[:, None], each, 0.0).permute(3, 0, 2, 1)
 
 
 def minors(m: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

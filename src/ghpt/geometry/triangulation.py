@@ -6,25 +6,34 @@ the number of subsets; then each joint is a 3x3 solve.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
 import torch
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import (
+    LARGEST,
+    Views,
     local_cameras,
     minors,
+    products,
     solve_symmetric,
     usable_views,
+    valid_cameras,
     view_equations,
-    view_rows,
+    views_of,
+    weighted_sum,
 )
 
 NO_DEPTH = 1e-9
 """A depth below this fraction of |t| is rounding: the rays met in the camera's own centre."""
+
+_AT_ONCE = 2**15
+"""Key points that are worked on at once: few enough to stay in a processor's cache."""
 
 
 class Status(IntEnum):
@@ -65,29 +74,6 @@ class Triangulation:
         return self.status == Status.OK
 
 
-def _ray_angle(cameras: Cameras, key_points: Tensor, used: Bool[Tensor, "*B V J"]) -> Float[Tensor, "*B J"]:
-    """``Triangulation.angle``: the sum of |d_i x d_j|^2 over pairs is the sum of the principal minors of
-    the sum of d d^T (Cauchy-Binet)."""
-    rays = torch.cat((key_points, torch.ones_like(key_points[..., :1])), dim=-1)
-    rays = rays @ (torch.linalg.inv_ex(cameras.K).inverse.mT @ cameras.R)
-    rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-    x, y, z = torch.where(used[..., None], rays, 0.0).unbind(-1)
-    areas = minors(tuple(product.sum(-2) for product in (x * x, x * y, x * z, y * y, y * z, z * z)))
-    count = used.sum(-2)
-    pairs = (count * (count - 1) / 2).clamp(min=1)
-    return ((areas[0] + areas[3] + areas[5]) / pairs).clamp(0, 1).sqrt().asin()
-
-
-def _one_centre(
-    cameras: Cameras, distance: Float[Tensor, "*B V"], used: Bool[Tensor, "*B V J"]
-) -> Bool[Tensor, "*B J"]:
-    """Whether the used cameras have one and the same centre, within the rounding of their world's distances."""
-    centre = cameras.centre[..., None, :]
-    spread = torch.where(used[..., None], centre, -torch.inf).amax(-3)
-    spread = spread - torch.where(used[..., None], centre, torch.inf).amin(-3)
-    return (spread <= 1e-12 * distance.amax(-1)[..., None, None]).all(-1)
-
-
 def triangulate(
     cameras: Cameras, key_points: Float[Tensor, "*B V J 2"], weights: Float[Tensor, "*B V J"]
 ) -> Triangulation:
@@ -96,44 +82,115 @@ def triangulate(
     A view with weight 0 (or less) is not used, and whatever its numbers are they change nothing. Never raises
     on values; a joint's result depends on its own inputs only.
     """
+    lead, (views, joints) = weights.shape[:-2], weights.shape[-2:]
+    rig = flat_cameras(cameras, lead)
+    frames = lead.numel()
+    key_points, weights = key_points.reshape(frames, views, joints, 2), weights.reshape(frames, views, joints)
+    parts = []
+    size = max(1, _AT_ONCE // max(views * joints, 1))
+    for start in range(0, max(frames, 1), size):
+        part = slice(start, start + size)
+        parts.append(_triangulate(rig if len(rig.t) == 1 else rig.index(part), key_points[part], weights[part]))
+    whole = [torch.cat(field) if len(parts) > 1 else field[0] for field in zip(*parts, strict=True)]
+    return Triangulation(*(x.reshape(*lead, *x.shape[1:]) for x in whole))
+
+
+def flat_cameras(cameras: Cameras, lead: torch.Size) -> Cameras:
+    """Cameras with the leading dimensions as one; of length 1 where all frames share one rig in memory."""
+    views = cameras.t.shape[-2]
+    fields = []
+    for x, inner in ((cameras.K, 2), (cameras.R, 2), (cameras.t, 1)):
+        fields.append(x.expand(*lead, views, *x.shape[-inner:]))
+    frames = lead.numel()
+    if frames > 1 and not any(any(x.stride()[: len(lead)]) for x in fields):
+        return Cameras(*(x[(0,) * len(lead)][None] for x in fields))
+    return Cameras(*(x.reshape(frames, *x.shape[len(lead) :]) for x in fields))
+
+
+def _triangulate(
+    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], weights: Float[Tensor, "B V J"]
+) -> tuple[Tensor, ...]:
+    """The fields of Triangulation for a few frames; inside, arrays are [V, J, B]."""
+    weights = weights.permute(1, 2, 0).contiguous()
+    valid = valid_cameras(cameras)
+    local, origin = local_cameras(cameras, valid)
     chosen = ~(weights <= 0)
-    used = chosen & usable_views(cameras, key_points) & (weights < torch.inf)
-    spoilt = (chosen & ~used).any(-2)
-    local, origin = local_cameras(cameras)
-    safe = torch.where(used[..., None], key_points.to(torch.float64), 0.0)
+    usable = (key_points.abs() <= LARGEST).all(-1).permute(1, 2, 0) & valid.mT[:, None]
+    used = chosen & usable & (weights < torch.inf)
+    spoilt = (chosen & ~used).any(0)
+    count = used.sum(0)
     weight = torch.where(used, weights.to(torch.float64), 0.0)
-    largest = weight.amax(dim=-2, keepdim=True)
+    largest = weight.amax(dim=0) if len(weight) else weight.sum(0)
     weight = weight / torch.where(largest > 0, largest, 1.0)
 
-    rows, right = view_rows(local, safe)
-    scaled = rows * weight[..., None, None]
-    matrix = torch.stack([(scaled[..., i] * rows[..., j]).sum((-3, -1)) for i in range(3) for j in range(i, 3)])
-    solution = torch.zeros((*weight.shape[:-2], weight.shape[-1], 3), dtype=torch.float64, device=weight.device)
-    for _ in range(2):  # once more from the residuals of the rows: the digits that squaring has cost
-        residual = right - (rows * solution[..., None, :, None, :]).sum(-1)
-        toward = (scaled * residual[..., None]).sum((-4, -2))
-        *step, cond = solve_symmetric((*matrix.unbind(0), *toward.unbind(-1)))
-        solution = solution + torch.stack(step, dim=-1)
+    views = views_of(local, key_points, used)
+    a, b = views.rows()
+    equations = weighted_sum(products(a, b), weight)
+    *solution, cond = solve_symmetric(tuple(equations))
+    # once more from the residuals of the rows: the digits that squaring has cost
+    toward = weighted_sum(_toward(a, b, solution), weight)
+    solution = [x + d for x, d in zip(solution, solve_symmetric((*equations[:6], *toward)), strict=False)]
 
-    depth = (local.R[..., None, 2, :] * solution[..., None, :, :]).sum(-1) + local.t[..., None, 2]
-    distance = torch.where(used.any(-1)[..., None], cameras.t.to(torch.float64), 0.0).norm(dim=-1)
-    few = used.sum(-2) < 2
+    depth = views.depth(*solution)
+    length = torch.linalg.vector_norm(torch.where(valid[..., None], cameras.t.to(torch.float64), 0.0), dim=-1)
+    distance = torch.where(used.any(1), length.mT, 0.0)[:, None]
     parallel = torch.isinf(cond) | _one_centre(local, distance, used)
-    behind = (used & ~(depth > NO_DEPTH * distance[..., None])).any(-2)
-    status = torch.full(few.shape, int(Status.OK), dtype=torch.int8, device=few.device)
+    behind = (used & ~(depth > NO_DEPTH * distance)).any(0)
+    status = torch.full_like(count, int(Status.OK), dtype=torch.int8)
     for mask, reason in (
-        (behind, Status.BEHIND), (parallel, Status.PARALLEL), (few, Status.FEW_VIEWS),
+        (behind, Status.BEHIND), (parallel, Status.PARALLEL), (count < 2, Status.FEW_VIEWS),
         (spoilt, Status.NONFINITE_INPUT),
     ):  # fmt: skip
-        status = torch.where(mask, int(reason), status)
-    measured = (status == Status.OK) | (status == Status.BEHIND)
-    return Triangulation(
-        points=torch.where((status == Status.OK)[..., None], solution + origin[..., None, :], 0.0),
-        status=status.to(torch.int8),
-        angle=_ray_angle(local, safe, used),
-        depth_min=torch.where(measured, torch.where(used, depth, torch.inf).amin(-2), 0.0),
-        cond=cond,
+        status = status.masked_fill(mask, int(reason))
+    ok = status == Status.OK
+    nearest = torch.where(used, depth, torch.inf).amin(0) if len(depth) else torch.zeros_like(cond)
+    points = torch.stack([torch.where(ok, x + o[None], 0.0) for x, o in zip(solution, origin.mT, strict=True)], -1)
+    fields = (
+        status,
+        _ray_angle(local, views, used, count),
+        torch.where(ok | (status == Status.BEHIND), nearest, 0.0),
+        cond,
     )
+    return (points.transpose(0, 1), *(x.mT for x in fields))
+
+
+def _toward(a: Sequence[Tensor], b: Sequence[Tensor], solution: Sequence[Tensor]) -> Float[Tensor, "V 3 J B"]:
+    """The right-hand sides of the views' equations for a step from ``solution``."""
+    over, down = (r[3] - (r[0] * solution[0] + r[1] * solution[1] + r[2] * solution[2]) for r in (a, b))
+    return torch.stack([torch.addcmul(a[i] * over, b[i], down) for i in range(3)], dim=1)
+
+
+def _ray_angle(
+    cameras: Cameras, views: Views, used: Bool[Tensor, "V J B"], count: Int[Tensor, "J B"]
+) -> Float[Tensor, "J B"]:
+    """``Triangulation.angle``: the sum of |d_i x d_j|^2 over pairs is the sum of the principal minors of
+    the sum of d d^T (Cauchy-Binet)."""
+    (k, s), (l, m) = cameras.K.permute(2, 3, 1, 0)[:2, :2, :, None].contiguous()
+    determinant = k * m - s * l
+    determinant = torch.where(determinant == 0, 1.0, determinant)
+    x, y = (m * views.u - s * views.v) / determinant, (k * views.v - l * views.u) / determinant
+    first, second, third = cameras.R.permute(2, 3, 1, 0)[..., None, :].contiguous()
+    ray = [torch.addcmul(torch.addcmul(r, q, y), p, x) for p, q, r in zip(first, second, third, strict=True)]
+    outer = torch.stack([ray[i] * ray[j] for i in range(3) for j in range(i, 3)], dim=1)
+    share = used / (outer[:, 0] + outer[:, 3] + outer[:, 5])
+    areas = minors(tuple(weighted_sum(outer, share)))
+    pairs = (count * (count - 1) / 2).clamp(min=1)
+    return ((areas[0] + areas[3] + areas[5]) / pairs).clamp(0, 1).sqrt().asin()
+
+
+def _one_centre(cameras: Cameras, distance: Float[Tensor, "V 1 B"], used: Bool[Tensor, "V J B"]) -> Bool[Tensor, "J B"]:
+    """Whether the used cameras have one and the same centre, within the rounding of their world's distances."""
+    centre = cameras.centre.permute(2, 1, 0)
+    if not len(used):
+        return torch.ones(used.shape[1:], dtype=torch.bool, device=used.device)
+    limit = 1e-12 * distance.amax(0)
+    if not (centre[0].sort(0).values.diff(dim=0) <= limit).any():  # no two cameras can have: nothing to do
+        return torch.zeros(used.shape[1:], dtype=torch.bool, device=used.device)
+    one = torch.ones(used.shape[1:], dtype=torch.bool, device=used.device)
+    for x in centre[..., None, :]:
+        spread = torch.where(used, x, -torch.inf).amax(0) - torch.where(used, x, torch.inf).amin(0)
+        one &= spread <= limit
+    return one
 
 
 @torch.no_grad()

@@ -55,6 +55,12 @@ class Baseline(ABC):
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         """The batch's joints with their status."""
 
+    @property
+    def reach(self) -> float | None:
+        """Largest residual of a view that counts as one that made the joint, as a fraction of the person's size; None
+        where all views do."""
+        return None
+
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> PoseEstimate:
         result = self.triangulate(batch)
@@ -99,6 +105,10 @@ class Ransac(Baseline):
 
     def __post_init__(self) -> None:
         _check_positive(threshold=self.threshold, pairs=self.pairs)
+
+    @property
+    def reach(self) -> float:
+        return self.threshold
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         candidates = self._pairs(batch)
@@ -152,6 +162,12 @@ class MEstimator(Baseline):
         check(self.loss in _WEIGHTS, "loss", f"is {self.loss!r}", f"Choose from {', '.join(_WEIGHTS)}.")
         _check_positive(scale=self.scale, iterations=self.iterations, tolerance=self.tolerance)
 
+    @property
+    def reach(self) -> float:
+        """The scale: a residual of that size has a quarter (Geman-McClure), half (Cauchy) or all (Huber) of the
+        weight."""
+        return self.scale
+
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         linear = result = Linear().triangulate(batch)
         scale = (self.scale * person_size(batch.key_points, batch.seen))[..., None].clamp(min=1e-12)
@@ -190,6 +206,10 @@ class LoRansac(Baseline):
 
     def __post_init__(self) -> None:
         _check_positive(threshold=self.threshold)
+
+    @property
+    def reach(self) -> float:
+        return self.threshold
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         usable = batch.seen & usable_views(batch.cameras, batch.key_points)

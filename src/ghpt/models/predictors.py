@@ -1,0 +1,150 @@
+"""From a batch of key points to what a recording becomes, by a classical estimator or by the learned model."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import torch
+from jaxtyping import Bool, Float, Int8
+from torch import Tensor
+
+from ghpt.errors import check
+from ghpt.geometry.cameras import reprojection_error
+from ghpt.geometry.normal_equations import usable_views
+from ghpt.geometry.triangulation import Status, triangulate
+from ghpt.models.baselines import Baseline, person_size
+from ghpt.models.module import StochasticEstimator
+from ghpt.models.quality import Quality
+from ghpt.models.selection import softmax_weights
+from ghpt.reconstruction import Reconstruction, State
+from ghpt.recording import KeyPointBatch
+
+FAR = 20.0
+"""A key point so many times as far from its view's median as the median one belongs to nobody."""
+
+_STATE = {
+    Status.OK: State.OBSERVED, Status.NOT_CONVERGED: State.OBSERVED, Status.FEW_VIEWS: State.FEW_VIEWS,
+    Status.PARALLEL: State.PARALLEL, Status.BEHIND: State.BEHIND, Status.NONFINITE_INPUT: State.BAD_INPUT,
+}  # fmt: skip
+
+
+class Predictor(Protocol):
+    """What `predict` runs: each frame's result is its own, whatever batch it is in, once ``fitted``."""
+
+    def fitted(self, batch: KeyPointBatch) -> Predictor:
+        """The same with the noise level of these frames: a few hundred, spread over the recording."""
+
+    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
+        """The batch's frames, with ``frame`` = ``batch.sample``; on the CPU."""
+
+
+class Classical:
+    """A classical estimator with what it can say of its joints.
+
+    A view counts as one of those that made a joint if its residual is within the estimator's ``reach``; where fewer
+    than two views are, all that were given to it count, and the error and covariance say so. ``reject``: a joint on
+    which no two views agree so is REJECTED; false: kept with its large error and covariance.
+    """
+
+    def __init__(self, estimator: Baseline, quality: Quality, reject: bool) -> None:
+        self.estimator, self.quality, self.reject = estimator, quality, reject
+
+    def fitted(self, batch: KeyPointBatch) -> Classical:
+        clean, _ = cleaned(batch)
+        result = self.estimator.triangulate(clean)
+        placed = result.ok | (result.status == Status.NOT_CONVERGED)
+        views, _ = self._views(clean, result.points, placed)
+        return Classical(self.estimator, self.quality.fitted(clean, result.points, views), self.reject)
+
+    @torch.no_grad()
+    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
+        clean, spoilt = cleaned(batch)
+        result = self.estimator.triangulate(clean)
+        state = _states(result.status, spoilt)
+        views, agreed = self._views(clean, result.points, state == State.OBSERVED)
+        if self.reject:
+            state = torch.where((state == State.OBSERVED) & ~agreed, int(State.REJECTED), state).to(torch.int8)
+            views &= (state == State.OBSERVED)[:, None]
+        found = self.quality(clean, result.points, views)
+        score = torch.zeros(len(batch), dtype=torch.float32)
+        return _reconstruction(batch, result.points, state, views, found.error, found.covariance, score)
+
+    def _views(
+        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
+    ) -> tuple[Bool[Tensor, "B V J"], Bool[Tensor, "B J"]]:
+        """The views that made each joint, and whether two of them agree."""
+        given = batch.seen & placed[:, None]
+        if self.estimator.reach is None:
+            return given, placed
+        limit = self.estimator.reach * person_size(batch.key_points, batch.seen)
+        near = given & (reprojection_error(batch.cameras, batch.key_points, points) <= limit[..., None])
+        agreed = near.sum(1) >= 2
+        return torch.where(agreed[:, None], near, given), agreed
+
+
+class Learned:
+    """The learned model: the average of its hypotheses under its weights (the selection ``weight``).
+
+    All seen views made each joint. The covariance is that of ``quality`` with all seen views, and of the hypotheses
+    under their weights ``spread`` times: the first is what noise of this size does to any estimate, the second how far
+    these views contradict each other. The score is the mean logit under the weights.
+    """
+
+    def __init__(self, model: StochasticEstimator, quality: Quality, spread: float) -> None:
+        check(spread >= 0, "spread", f"is {spread}", "It must be >= 0.")
+        self.model, self.quality, self.spread = model.eval(), quality, spread
+
+    def fitted(self, batch: KeyPointBatch) -> Learned:
+        clean, _ = cleaned(batch)
+        linear = triangulate(clean.cameras, clean.key_points, clean.seen.double())
+        return Learned(
+            self.model, self.quality.fitted(clean, linear.points, clean.seen & linear.ok[:, None]), self.spread
+        )
+
+    @torch.no_grad()
+    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
+        clean, spoilt = cleaned(batch)
+        status = triangulate(clean.cameras, clean.key_points, clean.seen.double()).status
+        state = _states(status, spoilt)
+        pool = self.model.pool(clean, self.model.keys("predict", clean))
+        weights = softmax_weights(pool.logits, self.model.temperature)
+        estimate = self.model.problem.combine(pool.hypotheses, weights)
+        views = clean.seen & (state == State.OBSERVED)[:, None]
+        found = self.quality(clean, estimate.points, views)
+        offset = (pool.hypotheses.points - estimate.points[:, None]).double()
+        i, j = torch.triu_indices(3, 3)
+        scatter = torch.einsum("bh,bhjk->bjk", weights.double(), offset[..., i] * offset[..., j])
+        covariance = found.covariance + self.spread * scatter
+        score = (weights * pool.logits).sum(-1)
+        return _reconstruction(batch, estimate.points, state, views, found.error, covariance, score)
+
+
+def cleaned(batch: KeyPointBatch) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"]]:
+    """The batch without key points that no detection can be, and which those were: not finite, of a camera that is
+    none, or ``FAR`` from all others of its view."""
+    usable = batch.seen & usable_views(batch.cameras, batch.key_points)
+    points = torch.where(usable[..., None], batch.key_points, torch.nan)
+    offset = (points - points.nanmedian(-2, keepdim=True).values).abs().amax(-1)
+    typical = offset.nanmedian(-1, keepdim=True).values.clamp(min=1.0)
+    few = usable.sum(-1, keepdim=True) < 5
+    seen = usable & (few | ~(offset > FAR * typical))
+    return replace(batch, seen=seen, key_points=torch.where(seen[..., None], batch.key_points, 0.0)), batch.seen & ~seen
+
+
+def _states(status: Int8[Tensor, "B J"], spoilt: Bool[Tensor, "B V J"]) -> Int8[Tensor, "B J"]:
+    table = torch.tensor([int(_STATE[s]) for s in Status], dtype=torch.int8, device=status.device)
+    state = table[status.long()]
+    return torch.where((state == State.FEW_VIEWS) & spoilt.any(1), int(State.BAD_INPUT), state).to(torch.int8)
+
+
+def _reconstruction(
+    batch: KeyPointBatch, points: Tensor, state: Tensor, views: Tensor, error: Tensor, covariance: Tensor, score: Tensor
+) -> Reconstruction:
+    placed = state == State.OBSERVED
+    swapped = torch.zeros(views.shape[:2], dtype=torch.bool)
+    fields = (
+        batch.sample, torch.where(placed[..., None], points, 0.0).float(), state, torch.where(placed, error, 0.0).float(),
+        views, torch.where(placed[..., None], covariance, 0.0).float(), score.float(), swapped,
+    )  # fmt: skip
+    return Reconstruction(*(x.cpu() for x in fields))
