@@ -11,10 +11,10 @@ from typing import Any, TypedDict
 
 import torch
 
-from ghpt.calibrate import from_data, people_note
+from ghpt.calibrate import from_data
 from ghpt.config import build, check_type, suggest
 from ghpt.data.camera_files import read_cameras
-from ghpt.data.key_points import read_key_points
+from ghpt.data.key_points import read_people
 from ghpt.data.views import look_through
 from ghpt.errors import GhptCheckpointError, GhptConfigError, check
 from ghpt.export import WRITERS
@@ -24,7 +24,7 @@ from ghpt.models.pose import PoseTriangulation
 from ghpt.prediction.frames import Frames, calibrated, frames_of_views
 from ghpt.prediction.gaps import Gaps, after, gap_frames
 from ghpt.prediction.report import prediction_report, print_prediction
-from ghpt.prediction.run import Predictor, predict_shards
+from ghpt.prediction.run import Predictor, predicted
 from ghpt.prediction.stand_in import Classical, Learned
 from ghpt.prediction.statistics import Estimate, counts, evaluate
 from ghpt.prediction.stored import frames_of_stored, open_stored
@@ -52,6 +52,8 @@ class Settings(TypedDict):
     match: dict[str, str] | None
     skeleton: str | None
     rate_hz: float | None
+    format: str | None
+    person: int
     recording: str | None
     ckpt: str | None
     hypotheses: int | None
@@ -108,13 +110,13 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     _log.info("%s: %d frames, %d views, by %s.", frames.title, len(frames), len(frames.camera_names), chosen.text)
     sweep_temporaries(output)
     key = _key(frames, chosen, origin)
-    shards, first = predict_shards(frames, chosen.predictor, chosen.weights, output / SHARDS, key, config)
-    if not first:
-        return {}
-    with after(gaps, shards, len(JOINTS), output) as chunks:
-        for name in formats:
-            WRITERS[name].write(output / WRITERS[name].file, about, chunks, **config.get(name, {}))
-        found = counts(chunks(), about.joints, about.camera_names)
+    with predicted(frames, chosen.predictor, chosen.weights, output / SHARDS, key, config) as shards:
+        if shards is None:
+            return {}
+        with after(gaps, shards, len(JOINTS), output) as chunks:
+            for name in formats:
+                WRITERS[name].write(output / WRITERS[name].file, about, chunks, **config.get(name, {}))
+            found = counts(chunks(), about.joints, about.camera_names)
     estimates: dict[str, Estimate] = {chosen.name: _estimate(chosen.predictor)}
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
     numbers = {
@@ -173,10 +175,12 @@ def from_files(config: dict[str, Any]) -> Frames:
     stored = open_stored(config["keypoints"], config["skeleton"], config["rate_hz"])
     if stored is not None:
         return frames_of_stored(stored, cameras, config["match"], config["views"], title)
-    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"])
-    for note in people_note(points):
-        _log.warning("%s: %s.", note.severity, note.text)
-    views = look_through(points, cameras, config["match"], config["views"])
+    people = read_people(config["keypoints"], config["skeleton"], config["rate_hz"], config["format"])
+    views = look_through(people, cameras, config["match"], config["views"], config["person"])
+    several = dict(zip(people.views, (people.counts() > 1).sum(0).tolist(), strict=True))
+    if any(several.values()):
+        words = ", ".join(f"{n} frames of {view}" for view, n in several.items() if n)
+        _log.warning("Several people are in %s: person %d is followed (person=).", words, config["person"])
     return frames_of_views(views, str(Path(config["keypoints"]).resolve()), title)
 
 

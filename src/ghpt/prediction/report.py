@@ -82,7 +82,7 @@ def prediction_report(numbers: Numbers) -> str:
         "\n".join(f"- {line}" for line in summary_lines(numbers)),
         "## Errors by view",
         f"On {evaluation['frames']} frames, evenly spread; median and 90 %, pixels. *Reprojection* is the distance of "
-        "every key point from its joint, those that the estimator set aside among them; *left out*, from the joint that "
+        "every key point from its joint, set aside or not; *left out*, from the joint that "
         "the other views alone give.",
         markdown(*error_rows(numbers)),
         "## Estimators",

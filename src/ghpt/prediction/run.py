@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -67,25 +67,27 @@ class ShardPrediction(L.LightningModule):
         self._bar.__exit__(None, None, None)
 
 
-def predict_shards(
+@contextmanager
+def predicted(
     frames: Frames,
     predictor: Predictor,
     weights: torch.nn.Module | None,
     folder: Path,
     key: str,
     settings: dict[str, Any],
-) -> tuple[Shards, bool]:
-    """Predict what is missing of a recording's shards; whether this process is the one that goes on with them."""
+) -> Iterator[Shards | None]:  # fmt: skip
+    """Predict what is missing of a recording's shards and yield them; None in the processes beside the first."""
     ours = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "default_root_dir": folder}
     trainer = make_trainer(settings["trainer"], **ours)
     shards = Shards(folder, key, len(frames), settings["shard_frames"], clean=trainer.is_global_zero)
     module = ShardPrediction(frames, predictor, weights, shards, settings["batch"], settings["progress_bar"])
-    if module.pending:
-        with shell_status():
-            trainer.predict(module, return_predictions=False)
-        trainer.strategy.barrier()
-    shards.look()
-    return shards, trainer.is_global_zero
+    with closing(shards):
+        if module.pending:
+            with shell_status():
+                trainer.predict(module, return_predictions=False)
+            trainer.strategy.barrier()
+            shards.look()
+        yield shards if trainer.is_global_zero else None
 
 
 def to_cpu(part: Reconstruction) -> Reconstruction:

@@ -44,6 +44,7 @@ class Shards:
     def __init__(self, folder: Path, key: str, frames: int, size: int, clean: bool = True) -> None:
         self.folder, self.frames, self.size = folder, frames, size
         self._header = {"version": FORMAT_VERSION, "key": key, "frames": frames, "shard_frames": size}
+        self._lock: int | None = None
         if clean:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(folder)
@@ -58,6 +59,12 @@ class Shards:
     def rows(self, shard: int) -> range:
         """The rows of the recording that are this shard's."""
         return range(shard * self.size, min((shard + 1) * self.size, self.frames))
+
+    def close(self) -> None:
+        """Let others write here; the end of the process does so too."""
+        if self._lock is not None:
+            os.close(self._lock)
+        self._lock = None
 
     def look(self) -> None:
         """Take in what other processes have written."""

@@ -1,0 +1,80 @@
+"""A synthetic recording of any length, and predict.py's configuration, for the tests of prediction."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from pathlib import Path
+
+import hydra
+import numpy as np
+import torch
+from torch import Tensor
+
+from ghpt.config import plain
+from ghpt.data.camera_writers import write_pose2sim
+from ghpt.data.embedded import motion
+from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.geometry.cameras import Cameras, project
+from ghpt.prediction.frames import Frames, Seen
+from ghpt.skeleton import JOINTS
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+QUICK = ("trainer.accelerator=cpu", "progress_bar=false", "evaluated_frames=4")
+
+
+def config(*words: str) -> dict:
+    """conf/predict.yaml with these overrides, as predict.py gets it."""
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return plain(hydra.compose("predict", overrides=[*QUICK, *map(str, words)]))
+
+
+@cache
+def walk(frames: int = 200) -> Tensor:
+    """A walking person, mm [T, 17, 3]."""
+    return torch.from_numpy(motion(0, "S9", "S9/Walking-1", "Walking", frames, 50.0)).double()
+
+
+def frames_of(count: int, noise: float = 1.0, gaps: float = 0.1) -> Frames:
+    """A walk repeated ``count`` frames long, before Human3.6M's cameras; made as it is read."""
+    rig = human36m_rig("S9")
+    pixels = project(rig.cameras, walk())[0].numpy()
+
+    def read(rows: np.ndarray) -> Seen:
+        shape = (len(rows), len(rig), len(JOINTS))
+        # a stream of its own for each frame, so that a frame is the same however it is read
+        phase = (rows[:, None, None] * 7919 + np.arange(shape[1] * shape[2]).reshape(shape[1:]) * 104729) % 65521
+        random = phase / 65521
+        values = pixels[rows % len(pixels)] + noise * np.sin(40 * random)[..., None]
+        seen = random >= gaps
+        return np.where(seen[..., None], values, 0).astype(np.float32), seen.astype(np.float32), seen
+
+    return Frames("walk", "embedded", rig.names, rig.cameras, np.arange(count), 50.0, read)
+
+
+def cameras_file(folder: Path) -> Path:
+    """Human3.6M's cameras of S9 with perfect lenses, named cam_00 to cam_03."""
+    rig = human36m_rig("S9")
+    names = tuple(f"cam_{i:02d}" for i in range(len(rig)))
+    write_pose2sim(folder / "cameras.toml", Rig(names, rig.cameras, 0 * rig.distortion, rig.size), {})
+    return folder / "cameras.toml"
+
+
+def openpose_folders(folder: Path, frames: list[int], cameras: Cameras | None = None) -> Path:
+    """A JSON file for each camera and frame number: the walk's pose of that number, seen exactly."""
+    pixels = project(cameras or human36m_rig("S9").cameras, walk())[0]
+    for view in range(pixels.shape[1]):
+        (folder / f"cam{view}_json").mkdir(parents=True)
+        for frame in frames:
+            write_people(folder / f"cam{view}_json" / f"cam{view}_{frame:06d}.json", [pixels[frame, view]])
+    return folder
+
+
+def write_people(path: Path, people: list[Tensor]) -> None:
+    """An OpenPose file; joints that are not finite are missing."""
+    rows = []
+    for person in people:
+        values = torch.cat([person, torch.ones(len(person), 1, dtype=person.dtype)], dim=-1)
+        values = torch.where(values.isfinite().all(-1, keepdim=True), values, 0.0)
+        rows.append({"pose_keypoints_2d": values.flatten().tolist()})
+    path.write_text(json.dumps({"people": rows}))
