@@ -6,12 +6,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ghpt.export.c3d import write_c3d
+from ghpt.export.html import write_html
 from ghpt.export.npz import read_reconstruction, write_npz
+from ghpt.export.rerun import write_rerun
+from ghpt.export.scene import Evidence, Scene
 from ghpt.export.stream import Chunks
 from ghpt.export.table import write_csv, write_parquet
 from ghpt.export.trc import write_trc
 
-__all__ = ["WRITERS", "Chunks", "Writer", "read_reconstruction"]
+__all__ = ["WRITERS", "Chunks", "Evidence", "Scene", "Writer", "read_reconstruction"]
 
 
 @dataclass(frozen=True)
@@ -33,4 +36,6 @@ WRITERS = {
     "parquet": Writer("poses.parquet", write_parquet),
     "trc": Writer("poses.trc", write_trc),
     "c3d": Writer("poses.c3d", write_c3d),
+    "html": Writer("poses.html", write_html),
+    "rerun": Writer("poses.rrd", write_rerun),
 }
