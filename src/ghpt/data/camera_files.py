@@ -30,6 +30,8 @@ _MM_PER_M, _MM_PER_CM = 1000.0, 10.0
 _LARGEST = 16 << 20
 """Bytes of a TOML file."""
 _MOST_CAMERAS = 10_000
+_LARGEST_NUMBER = 1e15
+"""No focal length or distance; its square would still be one, though."""
 _FIELDS = ("matrix", "distortions", "rotation", "translation")
 _FORMATS = (
     "Known: TOML of Pose2Sim, aniposelib, caliscope or freemocap; intri.yml (with extri.yml beside it) of OpenCV or "
@@ -102,24 +104,25 @@ def read_cameras(path: str | Path, subject: str | None = None, unit_mm: int | fl
     path = Path(path)
     if unit_mm is not None and not 0 < unit_mm < float("inf"):
         raise GhptDataError(path, "unit_mm", f"is {unit_mm}", "Give the length of the file's unit in mm.")
+    given = None if unit_mm is None else float(unit_mm)
     if path.is_dir() and is_colmap(path):
         if unit_mm is None:
             _log.warning("%s: a COLMAP model has no unit of length: it is taken to be in metres; unit_mm= says how "
                          "many mm its unit is.", path)  # fmt: skip
         entries = [_Entry(c.name, c.other, c.K, c.distortion, c.size, c.R, c.t) for c in read_colmap(path)]
-        return replace(_checked(path, "COLMAP", entries, unit_mm or _MM_PER_M), unit_known=unit_mm is not None)
+        return replace(_checked(path, "COLMAP", entries, given or _MM_PER_M), unit_known=unit_mm is not None)
     if path.is_dir():
         path = path / "intri.yml"
     with open_input(path) as handle:
         start = handle.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
     if start.startswith(b"%YAML"):
-        return _checked(path, "OpenCV", _opencv(path), unit_mm or _MM_PER_M)
+        return _checked(path, "OpenCV", _opencv(path), given or _MM_PER_M)
     if start.startswith((b"{", b"\xff\xfe{", b"\xfe\xff\0{")):
         content = read_json(path)
         if isinstance(content, dict) and "intrinsics" in content:
-            return _checked(path, "Human3.6M", _human36m(path, content, subject), unit_mm or 1.0)
-        return _checked(path, "Panoptic", _panoptic(path, content), unit_mm or _MM_PER_CM)
-    return _checked(path, *_toml(path), unit_mm or _MM_PER_M)
+            return _checked(path, "Human3.6M", _human36m(path, content, subject), given or 1.0)
+        return _checked(path, "Panoptic", _panoptic(path, content), given or _MM_PER_CM)
+    return _checked(path, *_toml(path), given or _MM_PER_M)
 
 
 def _toml(path: Path) -> tuple[str, list[_Entry]]:
@@ -257,13 +260,13 @@ def _size(path: Path, entry: _Entry) -> tuple[int, int] | None:
 
 
 def _numbers(path: Path, name: str, field: str, value: Any, sizes: tuple[int, ...]) -> Float[np.ndarray, " N"]:
-    """A list (of lists, or an array) of as many finite numbers as one of ``sizes``, flat."""
+    """A list (of lists, or an array) of as many finite, sane numbers as one of ``sizes``, flat."""
     try:
         array = np.array(value)
         flat = array.astype(np.float64).ravel() if array.dtype.kind in "fiu" else np.empty(0)
     except (ValueError, OverflowError):
         flat = np.empty(0)
-    if flat.size not in sizes or not np.isfinite(flat).all():
+    if flat.size not in sizes or not (np.abs(flat) < _LARGEST_NUMBER).all():
         expected = " or ".join(map(str, sizes))
         problem = f"is not {expected} finite numbers"
         raise GhptDataError(path, f"camera {name}, {field}", problem, "Check how the file was written.")

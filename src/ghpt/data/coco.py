@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from ghpt.data.json_views import json_files, view_name
 from ghpt.data.people import Detections, People, detections, gather, triples
+from ghpt.data.skeletons import SKELETONS
 from ghpt.data.validate import read_json
 from ghpt.errors import GhptDataError
 
@@ -24,14 +25,15 @@ def read_coco(path: Path, skeleton: str | None) -> People:
 
     In a folder the file's name is the view's. In one file it is the folder of the image (``cam1/000012.jpg``), or the
     image's name before its last number (``cam1_000012.jpg``). The frame number is the last number of the image's name,
-    or the ``image_id`` where that is a number without a name. Raises GhptDataError.
+    or the ``image_id`` where that is a number without a name. 17 joints are COCO's. Raises GhptDataError.
     """
     files = json_files(path)
     found: list[Detections] = []
     for file in files:
         views, frames = _views(file, named=path.is_dir())
         found += [detections(file, view, frames[view], views[view]) for view in sorted(frames)]
-    return gather(path, found, None, skeleton)
+    coco = {view.values.shape[1] for view in found if len(view.values)} == {len(SKELETONS["coco_17"])}
+    return gather(path, found, SKELETONS["coco_17"] if coco else None, skeleton)
 
 
 def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[int]]]:

@@ -5,6 +5,7 @@ Read without COLMAP's own library: what it does with a damaged file cannot be ca
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -127,9 +128,8 @@ def _image_lines(data: bytes) -> Iterator[Image]:
     # a line of the image, then one of its points, which may be empty
     for line in list(_lines(data))[::2]:
         if line:
-            _, *pose, camera, name = line.split(maxsplit=9)
-            w, x, y, z, *t = map(float, pose)
-            yield Image(name, (w, x, y, z), tuple(t), int(camera))
+            _, w, x, y, z, t1, t2, t3, camera, name = line.split(maxsplit=9)
+            yield Image(name, (float(w), float(x), float(y), float(z)), (float(t1), float(t2), float(t3)), int(camera))
 
 
 def _lines(data: bytes) -> Iterator[str]:
@@ -141,7 +141,7 @@ def _names(where: Path, paths: list[PurePosixPath]) -> list[tuple[str, str]]:
     for of in (lambda p: p.stem, lambda p: p.parent.name):
         names = [of(path) for path in paths]
         if len({*names}) == len(names) and all(names):
-            return [(name, str(path.with_suffix(""))) for name, path in zip(names, paths, strict=True)]
+            return [(name, str(path.parent / path.stem)) for name, path in zip(names, paths, strict=True)]
     mend = "A rig's cameras stand still: keep one image of each, called as its view."
     raise GhptDataError(where, "images", f"are {len(paths)} with names that tell no cameras apart", mend)
 
@@ -164,7 +164,7 @@ def _intrinsics(where: Path, name: str, model: int | str, parameters: list[float
 
 
 def _rotation(where: Path, image: Image) -> Float[np.ndarray, "3 3"]:
-    length = np.linalg.norm(image.wxyz)
+    length = math.hypot(*image.wxyz)
     if not 0.5 < length < 2:
         raise GhptDataError(where, f"image {image.name}", "has a quaternion that is not of length 1", _MEND)
     return quaternion_to_matrix(torch.tensor(image.wxyz, dtype=torch.float64) / length).numpy()

@@ -1,0 +1,164 @@
+"""COCO results and MMPose's JSON: who is where, in which view and frame, and what is not right is named."""
+
+import json
+
+import numpy as np
+import pytest
+
+from ghpt.data.key_points import FORMATS, read_key_points, read_people
+from ghpt.data.skeletons import SKELETONS, canonical
+from ghpt.errors import GhptDataError
+
+RNG = np.random.default_rng(0)
+BODY = RNG.uniform(0, 400, (17, 3)).round(3) * [1, 1, 1 / 400]
+COCO = SKELETONS["coco_17"]
+
+
+def result(image, shift=0.0, joints=BODY):
+    shifted = joints + np.array([shift, 0, 0])
+    return {"image_id": image, "category_id": 1, "keypoints": shifted.ravel().tolist(), "score": 0.9}
+
+
+def mmpose(frames, meta=True, names=COCO):
+    people = [
+        {"frame_id": number, "instances": [
+            {"keypoints": (BODY[:, :2] + [shift, 0]).tolist(), "keypoint_scores": BODY[:, 2].tolist(), "bbox": [[0]]}
+            for shift in shifts
+        ]}
+        for number, shifts in frames
+    ]  # fmt: skip
+    named = {str(i): name for i, name in enumerate(names)}
+    return (
+        {"meta_info": {"dataset_name": "coco", "keypoint_id2name": named}, "instance_info": people} if meta else people
+    )
+
+
+def write(path, content):
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(content))
+
+
+def test_coco_results_with_a_file_for_each_camera(tmp_path):
+    write(tmp_path / "cam1.json", [result(7), result(5, 10), result(5, 500)])
+    write(tmp_path / "cam2.json", [result("frame_000005.jpg", 20), result("frame_000009.jpg", 30)])
+    found = read_people(tmp_path)
+    assert found.views == ("cam1", "cam2")
+    assert found.joints == COCO
+    assert found.frame.tolist() == [5, 7, 9]
+    assert found.counts().tolist() == [[2, 1], [1, 0], [0, 1]]
+    chosen = found.pick(found.first())
+    np.testing.assert_allclose(chosen.key_points[:, 0, 0, 0] - BODY[0, 0], [10, 0, -BODY[0, 0]])
+    np.testing.assert_allclose(chosen.confidence[0, 0], BODY[:, 2])
+
+
+@pytest.mark.parametrize("form", ["{view}/{frame:06d}.jpg", "{view}_{frame:04d}.png", "x\\{view}\\img{frame}.jpg"])
+def test_one_coco_file_whose_images_name_the_views(form, tmp_path):
+    images = [(view, frame) for view in ("left", "right") for frame in (3, 4, 12)]
+    listed = [result(form.format(view=view, frame=frame), frame) for view, frame in images]
+    write(tmp_path / "results.json", listed)
+    found = read_people(tmp_path / "results.json")
+    assert found.views == ("left", "right")
+    assert found.frame.tolist() == [3, 4, 12]
+    assert (found.counts() == 1).all()
+    names = [form.format(view=view, frame=frame) for view, frame in [*images, ("left", 2)]]
+    listed = [result(i, frame) for i, (_, frame) in enumerate(images)]
+    numbered = [{"id": i, "file_name": name} for i, name in enumerate(names)]
+    write(tmp_path / "results.json", {"images": numbered, "annotations": listed})
+    again = read_people(tmp_path / "results.json")
+    assert again.views == ("left", "right")
+    assert again.frame.tolist() == [2, 3, 4, 12]  # an image without anybody is a frame
+    np.testing.assert_array_equal(again.key_points, found.key_points)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ([], "people: is empty"),
+        ([1], "annotations: is not a list of objects"),
+        ({"images": 1, "annotations": []}, "images: is not a list"),
+        ([{"keypoints": [1, 2, 3]}], "image_id: an image has neither number nor name"),
+        ([result("frame.jpg")], "'frame.jpg' has no frame number"),
+        ([result(-1)], "image_id: -1 has no frame number"),
+        ([{"image_id": 1}], r"\[0\]\.keypoints: is not a list of x, y, confidence"),
+        ([{"image_id": 1, "keypoints": [1, 2, "3"]}], r"\[0\]\.keypoints: is not a list"),
+        ([{"image_id": 1, "keypoints": [1, 2e6, 3]}], "beyond 1e6"),
+        ([{"image_id": 1, "keypoints": [10**400, 2, 3]}], "beyond 1e6"),
+        ([result(1), result(2, 0, BODY[:3])], "frame 2 has a person of 3 joints, frame 1 of 17"),
+        ([result(1, 0, BODY[:3])], r"no known skeleton has 3 joints.*coco_17 \(17\)"),
+        ([result(1)] * 65, "65 people are in a frame"),
+    ],
+)
+def test_bad_coco_results_are_named(content, says, tmp_path):
+    write(tmp_path / "cam1.json", content)
+    with pytest.raises(GhptDataError, match=says):
+        read_people(tmp_path, format="coco")
+
+
+@pytest.mark.parametrize("meta", [True, False])
+def test_mmpose_s_files_of_each_camera(meta, tmp_path):
+    write(tmp_path / "results_cam1.json", mmpose([(1, [0.0, 300.0]), (2, []), (3, [2.0])], meta))
+    write(tmp_path / "results_cam2.json", mmpose([(1, [0.0]), (2, [1.0]), (4, [3.0])], meta))
+    found = read_people(tmp_path, None if meta else "coco_17", rate_hz=50)
+    assert (found.views, found.joints, found.rate_hz) == (("cam1", "cam2"), COCO, 50)
+    assert found.frame.tolist() == [1, 2, 3, 4]
+    assert found.counts().tolist() == [[2, 1], [0, 1], [1, 0], [0, 1]]
+    np.testing.assert_allclose(found.key_points[found.first()[3, 1]], BODY[:, :2] + [3, 0])
+
+
+def test_the_joints_are_those_that_mmpose_names(tmp_path):
+    names = [name.replace("_", " ").title() for name in COCO]
+    order = RNG.permutation(17)
+    write(tmp_path / "a.json", mmpose([(1, [0.0])], names=[names[i] for i in order]))
+    assert read_people(tmp_path).joints == tuple(COCO[i] for i in order)
+    h36m = ["root", "right_hip", "right_knee", "right_foot", "left_hip", "left_knee", "left_foot", "spine", "thorax",
+            "neck_base", "head", "left_shoulder", "left_elbow", "left_wrist", "right_shoulder", "right_elbow",
+            "right_wrist"]  # fmt: skip
+    write(tmp_path / "a.json", mmpose([(1, [0.0])], names=h36m))
+    assert set(read_people(tmp_path).joints) == set(SKELETONS["human36m"])
+    write(tmp_path / "a.json", mmpose([(1, [0.0])], names=[f"paw {i}" for i in range(17)]))
+    with pytest.raises(GhptDataError, match=r"joints: lack right_ankle.*Name the joints as in human36m, coco_17"):
+        read_people(tmp_path)
+    assert read_people(tmp_path, "coco_17").joints == COCO
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ([3], "instance_info: is not a list of frames"),
+        ([{"frame_id": "1", "instances": []}], r"instance_info\[0\]\.frame_id: is not a frame number"),
+        ([{"frame_id": 1, "instances": 2}], r"\[0\]\.instances: is not a list of people"),
+        ([{"frame_id": 1, "instances": []}] * 2, "frame_id: is there twice"),
+        ([{"frame_id": 1, "instances": [{"keypoints": [1]}]}], r"keypoints: is not a list of \[x, y\]"),
+        ([{"frame_id": 1, "instances": [{"keypoints": [[1, 2]]}]}], "keypoint_scores: is not a list"),
+        ({"meta_info": {"keypoint_id2name": {"0": "nose"}}}, "names 1 joints, and people have 17"),
+        ({"meta_info": {"keypoint_id2name": {"1": "nose"}}}, "does not name the joints from 0 on"),
+        ({"meta_info": {"keypoint_id2name": ["nose"]}}, "does not name the joints from 0 on"),
+    ],
+)  # fmt: skip
+def test_bad_mmpose_files_are_named(change, says, tmp_path):
+    change = {"instance_info": change} if isinstance(change, list) else change
+    write(tmp_path / "a.json", mmpose([(1, [0.0])]) | change)
+    with pytest.raises(GhptDataError, match=says):
+        read_key_points(tmp_path, format="mmpose")
+
+
+def test_views_of_different_joints_are_refused(tmp_path):
+    write(tmp_path / "a.json", mmpose([(1, [0.0])]))
+    write(tmp_path / "b.json", mmpose([(1, [0.0])], names=COCO[::-1]))
+    with pytest.raises(GhptDataError, match=r"b\.json: meta_info: names other joints than a\.json"):
+        read_people(tmp_path)
+
+
+def test_joints_are_found_in_other_spellings():
+    names = ["Left Elbow", "LElbow", "leftElbow", "elbow_l", "l_elbow", "elbow.left", "LEFT-ELBOW"]
+    assert set(canonical(names)) == {"left_elbow"}
+    assert canonical(["neck_base"]) == ("neck",)
+    assert canonical(["tail tip"]) == ("tail_tip",)
+
+
+def test_a_format_is_chosen_by_name(tmp_path):
+    write(tmp_path / "a.json", mmpose([(1, [0.0])]))
+    with pytest.raises(GhptDataError, match=f"there is no format 'c3d'.*{', '.join(FORMATS)}"):
+        read_people(tmp_path, format="c3d")
+    with pytest.raises(GhptDataError, match="annotations: is not a list of objects"):
+        read_people(tmp_path, format="coco")
