@@ -98,7 +98,8 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     chosen = choose(config)
     compared = {name: build(config["baselines"][name], f"baselines.{name}") for name in config["compare"]}
     frames = from_files(config) if config["keypoints"] else _from_data(config)
-    gaps = Gaps(gap_frames(config["fill"], frames.rate_hz), config["interpolation"], config["smooth"], frames.rate_hz)
+    hertz = None if config["smooth"] is None else float(config["smooth"])
+    gaps = Gaps(gap_frames(config["fill"], frames.rate_hz), config["interpolation"], hertz, frames.rate_hz)
     origin = provenance(config["seed"])
     about = About(
         name=frames.title, source=frames.source, estimator=chosen.name, joints=JOINTS, camera_names=frames.camera_names,
@@ -172,10 +173,11 @@ def from_files(config: dict[str, Any]) -> Frames:
     cameras = read_cameras(config["cameras"])
     calibrated(str(config["cameras"]), cameras)
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
-    stored = open_stored(config["keypoints"], config["skeleton"], config["rate_hz"])
+    rate = None if config["rate_hz"] is None else float(config["rate_hz"])
+    stored = open_stored(config["keypoints"], config["skeleton"], rate) if config["format"] in (None, "npz") else None
     if stored is not None:
         return frames_of_stored(stored, cameras, config["match"], config["views"], title)
-    people = read_people(config["keypoints"], config["skeleton"], config["rate_hz"], config["format"])
+    people = read_people(config["keypoints"], config["skeleton"], rate, config["format"])
     views = look_through(people, cameras, config["match"], config["views"], config["person"])
     several = dict(zip(people.views, (people.counts() > 1).sum(0).tolist(), strict=True))
     if any(several.values()):

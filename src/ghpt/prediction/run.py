@@ -48,7 +48,7 @@ class ShardPrediction(L.LightningModule):
         return DataLoader(mine, batch_size=None)  # type: ignore[arg-type]
 
     @torch.no_grad()
-    def predict_step(self, shard: int) -> int:
+    def predict_step(self, shard: int, batch_idx: int) -> int:
         rows = np.array(self.shards.rows(int(shard)))
         parts = []
         for start in range(0, len(rows), self.size):

@@ -1,0 +1,167 @@
+"""Filling and smoothing: only on request, only between what was observed, the same however it is cut up."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.interpolate import PchipInterpolator
+
+from ghpt.errors import GhptConfigError
+from ghpt.export.stream import part
+from ghpt.prediction.gaps import Gaps, after, frame_step, gap_frames, runs
+from ghpt.prediction.shards import Shards
+from ghpt.reconstruction import State
+from predicting import frames_of
+from reconstructions import random_reconstruction
+
+S, F, M = int(State.OBSERVED), int(State.FILLED), int(State.FEW_VIEWS)
+
+
+def path(*states: int, frame=None, seed=0):
+    state = np.array(states, np.int8)
+    points = np.random.default_rng(seed).normal(0, 500, (len(state), 3)).astype(np.float32)
+    return np.arange(len(state)) if frame is None else np.array(frame), points, state
+
+
+def filling(longest, kind="linear"):
+    return Gaps(longest, kind, None, None)
+
+
+def smoothing(hertz, rate=100.0):
+    return Gaps(None, "pchip", hertz, rate)
+
+
+def test_gaps_up_to_the_longest_are_filled_and_no_other():
+    found = filling(2)(*path(S, M, S, M, M, S, M, M, M, S))[1]
+    assert found.tolist() == [S, F, S, F, F, S, M, M, M, S]
+
+
+@pytest.mark.parametrize("kind", ["linear", "pchip"])
+def test_nothing_is_invented_before_the_first_or_after_the_last(kind):
+    frame, points, state = path(M, M, S, M, S, M)
+    found, states = filling(100, kind)(frame, points, state)
+    assert states.tolist() == [M, M, S, F, S, M]
+    kept = states != F
+    assert np.array_equal(found[kept], points[kept])
+
+
+def test_linear_is_the_line_between_the_neighbours():
+    frame, points, state = path(S, M, M, S)
+    found, _ = filling(2)(frame, points, state)
+    expected = [points[0] + (points[3] - points[0]) * t for t in (1 / 3, 2 / 3)]
+    np.testing.assert_allclose(found[1:3], expected, rtol=1e-5)
+
+
+def test_pchip_stays_between_its_neighbours_and_is_scipys():
+    frame, points, state = path(*[S, S, M, M, S, S, M, S])
+    found, _ = filling(2, "pchip")(frame, points, state)
+    known = state == S
+    expected = PchipInterpolator(frame[known], points[known].astype(float), axis=0)(frame)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-3)
+    low, high = np.minimum(points[1], points[4]), np.maximum(points[1], points[4])
+    assert ((found[2:4] >= low - 1e-3) & (found[2:4] <= high + 1e-3)).all()
+
+
+def test_a_frame_that_is_left_out_counts_as_a_part_of_the_gap():
+    numbers = [0, 1, 3, 4]  # 2 is in no file
+    assert filling(1)(*path(S, M, S, S, frame=numbers))[1].tolist() == [S, M, S, S]
+    assert filling(2)(*path(S, M, S, S, frame=numbers))[1].tolist() == [S, F, S, S]
+
+
+def test_every_tenth_frame_is_a_step_of_one():
+    frame = np.arange(0, 60, 10)
+    assert frame_step(frame) == 10
+    assert filling(1)(*path(S, M, S, M, M, S, frame=frame))[1].tolist() == [S, F, S, M, M, S]
+
+
+@pytest.mark.parametrize("states", [(M, M, M), (S,), (M,), (), (S, M, M), (M, M, S)])
+def test_too_little_to_fill_or_smooth_is_left_alone(states):
+    frame, points, state = path(*states)
+    for gaps in (filling(9), filling(9, "pchip"), smoothing(5.0)):
+        found, after_states = gaps(frame, points, state)
+        np.testing.assert_array_equal(found, points)
+        assert after_states.tolist() == list(states)
+
+
+def test_slow_motion_passes_and_fast_jitter_does_not():
+    t = np.arange(400) / 100
+    slow, fast = np.sin(2 * np.pi * 1.0 * t), 0.5 * np.sin(2 * np.pi * 30 * t)
+    points = np.stack([slow + fast, slow, fast], axis=-1).astype(np.float32)
+    found, _ = smoothing(8.0)(np.arange(400), points, np.zeros(400, np.int8))
+    middle = slice(50, 350)
+    assert np.abs(found[middle, 0] - slow[middle]).max() < 0.01  # in phase, and of its size
+    assert np.abs(found[middle, 2]).max() < 0.01
+
+
+def test_runs_do_not_touch_each_other():
+    frame, points, state = path(*[S] * 30, M, *[S] * 30)
+    other = points.copy()
+    other[31:] += 1000
+    one, two = (smoothing(5.0)(frame, p, state)[0] for p in (points, other))
+    np.testing.assert_array_equal(one[:30], two[:30])
+    np.testing.assert_array_equal(one[30], points[30])
+    assert np.abs(one[:30] - points[:30]).max() > 1
+
+
+def test_runs_end_where_a_number_is_left_out():
+    placed = np.array([1, 1, 0, 1, 1, 1], bool)
+    found = runs(np.array([0, 1, 2, 3, 5, 6]), placed, 1)
+    assert [run.tolist() for run in found] == [[0, 1], [3], [4, 5]]
+    assert runs(np.arange(3), np.zeros(3, bool), 1) == []
+
+
+@pytest.mark.parametrize("gaps", [filling(3, "pchip"), smoothing(5.0), Gaps(3, "linear", 5.0, 100.0)])
+@pytest.mark.parametrize("size", [7, 40, 1000])
+def test_the_borders_between_shards_do_not_show(tmp_path, gaps, size):
+    whole = random_reconstruction(90)
+    shards = Shards(tmp_path, "key", 90, size)
+    for shard in shards.missing():
+        shards.write(shard, part(whole, shards.rows(shard).start, shards.rows(shard).stop))
+    with after(gaps, shards, 17, tmp_path) as chunks:
+        found = [list(chunks()), list(chunks())]
+    shards.close()
+    points = torch.cat([chunk.points for chunk in found[0]])
+    state = torch.cat([chunk.state for chunk in found[0]])
+    assert torch.equal(points, torch.cat([chunk.points for chunk in found[1]]))  # called more than once
+    for joint in range(17):
+        expected = gaps(whole.frame.numpy(), whole.points[:, joint].numpy(), whole.state[:, joint].numpy())
+        np.testing.assert_array_equal(points[:, joint], expected[0])
+        np.testing.assert_array_equal(state[:, joint], expected[1])
+    filled = (state == State.FILLED) & (whole.state != State.FILLED)
+    assert bool(filled.any()) == (gaps.longest is not None)
+    assert not torch.cat([chunk.error for chunk in found[0]])[filled].any()
+    assert not [p for p in tmp_path.iterdir() if p.suffix != ".npz" and p.name not in ("manifest.jsonl", "lock")]
+
+
+def test_without_a_request_nothing_is_done(tmp_path):
+    assert Gaps(None, "pchip", None, None).nothing
+    assert gap_frames(None, 50.0) is None
+    assert len(frames_of(3)) == 3
+
+
+@pytest.mark.parametrize(
+    ("fill", "rate", "frames"),
+    [(6, None, 6), ("0.1s", 60.0, 6), ("0.1 s", 60.0, 6), (".5s", 10.0, 5), ("1s", 29.97, 29)],
+)
+def test_gaps_are_given_in_frames_or_seconds(fill, rate, frames):
+    assert gap_frames(fill, rate) == frames
+
+
+@pytest.mark.parametrize(
+    ("fill", "rate", "said"),
+    [(0, 60.0, "is 0"), (-1, 60.0, "is -1"), ("6", 60.0, "'6'"), ("long", 60.0, "'long'"), ("0.1s", None, "frame rate"),
+     ("0.001s", 60.0, "less than a frame")],
+)  # fmt: skip
+def test_other_gaps_are_named_errors(fill, rate, said):
+    with pytest.raises(GhptConfigError, match=f"fill: .*{said}"):
+        gap_frames(fill, rate)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [((1, "cubic", None, None), "interpolation: is 'cubic'"), ((None, "pchip", 6.0, None), "smooth: needs the frame"),
+     ((None, "pchip", 6.0, 12.0), "smooth: is 6 Hz"), ((None, "pchip", 0.0, 12.0), "smooth: is 0 Hz"),
+     ((None, "pchip", -1.0, 12.0), "smooth: is -1 Hz")],
+)  # fmt: skip
+def test_a_filter_that_cannot_be_is_a_named_error(arguments, said):
+    with pytest.raises(GhptConfigError, match=said):
+        Gaps(*arguments)
