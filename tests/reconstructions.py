@@ -1,9 +1,11 @@
 """Random reconstructions with every state, for tests of what is written of them."""
 
+import numpy as np
 import torch
 
 from ghpt.reconstruction import About, Reconstruction, State
 from ghpt.skeleton import JOINTS
+from toys import recording
 
 
 def about(joints=JOINTS, cameras=("cam_1", "cam_2", "cam_3"), rate_hz=29.97):
@@ -37,3 +39,8 @@ def random_reconstruction(frames, joints=17, views=3, seed=0, missing=0.3, first
 def in_parts(*parts):
     """Chunks of these parts, in this order."""
     return lambda: iter(parts)
+
+
+def rig(views):
+    """Cameras around the origin."""
+    return recording("toy", "S1", 1, views, 0.0, np.random.default_rng(0)).cameras

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from ghpt.errors import GhptDataError
-from ghpt.export.stream import Chunks, extent, plain, plain_names, required_rate, without_gaps
+from ghpt.export.stream import Chunks, extent_without_gaps, plain, plain_names, required_rate, without_gaps
 from ghpt.files import atomic_write
 from ghpt.reconstruction import About, Reconstruction, State
 
@@ -33,7 +33,7 @@ def write_c3d(path: Path, about: About, chunks: Chunks) -> None:
     it. Above 65,535 frames the count is in TRIAL:ACTUAL_END_FIELD and POINT:LONG_FRAMES. Raises GhptConfigError where
     the rate is unknown and GhptDataError for names that the format cannot hold.
     """
-    rate, whole = required_rate(about, "C3D"), extent(path, about, chunks)
+    rate, whole = required_rate(about, "C3D"), extent_without_gaps(path, about, chunks)
     frames, joints = whole.last - whole.first + 1, len(about.joints)
     parameters = _parameters(path, about, rate, frames, whole.first)
     start = 2 + len(parameters) // _BLOCK

@@ -70,7 +70,7 @@ def _about(about: About, shown: int, count: int, stride: int) -> str:
     words = [f"{about.estimator}", f"{len(about.camera_names)} cameras", f"{count} frames"]
     words += [f"{about.rate_hz:g} frames/s" if about.rate_hz else "rate unknown (played at 30 frames/s)"]
     words += ["smoothed"] if about.smoothed else []
-    words += [f"shown: every {stride}th of the frames, {shown}"] if stride > 1 else []
+    words += [f"shown: 1 frame of {stride}, {shown} in all"] if stride > 1 else []
     return " · ".join(words)
 
 

@@ -70,16 +70,18 @@ def extent(path: Path, about: About, chunks: Chunks) -> Extent:
     return Extent(first, last, count)
 
 
-def without_gaps(path: Path, about: About, chunks: Chunks, whole: Extent) -> Iterator[Reconstruction]:
-    """All frames from the first number to the last, in pieces: one that is absent has no joint (``FEW_VIEWS``).
-
-    For formats whose rows are equally spaced in time. Raises GhptDataError if next to all frames would be absent:
-    such numbers are times or names.
-    """
-    span = whole.last - whole.first + 1
-    if span > _MOST_ABSENT * whole.count + _ALWAYS_ABSENT:
+def extent_without_gaps(path: Path, about: About, chunks: Chunks) -> Extent:
+    """``extent``, for formats whose rows are equally spaced in time. Raises GhptDataError if next to all frames would
+    be absent: such numbers are times or names."""
+    whole = extent(path, about, chunks)
+    if whole.last - whole.first > _MOST_ABSENT * whole.count + _ALWAYS_ABSENT:
         problem = f"{whole.count} frames have numbers from {whole.first} to {whole.last}"
         raise GhptDataError(path, "frame", problem, "Number the frames one after another, or leave this format out")
+    return whole
+
+
+def without_gaps(path: Path, about: About, chunks: Chunks, whole: Extent) -> Iterator[Reconstruction]:
+    """All frames from the first number to the last, in pieces: one that is absent has no joint (``FEW_VIEWS``)."""
     following = whole.first
     for piece in pieces(path, about, chunks):
         stop = int(piece.frame[-1]) + 1
@@ -97,9 +99,8 @@ def _between(piece: Reconstruction, start: int, stop: int) -> Reconstruction:
     numbers = torch.arange(start, stop, dtype=piece.frame.dtype)
     values = {"frame": numbers}
     for field in (field.name for field in fields(piece) if field.name != "frame"):
-        value = getattr(there, field)
-        values[field] = value.new_zeros(len(numbers), *value.shape[1:])
-        values[field] += int(State.FEW_VIEWS) if field == "state" else 0
+        value, absent = getattr(there, field), State.FEW_VIEWS if field == "state" else 0
+        values[field] = value.new_full((len(numbers), *value.shape[1:]), int(absent))
         values[field][there.frame - start] = value
     return Reconstruction(**values)
 

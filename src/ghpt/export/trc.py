@@ -8,27 +8,35 @@ import numpy as np
 import torch
 
 from ghpt.errors import check
-from ghpt.export.stream import Chunks, extent, plain, plain_names, required_rate, text_rows, without_gaps
+from ghpt.export.stream import Chunks, extent_without_gaps, plain, plain_names, required_rate, text_rows, without_gaps
 from ghpt.files import atomic_write
 from ghpt.reconstruction import About
 
 _KEYS = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"
 _UNITS = {"mm": (1.0, "%.5f"), "m": (1e-3, "%.8f")}
 """Factor from mm, and decimals far below a float32's."""
-_TO_Y_UP = {"x": ((1, -1), (0, 1), (2, 1)), "y": ((0, 1), (1, 1), (2, 1)), "z": ((0, 1), (2, 1), (1, -1))}
+_TO_Y_UP = {
+    "x": ((1, -1), (0, 1), (2, 1)), "y": ((0, 1), (1, 1), (2, 1)), "z": ((0, 1), (2, 1), (1, -1)),
+    "-x": ((1, 1), (0, -1), (2, 1)), "-y": ((0, 1), (1, -1), (2, -1)), "-z": ((0, 1), (2, -1), (1, 1)),
+}  # fmt: skip
 """For a world with this axis up: (axis, sign) of the file's x, y, z. All are rotations."""
 
 
 def write_trc(path: Path, about: About, chunks: Chunks, unit: str = "mm", world_up: str | None = None) -> None:
     """A row for each frame from the first to the last number, tabs between; what is missing is blank, never NaN.
 
-    ``unit``: ``mm`` or ``m``. ``world_up``: the axis of the world that points up (``x``, ``y``, ``z``); the file's y
+    ``unit``: ``mm`` or ``m``. ``world_up``: the axis of the world that points up (``z``, ``-y``, ...); the file's y
     then does, as OpenSim's models expect. None leaves the world's own axes. Times count from the first frame. Raises
     GhptConfigError where the rate is unknown.
     """
     check(unit in _UNITS, "trc.unit", f"is {unit!r}", f"Choose one of {', '.join(_UNITS)}")
-    check(world_up is None or world_up in _TO_Y_UP, "trc.world_up", f"is {world_up!r}", "Choose x, y, z or null")
-    rate, whole = required_rate(about, "TRC"), extent(path, about, chunks)
+    check(
+        world_up is None or world_up in _TO_Y_UP,
+        "trc.world_up",
+        f"is {world_up!r}",
+        "Choose x, y, z, -x, -y, -z or null",
+    )
+    rate, whole = required_rate(about, "TRC"), extent_without_gaps(path, about, chunks)
     names, joints = plain_names(path, "joints", about.joints), len(about.joints)
     rows = whole.last - whole.first + 1
     hertz = f"{rate:.15g}"

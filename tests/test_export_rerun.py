@@ -1,0 +1,38 @@
+"""The Rerun recording, where rerun-sdk is installed; and that its absence is named."""
+
+import importlib.util
+import subprocess
+import sys
+
+import pytest
+import torch
+
+from ghpt.errors import GhptConfigError
+from ghpt.export import WRITERS, Evidence, Scene
+from ghpt.export.stream import part
+from reconstructions import about, in_parts, random_reconstruction, rig
+
+
+def test_without_the_package_it_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(GhptConfigError, match=r"rerun: needs rerun-sdk.*ghpt\[viz\]"):
+        WRITERS["rerun"].write(tmp_path / "poses.rrd", about(), in_parts(random_reconstruction(3)))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_recording_has_cameras_rays_key_points_joints_and_hypotheses(tmp_path):
+    if importlib.util.find_spec("rerun") is None:
+        pytest.skip("rerun-sdk, 170 MB, comes with ghpt[viz]")
+    made = random_reconstruction(20)
+    evidence = Evidence(torch.randn(20, 3, 17, 2), made.views, torch.randn(20, 4, 17, 3))
+    parts = [Evidence(*(value[a:b] for value in evidence)) for a, b in ((0, 7), (7, 20))]
+    scene = Scene(rig(3), lambda: iter(parts))
+    WRITERS["rerun"].write(
+        tmp_path / "poses.rrd", about(cameras=("a/b", "..", "c d")), in_parts(part(made, 0, 7), part(made, 7, 20)),
+        scene=scene,
+    )  # fmt: skip
+    assert [path.name for path in tmp_path.iterdir()] == ["poses.rrd"]
+    command = [sys.executable, "-m", "rerun_cli", "rrd", "stats", str(tmp_path / "poses.rrd")]
+    stats = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+    for entity in ("/world/joints", "/world/bones", "/world/hypotheses", "/world/rays/", "key_points", "reprojected"):
+        assert entity in stats
