@@ -1,0 +1,119 @@
+"""The camera doctor's confusion table: good rigs, each spoilt in each way; what was broken against what was said.
+
+``python scripts/doctor_table.py`` takes the embedded recordings; ``--real FOLDER`` adds Pose2Sim's example and
+caliscope's recording from a folder with ``pose2sim_single`` and ``caliscope``.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import hydra
+import torch
+
+from ghpt.checkup.breakages import BREAKAGES, Case
+from ghpt.checkup.evidence import gather
+from ghpt.checkup.examination import Doctor
+from ghpt.checkup.setup import as_filed
+from ghpt.config import build, plain
+from ghpt.data.camera_files import read_cameras
+from ghpt.data.key_points import read_key_points
+from ghpt.data.store import prepared
+from ghpt.doctor import from_recording
+from ghpt.report.tables import markdown
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def compose(overrides: list[str]) -> dict:
+    with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        return plain(hydra.compose("cameras", [*overrides, "output=unused"]))
+
+
+def embedded(doctor: Doctor, names: list[str], frames: int, take: int) -> Iterator[tuple[str, Case]]:
+    """The middle ``frames`` frames of ``take`` recordings of each arrangement, over all of its subjects."""
+    for name in names:
+        for split in ("train", "validation", "test"):
+            data = build(compose([f"data={name}", f"data.evaluate={split}"])["data"], "data")
+            made = {"source": data.source, "split": split}
+            stored = prepared(data.cache, data.key(split), lambda data=data, split=split: data.make(split), made)
+            subjects = defaultdict(list)
+            for recording in stored:
+                subjects[recording.subject].append(recording)
+            for number, of in enumerate(subjects.values()):
+                for recording in of[number % 7 :: max(1, len(of) // take)][:take]:
+                    evidence, file = from_recording(recording, data, doctor, frames)
+                    yield f"{name} {recording.name}", (evidence, as_filed(file))
+
+
+def real(doctor: Doctor, folder: Path) -> Iterator[tuple[str, Case]]:
+    for name, points, cameras in (
+        ("pose2sim", "pose2sim_single/pose", "pose2sim_single/Calib_qualisys.toml"),
+        ("caliscope", "caliscope/xy_HOLISTIC.csv", "caliscope/camera_array.toml"),
+    ):
+        found = gather(read_key_points(folder / points), read_cameras(folder / cameras), {}, None, doctor.frames,
+                       doctor.shift)  # fmt: skip
+        yield name, (found[0], as_filed(found[1]))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", nargs="*", default=["h36m", "cmu1", "cmu2", "cmu3", "cmu4"])
+    parser.add_argument("--frames", type=int, default=200, help="of each recording")
+    parser.add_argument("--take", type=int, default=1, help="recordings of each subject")
+    parser.add_argument("--limit", type=int, default=1 << 30, help="recordings of all")
+    parser.add_argument("--kinds", nargs="*", default=[*BREAKAGES])
+    parser.add_argument("--views", type=int, help="the first so many views alone")
+    parser.add_argument("--real", type=Path, help="folder with pose2sim_single and caliscope")
+    options = parser.parse_args()
+    doctor = build(compose([])["doctor"], "doctor")
+    cases = list(embedded(doctor, options.data, options.frames, options.take))[: options.limit]
+    if options.real:
+        cases += real(doctor, options.real)
+    table: dict[str, Counter] = defaultdict(Counter)
+    seconds = []
+    for name, case in cases:
+        if options.views:
+            case = first_views(case, options.views)
+        for kind in ("nothing", *options.kinds):
+            expected = "nothing" if kind == "nothing" else BREAKAGES[kind].said
+            start = time.perf_counter()
+            evidence, setup = case if kind == "nothing" else BREAKAGES[kind].spoil(case)
+            checkup = doctor(evidence, setup)
+            seconds.append(time.perf_counter() - start)
+            words = said(checkup.findings)
+            table[kind][words] += 1
+            if words != expected:
+                before, after = (" ".join(f"{x:.1f}" for x in e.tolist()) for e in (checkup.given_px, checkup.error_px))
+                print(f"{name}, {kind}: {words} [{before} -> {after} px]", flush=True)
+    print_table(table)
+    print(f"\n{len(cases)} recordings; seconds: median {torch.tensor(seconds).median():.1f}, most {max(seconds):.1f}")
+
+
+def first_views(case: Case, count: int) -> Case:
+    evidence, setup = case
+    tensors = {name: getattr(setup, name)[:count] for name in vars(setup)}
+    return (
+        replace(evidence, names=evidence.names[:count], pixels=evidence.pixels[:count], seen=evidence.seen[:count]),
+        replace(setup, **tensors),
+    )
+
+
+def said(findings: tuple) -> str:
+    return " + ".join(f.code + ("" if f.mended else "?") for f in findings) or "nothing"
+
+
+def print_table(table: dict[str, Counter]) -> None:
+    columns = list(dict.fromkeys(["nothing", *(breakage.said for breakage in BREAKAGES.values()),
+                                  *(words for row in table.values() for words in row)]))  # fmt: skip
+    rows = [[kind, *(str(row[column] or "") for column in columns)] for kind, row in table.items()]
+    print(markdown(["broken", *columns], rows))
+
+
+if __name__ == "__main__":
+    main()

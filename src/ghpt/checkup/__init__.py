@@ -1,0 +1,1 @@
+"""What is wrong with the cameras, or with which view is whose, told from the key points alone."""

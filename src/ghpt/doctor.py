@@ -1,0 +1,207 @@
+"""The camera doctor: what is wrong with a calibration, from the people in view, and the mended files."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypedDict
+
+import numpy as np
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from ghpt.calibrate import people_note
+from ghpt.checkup.breakages import BREAKAGES
+from ghpt.checkup.evidence import Evidence, choose, gather
+from ghpt.checkup.examination import Checkup, Doctor
+from ghpt.checkup.mending import MENDED, write_mended
+from ghpt.checkup.setup import Setup, as_filed
+from ghpt.config import build, check_type, suggest
+from ghpt.data.camera_files import CameraFile, read_cameras
+from ghpt.data.key_points import KeyPoints, read_key_points
+from ghpt.data.lens import distort
+from ghpt.data.rigs import human36m_rig, panoptic_rig
+from ghpt.data.store import prepared
+from ghpt.errors import GhptConfigError, GhptDataError
+from ghpt.files import atomic_write, sweep_temporaries
+from ghpt.provenance import provenance
+from ghpt.recording import Recording
+from ghpt.report.tables import markdown, words
+from ghpt.train import shown
+
+_log = logging.getLogger(__name__)
+_HEADER = ["camera", "error px", "mended px"]
+
+
+class Settings(TypedDict):
+    """What `examine` needs of the configuration."""
+
+    keypoints: str | None
+    cameras: str | None
+    views: list[str] | None
+    match: dict[str, str] | None
+    skeleton: str | None
+    rate_hz: float | None
+    recording: str | None
+    spoil: str | None
+    data: dict[str, Any]
+    doctor: dict[str, Any]
+    seed: int
+
+
+@dataclass(frozen=True)
+class Patient:
+    """What is examined."""
+
+    title: str
+    source: str
+    evidence: Evidence
+    cameras: CameraFile
+    setup: Setup
+    points: KeyPoints | None
+    """None for a demonstration."""
+    at: tuple[int, ...]
+    """Which of the key points' views are the evidence's."""
+
+
+def examine(config: dict[str, Any], output: Path) -> dict[str, Any]:
+    """Examine the cameras of ``config["cameras"]`` with ``config["keypoints"]``, or a recording of ``config["data"]``.
+
+    Writes checkup.json and report.md into ``output`` and, of what can be mended, ``MENDED``; prints what is wrong.
+    Raises GhptDataError after writing if anything is. Returns what checkup.json holds.
+    """
+    check_type(config, Settings, "")
+    doctor = build(config["doctor"], "doctor")
+    patient = from_files(config, doctor) if config["keypoints"] else from_data(config, doctor)
+    sweep_temporaries(output)
+    for name in MENDED:  # of an earlier run
+        (output / name).unlink(missing_ok=True)
+    checkup = doctor(patient.evidence, patient.setup)
+    numbers = _numbers(patient, checkup) | {"provenance": provenance(config["seed"])}
+    mended = any(finding.mended for finding in checkup.findings)
+    if mended:
+        write_mended(output, patient.cameras, checkup, patient.points, patient.at)
+    with atomic_write(output / "checkup.json", "w") as handle:
+        json.dump(numbers, handle, indent=1)
+    with atomic_write(output / "report.md", "w") as handle:
+        handle.write(report(numbers))
+    _print(numbers)
+    _log.info("Report: %s%s.", shown(output / "report.md"), ", beside it the mended files" * mended)
+    if checkup.findings:
+        raise GhptDataError(patient.source, "cameras", summary(numbers), f"See {shown(output / 'report.md')}.")
+    return numbers
+
+
+def summary(numbers: dict[str, Any]) -> str:
+    """What `examine` found, in words."""
+    found = [f"{' and '.join(f['cameras']) or 'all cameras'}: {f['code']}" for f in numbers["findings"]]
+    return ", ".join(found) or f"{numbers['title']}: nothing wrong"
+
+
+def from_files(config: Mapping[str, Any], doctor: Doctor) -> Patient:
+    """The user's own key points and cameras."""
+    if not config["cameras"]:
+        raise GhptConfigError("cameras", "is missing", "Name the file to examine: cameras=Calib.toml")
+    if config["spoil"]:
+        raise GhptConfigError("spoil", "is for demonstrations", "Leave it out, or leave out keypoints.")
+    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"])
+    file = read_cameras(config["cameras"])
+    evidence, cameras, at = gather(points, file, config["match"] or {}, config["views"], doctor.frames, doctor.shift)
+    for note in people_note(points):
+        _log.warning(note.text)
+    title = f"{Path(config['cameras']).name} with {Path(config['keypoints']).resolve().name}"
+    return Patient(title, str(config["cameras"]), evidence, cameras, as_filed(cameras), points, at)
+
+
+def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
+    """An embedded recording, spoilt on request."""
+    data = build(config["data"], "data")
+    if data.source != "embedded":
+        raise GhptConfigError("data", "is a data set on disk", "Give keypoints and cameras, or the embedded data.")
+    made = {"source": data.source, "split": data.evaluate}
+    stored = prepared(data.cache, data.key(data.evaluate), lambda: data.make(data.evaluate), made)
+    recordings = {recording.name: recording for recording in stored}
+    name = config["recording"] or ("S9/Walking-1" if "S9/Walking-1" in recordings else next(iter(recordings), ""))
+    if name not in recordings:
+        raise GhptConfigError("recording", f"there is no {name!r}", suggest(name, recordings))
+    evidence, cameras = from_recording(recordings[name], data, doctor, len(recordings[name]))
+    setup = as_filed(cameras)
+    if config["spoil"]:
+        if config["spoil"] not in BREAKAGES:
+            raise GhptConfigError("spoil", f"there is no {config['spoil']!r}", suggest(config["spoil"], BREAKAGES))
+        evidence, setup = BREAKAGES[config["spoil"]].spoil((evidence, setup))
+    title = f"{name} of {words(data.name, data.source)}" + f", spoilt: {config['spoil']}" * bool(config["spoil"])
+    return Patient(title, data.source, evidence, cameras, setup, None, ())
+
+
+def from_recording(recording: Recording, data: Any, doctor: Doctor, frames: int) -> tuple[Evidence, CameraFile]:
+    """The middle ``frames`` frames of an embedded recording, as its rig's lenses show them."""
+    rig = human36m_rig(recording.subject) if data.name == "h36m" else panoptic_rig(data.cameras)
+    first = max(0, (len(recording) - frames) // 2)
+    rows = slice(first, first + frames)
+    straight = torch.from_numpy(recording.key_points[rows].astype(np.float64)).transpose(0, 1)
+    pixels = distort(straight.flatten(1, 2), rig.cameras.K, rig.distortion).reshape(straight.shape).transpose(0, 1)
+    file = CameraFile(
+        path=recording.name, format="ghpt", names=rig.names, other_names=("",) * len(rig), K=rig.cameras.K,
+        distortion=rig.distortion, size=rig.size, R=rig.cameras.R, t=rig.cameras.t,
+    )  # fmt: skip
+    seen, frame = np.array(recording.seen[rows]), np.array(recording.frame[rows])
+    return choose(rig.names, pixels.numpy(), seen, frame, doctor.frames, doctor.shift, recording.name), file
+
+
+def report(numbers: dict[str, Any]) -> str:
+    """The Markdown report."""
+    findings = "\n".join(f"- **{f['code']}**: {_sentence(f)}" for f in numbers["findings"])
+    return "\n\n".join([
+        f"# Check-up of {numbers['title']}",
+        f"{numbers['frames']} frames, {len(numbers['cameras'])} views. {_stature(numbers)}",
+        "## Findings", findings or "Nothing is wrong.",
+        "## Cameras", markdown(_HEADER, _rows(numbers)),
+        "Each view's key points against the joints that the other views triangulate: median distance, pixels, as the "
+        "files have it and with everything mended that can be.",
+    ]) + "\n"  # fmt: skip
+
+
+def _numbers(patient: Patient, checkup: Checkup) -> dict[str, Any]:
+    errors = zip(patient.evidence.names, checkup.given_px.tolist(), checkup.error_px.tolist(), strict=True)
+    return {
+        "title": patient.title, "source": patient.source, "frames": len(patient.evidence.frame),
+        "stature_mm": checkup.stature or None, "findings": [vars(finding) for finding in checkup.findings],
+        "cameras": [{"name": name, "error_px": given, "mended_px": after} for name, given, after in errors],
+    }  # fmt: skip
+
+
+def _print(numbers: dict[str, Any]) -> None:
+    console = Console()
+    table = Table(title=f"Check-up of {numbers['title']}", caption="median error against the other views",
+                  title_justify="left", caption_justify="left")  # fmt: skip
+    for i, column in enumerate(_HEADER):
+        table.add_column(column, justify="right" if i else "left")
+    for row in _rows(numbers):
+        table.add_row(*row)
+    console.print(table)
+    console.print(_stature(numbers), highlight=False)
+    for finding in numbers["findings"]:
+        console.print(f"[red]{finding['code']}[/red]: {_sentence(finding)}", highlight=False, soft_wrap=True)
+    if not numbers["findings"]:
+        console.print("Nothing is wrong.", highlight=False)
+
+
+def _rows(numbers: dict[str, Any]) -> list[list[str]]:
+    return [[c["name"], f"{c['error_px']:.1f}", f"{c['mended_px']:.1f}"] for c in numbers["cameras"]]
+
+
+def _sentence(finding: Mapping[str, Any]) -> str:
+    before, after = finding["before_px"], finding["after_px"]
+    if not before:
+        return f"{finding['text']}."
+    return f"{finding['text']} ({before:.1f} px" + (f", then {after:.1f} px)." if finding["mended"] else ").")
+
+
+def _stature(numbers: dict[str, Any]) -> str:
+    height = numbers["stature_mm"]
+    return f"The person measures {height / 1000:.2f} m." if height else "The person's size cannot be told."
