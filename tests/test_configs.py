@@ -64,6 +64,13 @@ def test_the_camera_s_numbers_are_those_of_the_paper_s_table_of_hyperparameters(
     assert model["problem"]["frames"] == 80
 
 
+@pytest.mark.parametrize("scale", choices("scale_of_t"))
+def test_the_length_of_t_has_its_choices(scale):
+    model = compose("train", "model=camera", f"scale_of_t@model.problem.scale={scale}", "model.scorer.layers=[2]")
+    kinds = {"known": "KnownScale", "height": "BodyHeight", "segments": "SegmentLengths"}
+    assert type(build(model["model"], "model").problem.scale).__name__ == kinds[scale]
+
+
 @pytest.mark.parametrize("data", choices("data"))
 def test_every_test_configuration_builds(data):
     config = compose("test", f"data={data}")
