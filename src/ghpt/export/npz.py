@@ -33,7 +33,7 @@ def _layout(views: int, joints: int) -> dict[str, tuple[str, tuple[int, ...]]]:
 
 
 def write_npz(path: Path, about: About, chunks: Chunks) -> None:
-    """All fields of ``Reconstruction`` and ``About`` (docs/formats: units mm and pixels).
+    """All fields of ``Reconstruction`` and ``About`` (docs/outputs.md).
 
     Positions are NaN where missing; errors and covariances where not observed. Stored without compression: numpy
     reads it, in parts too. The same content gives the same bytes.
