@@ -17,20 +17,20 @@ from ghpt.data.camera_files import read_cameras
 from ghpt.data.key_points import read_people
 from ghpt.data.views import look_through
 from ghpt.errors import GhptCheckpointError, GhptConfigError, check
-from ghpt.export import WRITERS
+from ghpt.export import WRITERS, Scene
 from ghpt.files import atomic_write, sweep_temporaries
 from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
-from ghpt.prediction.frames import Frames, calibrated, frames_of_views
+from ghpt.models.predictors import Classical, Learned, Predictor
+from ghpt.models.swaps import Swaps
+from ghpt.prediction.frames import Frames, calibrated, evidence, frames_of_views
 from ghpt.prediction.gaps import Gaps, after, gap_frames
 from ghpt.prediction.report import prediction_report, print_prediction
-from ghpt.prediction.run import Predictor, predicted
-from ghpt.prediction.stand_in import Classical, Learned
-from ghpt.prediction.statistics import Estimate, counts, evaluate
+from ghpt.prediction.run import predicted
+from ghpt.prediction.statistics import Estimate, counts, estimate_of, evaluate
 from ghpt.prediction.stored import frames_of_stored, open_stored
 from ghpt.provenance import provenance
-from ghpt.reconstruction import About, State
-from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.reconstruction import About
 from ghpt.report.tables import NAMES
 from ghpt.skeleton import JOINTS
 from ghpt.train import shown
@@ -71,6 +71,12 @@ class Settings(TypedDict):
     data: dict[str, Any]
     baselines: dict[str, Any]
     trainer: dict[str, Any]
+    reject: bool
+    swaps: bool
+    swap_search: dict[str, Any]
+    quality: dict[str, Any]
+    spread: float
+    fitted_frames: int
     seed: int
 
 
@@ -82,6 +88,7 @@ class Chosen:
     text: str
     """In words, for people."""
     predictor: Predictor
+    swaps: Swaps | None
     weights: torch.nn.Module | None
     identity: dict[str, Any]
     """What its results depend on, as plain data."""
@@ -110,21 +117,24 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     formats = _formats(config, frames)
     _log.info("%s: %d frames, %d views, by %s.", frames.title, len(frames), len(frames.camera_names), chosen.text)
     sweep_temporaries(output)
+    predictor = chosen.predictor.fitted(frames.batch(frames.spread(config["fitted_frames"])))
     key = _key(frames, chosen, origin)
-    with predicted(frames, chosen.predictor, chosen.weights, output / SHARDS, key, config) as shards:
+    with predicted(frames, predictor, chosen.weights, output / SHARDS, key, config) as shards:
         if shards is None:
             return {}
         with after(gaps, shards, len(JOINTS), output) as chunks:
+            scene = Scene(frames.cameras, lambda: evidence(frames, shards))
+            settings = {"trc": config["trc"], "html": {"scene": scene}, "rerun": {"scene": scene}}
             for name in formats:
-                WRITERS[name].write(output / WRITERS[name].file, about, chunks, **config.get(name, {}))
+                WRITERS[name].write(output / WRITERS[name].file, about, chunks, **settings.get(name, {}))
             found = counts(chunks(), about.joints, about.camera_names)
-    estimates: dict[str, Estimate] = {chosen.name: _estimate(chosen.predictor)}
+    estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor)}
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
     numbers = {
         "data": frames.title, "source": frames.source, "cameras": list(frames.camera_names),
         "estimator": chosen.name, "estimator_text": chosen.text, "rate_hz": frames.rate_hz,
         "fill_frames": gaps.longest, "smooth_hz": gaps.cut_off_hz, **found,
-        "evaluation": evaluate(frames, estimates, config["evaluated_frames"], config["batch"]),
+        "evaluation": evaluate(frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"]),
         "formats": formats, "provenance": about.provenance,
     }  # fmt: skip
     with atomic_write(output / "prediction.json", "w") as handle:
@@ -148,22 +158,26 @@ def summary(numbers: dict[str, Any]) -> str:
 def choose(config: dict[str, Any]) -> Chosen:
     """The checkpoint's model, or without one the classical estimator. Raises GhptCheckpointError for a model that does
     not predict poses."""
+    settings = {name: config[name] for name in ("quality", "swaps", "swap_search", "fitted_frames")}
+    quality = build(config["quality"], "quality")
+    swaps = build(config["swap_search"], "swap_search") if config["swaps"] else None
     if not config["ckpt"]:
         name = config["estimator"]
-        settings = config["baselines"][name]
+        settings |= {"estimator": config["baselines"][name], "reject": config["reject"]}
         text = f"{NAMES.get(name, name.replace('_', ' '))}, a classical estimator (no ckpt was given)"
-        predictor = Classical(build(settings, f"baselines.{name}"))
-        return Chosen(name, text, predictor, None, settings)
+        predictor = Classical(build(settings["estimator"], f"baselines.{name}"), quality, swaps, config["reject"])
+        return Chosen(name, text, predictor, swaps, None, settings)
     model, trained = load_model(config["ckpt"], hypotheses=config["hypotheses"], seed=config["seed"])
     if not isinstance(model.problem, PoseTriangulation):
         problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
         raise GhptCheckpointError(config["ckpt"], problem, "Give one that train.py model=pose wrote.")
-    model.eval()
     digest = hashlib.sha256(Path(config["ckpt"]).read_bytes()).hexdigest()
-    data = trained["provenance"].get("data", "unknown data")
-    text = f"the learned model of {Path(config['ckpt']).name}, trained on {data}"
-    identity = {"ckpt_sha256": digest, "hypotheses": model.hypotheses, "seed": config["seed"]}
-    return Chosen("weight", text, Learned(model), model, identity)
+    text = (
+        f"the learned model of {Path(config['ckpt']).name}, trained on {trained['provenance'].get('data', 'unknown')}"
+    )
+    settings |= {"ckpt_sha256": digest, "hypotheses": model.hypotheses, "seed": config["seed"],
+                 "spread": config["spread"]}  # fmt: skip
+    return Chosen("weight", text, Learned(model, quality, swaps, float(config["spread"])), swaps, model, settings)
 
 
 def from_files(config: dict[str, Any]) -> Frames:
@@ -191,14 +205,6 @@ def _from_data(config: dict[str, Any]) -> Frames:
     return frames_of_views(case.views, case.source, case.title)
 
 
-def _estimate(predictor: Predictor) -> Estimate:
-    def estimate(batch: KeyPointBatch) -> PoseEstimate:
-        found = predictor(batch)
-        return PoseEstimate(found.points, found.state == State.OBSERVED)
-
-    return estimate
-
-
 def _key(frames: Frames, chosen: Chosen, origin: dict[str, Any]) -> str:
     """What shards depend on, in one word."""
     made = {name: value for name, value in origin.items() if name != "command"}
@@ -218,7 +224,7 @@ def _formats(config: dict[str, Any], frames: Frames) -> list[str]:
 
 
 def _check(config: dict[str, Any]) -> None:
-    for name in ("evaluated_frames", "shard_frames", "batch"):
+    for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
         check(config[name] >= 1, name, f"is {config[name]}", "Give 1 or more.")
     for key, names, existing in (
         ("estimator", [config["estimator"]], config["baselines"]), ("compare", config["compare"], config["baselines"]),

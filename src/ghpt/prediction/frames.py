@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,9 @@ from jaxtyping import Bool, Float, Int
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.views import Views
 from ghpt.errors import GhptDataError
+from ghpt.export import Evidence
 from ghpt.geometry.cameras import Cameras
+from ghpt.prediction.shards import Shards
 from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import JOINTS
 
@@ -91,3 +93,10 @@ def calibrated(where: str, cameras: CameraFile) -> Cameras:
     if cameras.cameras is None:
         raise GhptDataError(cameras.path, "rotation, translation", "not all cameras have extrinsics", _MEND)
     return cameras.cameras
+
+
+def evidence(frames: Frames, shards: Shards) -> Iterator[Evidence]:
+    """The key points of each shard."""
+    for shard in range(len(shards)):
+        batch = frames.batch(np.array(shards.rows(shard)))
+        yield Evidence(batch.key_points, batch.seen, None)

@@ -11,7 +11,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.geometry.cameras import reprojection_error
+from ghpt.models.predictors import Predictor
 from ghpt.models.scale import SEGMENTS
+from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.prediction.frames import Frames
 from ghpt.reconstruction import Reconstruction, State
 from ghpt.recording import KeyPointBatch, PoseEstimate
@@ -35,11 +37,16 @@ def counts(chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: t
             "swapped": dict(zip(cameras, swapped.tolist(), strict=True))}  # fmt: skip
 
 
-def evaluate(frames: Frames, estimates: Mapping[str, Estimate], most: int, size: int) -> Numbers:
-    """For each estimator, on at most so many frames, evenly spread: reprojection errors by view; errors in views that
+@torch.no_grad()
+def evaluate(
+    frames: Frames, swaps: Swaps | None, estimates: Mapping[str, Estimate], most: int,
+    size: int,
+) -> Numbers:  # fmt: skip
+    """For each estimator, on at most so many frames, evenly spread, and with ``swaps`` undone for all:
+    reprojection errors by view; errors in views that
     were left out, on the joints that all of them estimate without that view; variation of the segments' lengths."""
     rows = frames.spread(most)
-    parts = [frames.batch(rows[start : start + size]) for start in range(0, len(rows), size)]
+    parts = [_undone(frames.batch(rows[start : start + size]), swaps) for start in range(0, len(rows), size)]
     own = {name: [estimate(part) for part in parts] for name, estimate in estimates.items()}
     held = {name: [_held_out(part, estimate) for part in parts] for name, estimate in estimates.items()}
     counted = torch.stack([torch.cat([there for _, there in found]) for found in held.values()]).all(0)
@@ -59,6 +66,20 @@ def evaluate(frames: Frames, estimates: Mapping[str, Estimate], most: int, size:
             "placed": float(placed.double().mean()),
         }  # fmt: skip
     return {"frames": len(rows), "estimators": result}
+
+
+def estimate_of(predictor: Predictor) -> Estimate:
+    """What a predictor gives, as the other estimators give it."""
+
+    def estimate(batch: KeyPointBatch) -> PoseEstimate:
+        found = predictor(batch)
+        return PoseEstimate(found.points, found.state == State.OBSERVED)
+
+    return estimate
+
+
+def _undone(batch: KeyPointBatch, swaps: Swaps | None) -> KeyPointBatch:
+    return batch if swaps is None else undo_swaps(batch, swaps)[0]
 
 
 def _errors(batch: KeyPointBatch, found: PoseEstimate) -> Float[Tensor, "B V J"]:
