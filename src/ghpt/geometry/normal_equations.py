@@ -99,14 +99,14 @@ def views_of(cameras: Cameras, key_points: Float[Tensor, "B V J 2"], usable: Boo
     return Views(first, second, tuple(R[2]), (*shift, t[2].contiguous()), u, v)
 
 
-def products(a: Sequence[Tensor], b: Sequence[Tensor]) -> Float[Tensor, "V 9 J B"]:
+def products(a: Sequence[Tensor], b: Sequence[Tensor]) -> Float[Tensor, "V 9 ..."]:
     """Normal equations of each view alone from its two rows: the matrix (xx xy xz yy yz zz) and its right-hand side
     (3)."""
     pairs = [(i, j) for i in range(3) for j in range(i, 3)] + [(i, 3) for i in range(3)]
     return torch.stack([torch.addcmul(a[i] * a[j], b[i], b[j]) for i, j in pairs], dim=1)
 
 
-def weighted_sum(equations: Float[Tensor, "V E J B"], weights: Float[Tensor, "V J B"]) -> Float[Tensor, "E J B"]:
+def weighted_sum(equations: Float[Tensor, "V E ..."], weights: Float[Tensor, "V ..."]) -> Float[Tensor, "E ..."]:
     """Over the views, in their order: each frame's sum is the same in any batch, as ``torch.sum``'s is not."""
     total = equations.new_zeros(equations.shape[1:])
     for equation, weight in zip(equations, weights, strict=True):
@@ -144,8 +144,8 @@ def solve_symmetric(equations: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tens
     determinant = matrix[0] * cxx + matrix[1] * cxy + matrix[2] * cxz
     numerator = (matrix[0] + matrix[3] + matrix[5]) * (cxx + cyy + czz)
     good = numerator < LARGEST_CONDITION * determinant
-    safe = torch.where(good, determinant, 1.0)
-    x = torch.where(good, (cxx * p + cxy * q + cxz * r) / safe, 0.0)
-    y = torch.where(good, (cxy * p + cyy * q + cyz * r) / safe, 0.0)
-    z = torch.where(good, (cxz * p + cyz * q + czz * r) / safe, 0.0)
-    return x, y, z, torch.where(good, numerator / safe, torch.inf)
+    inverse = torch.where(good, 1 / torch.where(good, determinant, 1.0), 0.0)
+    x = (cxx * p + cxy * q + cxz * r) * inverse
+    y = (cxy * p + cyy * q + cyz * r) * inverse
+    z = (cxz * p + cyz * q + czz * r) * inverse
+    return x, y, z, torch.where(good, numerator * inverse, torch.inf)

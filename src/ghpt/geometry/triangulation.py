@@ -6,7 +6,7 @@ the number of subsets; then each joint is a 3x3 solve.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -86,13 +86,26 @@ def triangulate(
     rig = flat_cameras(cameras, lead)
     frames = lead.numel()
     key_points, weights = key_points.reshape(frames, views, joints, 2), weights.reshape(frames, views, joints)
-    parts = []
+
+    def part(rows: slice) -> tuple[Tensor, ...]:
+        weight = weights[rows].permute(1, 2, 0)
+        chosen = ~(weight <= 0)
+        system = System(rig if len(rig.t) == 1 else rig.index(rows), key_points[rows], chosen & (weight < torch.inf))
+        weight = torch.where(system.used, weight.to(torch.float64), 0.0)
+        largest = weight.amax(dim=0) if len(weight) else weight.sum(0)
+        solution = system.solve(weight / torch.where(largest > 0, largest, 1.0))
+        return system.fields(*solution, system.used, (chosen & ~system.used).any(0))
+
+    fields = in_parts(part, weights.shape)
+    return Triangulation(*(x.reshape(*lead, *x.shape[1:]) for x in fields))
+
+
+def in_parts(function: Callable[[slice], tuple[Tensor, ...]], shape: torch.Size) -> list[Tensor]:
+    """What ``function`` gives for all frames of [B, V, J], a few frames at a time."""
+    frames, views, joints = shape
     size = max(1, _AT_ONCE // max(views * joints, 1))
-    for start in range(0, max(frames, 1), size):
-        part = slice(start, start + size)
-        parts.append(_triangulate(rig if len(rig.t) == 1 else rig.index(part), key_points[part], weights[part]))
-    whole = [torch.cat(field) if len(parts) > 1 else field[0] for field in zip(*parts, strict=True)]
-    return Triangulation(*(x.reshape(*lead, *x.shape[1:]) for x in whole))
+    parts = [function(slice(start, start + size)) for start in range(0, max(frames, 1), size)]
+    return [torch.cat(field) if len(parts) > 1 else field[0] for field in zip(*parts, strict=True)]
 
 
 def flat_cameras(cameras: Cameras, lead: torch.Size) -> Cameras:
@@ -107,51 +120,62 @@ def flat_cameras(cameras: Cameras, lead: torch.Size) -> Cameras:
     return Cameras(*(x.reshape(frames, *x.shape[len(lead) :]) for x in fields))
 
 
-def _triangulate(
-    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], weights: Float[Tensor, "B V J"]
-) -> tuple[Tensor, ...]:
-    """The fields of Triangulation for a few frames; inside, arrays are [V, J, B]."""
-    weights = weights.permute(1, 2, 0).contiguous()
-    valid = valid_cameras(cameras)
-    local, origin = local_cameras(cameras, valid)
-    chosen = ~(weights <= 0)
-    usable = (key_points.abs() <= LARGEST).all(-1).permute(1, 2, 0) & valid.mT[:, None]
-    used = chosen & usable & (weights < torch.inf)
-    spoilt = (chosen & ~used).any(0)
-    count = used.sum(0)
-    weight = torch.where(used, weights.to(torch.float64), 0.0)
-    largest = weight.amax(dim=0) if len(weight) else weight.sum(0)
-    weight = weight / torch.where(largest > 0, largest, 1.0)
+class System:
+    """The equations of a few frames, made once for any weights; arrays are [V, J, B]."""
 
-    views = views_of(local, key_points, used)
-    a, b = views.rows()
-    equations = weighted_sum(products(a, b), weight)
-    *solution, cond = solve_symmetric(tuple(equations))
-    # once more from the residuals of the rows: the digits that squaring has cost
-    toward = weighted_sum(_toward(a, b, solution), weight)
-    solution = [x + d for x, d in zip(solution, solve_symmetric((*equations[:6], *toward)), strict=False)]
+    def __init__(self, cameras: Cameras, key_points: Float[Tensor, "B V J 2"], given: Bool[Tensor, "V J B"]) -> None:
+        valid = valid_cameras(cameras)
+        self.local, self.origin = local_cameras(cameras, valid)
+        finite = (key_points.abs() <= LARGEST).permute(3, 1, 2, 0)
+        self.used = given & finite[0] & finite[1] & valid.mT[:, None]
+        self.views = views_of(self.local, key_points, self.used)
+        self.a, self.b = self.views.rows()
+        self.equations = products(self.a, self.b)
+        self.length = torch.linalg.vector_norm(torch.where(valid[..., None], cameras.t.to(torch.float64), 0.0), dim=-1)
 
-    depth = views.depth(*solution)
-    length = torch.linalg.vector_norm(torch.where(valid[..., None], cameras.t.to(torch.float64), 0.0), dim=-1)
-    distance = torch.where(used.any(1), length.mT, 0.0)[:, None]
-    parallel = torch.isinf(cond) | _one_centre(local, distance, used)
-    behind = (used & ~(depth > NO_DEPTH * distance)).any(0)
-    status = torch.full_like(count, int(Status.OK), dtype=torch.int8)
-    for mask, reason in (
-        (behind, Status.BEHIND), (parallel, Status.PARALLEL), (count < 2, Status.FEW_VIEWS),
-        (spoilt, Status.NONFINITE_INPUT),
-    ):  # fmt: skip
-        status = status.masked_fill(mask, int(reason))
-    ok = status == Status.OK
-    nearest = torch.where(used, depth, torch.inf).amin(0) if len(depth) else torch.zeros_like(cond)
-    points = torch.stack([torch.where(ok, x + o[None], 0.0) for x, o in zip(solution, origin.mT, strict=True)], -1)
-    fields = (
-        status,
-        _ray_angle(local, views, used, count),
-        torch.where(ok | (status == Status.BEHIND), nearest, 0.0),
-        cond,
-    )
-    return (points.transpose(0, 1), *(x.mT for x in fields))
+    def solve(self, weight: Float[Tensor, "V J B"]) -> tuple[Sequence[Tensor], Float[Tensor, "J B"]]:
+        """The solution in the local world and tr(M) tr(M^-1); ``weight`` is 0 where not ``used``."""
+        sums = weighted_sum(self.equations, weight)
+        *solution, cond = solve_symmetric(tuple(sums))
+        # once more from the residuals of the rows: the digits that squaring has cost
+        toward = weighted_sum(_toward(self.a, self.b, solution), weight)
+        step = solve_symmetric((*sums[:6], *toward))[:3]
+        return [x + d for x, d in zip(solution, step, strict=True)], cond
+
+    def square_residuals(
+        self, points: Float[Tensor, "3 *P J B"], square: Float[Tensor, "V J B"], view: int
+    ) -> Float[Tensor, "*P J B"]:
+        """Squared pixel errors of points (local world) in one view over ``square``; inf where that is 0 and behind the
+        camera."""
+        x, y, z = points
+        over, down = (torch.addcmul(r[0][view] * x, r[1][view], y).addcmul_(r[2][view], z) for r in (self.a, self.b))
+        over, down = over.sub_(self.a[3][view]), down.sub_(self.b[3][view])
+        (rx, ry, rz), shift = self.views.axis, self.views.shift[2]
+        depth = torch.addcmul(shift[view], rx[view], x).addcmul_(ry[view], y).addcmul_(rz[view], z).clamp_(min=0)
+        scale = depth.mul_(depth).mul_(square[view])
+        return over.mul_(over).addcmul_(down, down).div_(scale).nan_to_num_(nan=torch.inf, posinf=torch.inf)
+
+    def fields(
+        self, solution: Sequence[Tensor], cond: Tensor, used: Bool[Tensor, "V J B"], spoilt: Bool[Tensor, "J B"]
+    ) -> tuple[Tensor, ...]:
+        """The fields of Triangulation of a solution that is made of the ``used`` views."""
+        count = used.sum(0)
+        depth = self.views.depth(*solution)
+        distance = torch.where(used.any(1), self.length.mT, 0.0)[:, None]
+        parallel = torch.isinf(cond) | _one_centre(self.local, distance, used)
+        behind = (used & ~(depth > NO_DEPTH * distance)).any(0)
+        status = torch.full_like(count, int(Status.OK), dtype=torch.int8)
+        for mask, reason in (
+            (behind, Status.BEHIND), (parallel, Status.PARALLEL), (count < 2, Status.FEW_VIEWS),
+            (spoilt, Status.NONFINITE_INPUT),
+        ):  # fmt: skip
+            status = status.masked_fill(mask, int(reason))
+        ok = status == Status.OK
+        nearest = torch.where(used, depth, torch.inf).amin(0) if len(depth) else torch.zeros_like(cond)
+        nearest = torch.where(ok | (status == Status.BEHIND), nearest, 0.0)
+        world = [torch.where(ok, x + o, 0.0) for x, o in zip(solution, self.origin.mT, strict=True)]
+        angle = _ray_angle(self.local, self.views, used, count)
+        return (torch.stack(world, -1).transpose(0, 1), *(x.mT for x in (status, angle, nearest, cond)))
 
 
 def _toward(a: Sequence[Tensor], b: Sequence[Tensor], solution: Sequence[Tensor]) -> Float[Tensor, "V 3 J B"]:
@@ -165,10 +189,10 @@ def _ray_angle(
 ) -> Float[Tensor, "J B"]:
     """``Triangulation.angle``: the sum of |d_i x d_j|^2 over pairs is the sum of the principal minors of
     the sum of d d^T (Cauchy-Binet)."""
-    (k, s), (l, m) = cameras.K.permute(2, 3, 1, 0)[:2, :2, :, None].contiguous()
-    determinant = k * m - s * l
+    (k, s), (n, m) = cameras.K.permute(2, 3, 1, 0)[:2, :2, :, None].contiguous()
+    determinant = k * m - s * n
     determinant = torch.where(determinant == 0, 1.0, determinant)
-    x, y = (m * views.u - s * views.v) / determinant, (k * views.v - l * views.u) / determinant
+    x, y = (m * views.u - s * views.v) / determinant, (k * views.v - n * views.u) / determinant
     first, second, third = cameras.R.permute(2, 3, 1, 0)[..., None, :].contiguous()
     ray = [torch.addcmul(torch.addcmul(r, q, y), p, x) for p, q, r in zip(first, second, third, strict=True)]
     outer = torch.stack([ray[i] * ray[j] for i in range(3) for j in range(i, 3)], dim=1)

@@ -18,9 +18,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.errors import check
-from ghpt.geometry.cameras import Cameras, project, reprojection_error
+from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import usable_views
-from ghpt.geometry.triangulation import Status, Triangulation, triangulate, triangulate_subsets
+from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
+from ghpt.geometry.triangulation import (
+    Status,
+    System,
+    Triangulation,
+    flat_cameras,
+    in_parts,
+    triangulate,
+    triangulate_subsets,
+)
 from ghpt.randomness import key, uniform
 from ghpt.recording import KeyPointBatch, PoseEstimate
 
@@ -111,19 +120,40 @@ class Ransac(Baseline):
         return self.threshold
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+        rig = flat_cameras(batch.cameras, batch.seen.shape[:1])
+        limit = (self.threshold * person_size(batch.key_points, batch.seen)).clamp(min=1e-12)
         candidates = self._pairs(batch)
-        points, ok = triangulate_subsets(batch.cameras, batch.key_points, batch.seen, candidates)
-        rig = Cameras(*(x[:, None] for x in (batch.cameras.K, batch.cameras.R, batch.cameras.t)))
-        key_points = batch.key_points[:, None].expand(-1, points.shape[1], -1, -1, -1)
-        limit = self.threshold * person_size(batch.key_points, batch.seen)
-        error = reprojection_error(rig, key_points, points) / limit[:, None, :, None].clamp(min=1e-12)
-        inlier = (error <= 1) & batch.seen[:, None] & ok[:, :, None]
-        # the residuals sum up to less than one more inlier
-        rest = torch.where(inlier, error, 0.0).sum(-2) / (inlier.shape[-2] + 1)
-        best = (inlier.sum(-2) - rest).argmax(1)
-        inlier = inlier.gather(1, best[:, None, None].expand(-1, 1, inlier.shape[2], -1))[:, 0]
+
+        def part(rows: slice) -> tuple[Tensor, ...]:
+            own = rig if len(rig.t) == 1 else rig.index(rows)
+            return (self._inliers(own, batch.key_points[rows], batch.seen[rows], limit[rows], candidates[rows]),)
+
+        frames, views, joints = batch.seen.shape
+        (inlier,) = in_parts(part, torch.Size((frames, max(views, candidates.shape[1]), joints)))
         robust = triangulate(batch.cameras, batch.key_points, inlier.to(batch.key_points.dtype))
         return _otherwise(robust, Linear().triangulate(batch))
+
+    def _inliers(
+        self, cameras: Cameras, key_points: Tensor, seen: Bool[Tensor, "B V J"], limit: Tensor, pairs: Tensor
+    ) -> Bool[Tensor, "B V J"]:
+        """The inliers of each joint's best pair."""
+        whole = Cameras(*(x.expand(len(seen), *x.shape[1:]) for x in (cameras.K, cameras.R, cameras.t)))
+        points, ok = triangulate_subsets(whole, key_points, seen, pairs)
+        system = System(cameras, key_points, seen.permute(1, 2, 0))
+        square = torch.where(system.used, limit.double().mT[:, None] ** 2, 0.0)
+        ok, points = ok.permute(1, 2, 0), (points - system.origin[:, None, None]).permute(3, 1, 2, 0).contiguous()
+        count, rest = torch.zeros(ok.shape, dtype=points.dtype, device=ok.device), 0.0
+        for view in range(len(square)):
+            residual = system.square_residuals(points, square, view)
+            inlier = ok & (residual <= 1)
+            count += inlier
+            rest = rest + torch.where(inlier, residual.sqrt(), 0.0)
+        # the residuals sum up to less than one more inlier
+        best = (count - rest / (len(square) + 1)).argmax(0)[None]
+        chosen, right = (x.gather(-3, best.expand(*x.shape[:-3], 1, -1, -1)).squeeze(-3) for x in (points, ok))
+        return torch.stack(
+            [right & (system.square_residuals(chosen, square, view) <= 1) for view in range(len(square))]
+        ).permute(2, 0, 1)
 
     def _pairs(self, batch: KeyPointBatch) -> Bool[Tensor, "B P J V"]:
         """Pairs of seen views: each pair of the rig if they are few, else random ones."""
@@ -159,7 +189,7 @@ class MEstimator(Baseline):
     tolerance: float
 
     def __post_init__(self) -> None:
-        check(self.loss in _WEIGHTS, "loss", f"is {self.loss!r}", f"Choose from {', '.join(_WEIGHTS)}.")
+        check(self.loss in WEIGHTS, "loss", f"is {self.loss!r}", f"Choose from {', '.join(WEIGHTS)}.")
         _check_positive(scale=self.scale, iterations=self.iterations, tolerance=self.tolerance)
 
     @property
@@ -169,28 +199,10 @@ class MEstimator(Baseline):
         return self.scale
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
-        linear = result = Linear().triangulate(batch)
-        scale = (self.scale * person_size(batch.key_points, batch.seen))[..., None].clamp(min=1e-12)
-        step = torch.zeros_like(result.cond)
-        for _ in range(self.iterations):
-            depth = project(batch.cameras.to(torch.float64), result.points)[1]
-            residual = reprojection_error(batch.cameras, batch.key_points, result.points) / scale
-            weights = _WEIGHTS[self.loss](residual) / torch.where(depth > 0, depth, 1.0) ** 2
-            weights = torch.where(batch.seen & (depth > 0), weights, 0.0)
-            moved = triangulate(batch.cameras, batch.key_points, weights)
-            step = (moved.points - result.points).norm(dim=-1)
-            step = torch.where(moved.ok & result.ok, step, torch.inf)
-            result = _otherwise(moved, result)
-        last = torch.where(linear.ok & (step > self.tolerance), int(Status.NOT_CONVERGED), linear.status)
-        return Triangulation(result.points, last.to(torch.int8), result.angle, result.depth_min, result.cond)
-
-
-_WEIGHTS = {
-    "huber": lambda r: 1 / r.clamp(min=1),
-    "cauchy": lambda r: 1 / (1 + r**2),
-    "geman_mcclure": lambda r: 1 / (1 + r**2) ** 2,
-}
-"""Weight of a residual (in scales) in iteratively reweighted least squares: the loss's derivative over it."""
+        scale = (self.scale * person_size(batch.key_points, batch.seen)).clamp(min=1e-12)
+        return triangulate_robustly(
+            batch.cameras, batch.key_points, batch.seen, scale, WEIGHTS[self.loss], self.iterations, self.tolerance
+        )
 
 
 @dataclass(frozen=True)

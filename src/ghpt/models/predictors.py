@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 import torch
@@ -15,8 +15,9 @@ from ghpt.geometry.normal_equations import usable_views
 from ghpt.geometry.triangulation import Status, triangulate
 from ghpt.models.baselines import Baseline, person_size
 from ghpt.models.module import StochasticEstimator
-from ghpt.models.quality import Quality
+from ghpt.models.quality import JointQuality, Quality
 from ghpt.models.selection import softmax_weights
+from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.reconstruction import Reconstruction, State
 from ghpt.recording import KeyPointBatch
 
@@ -44,22 +45,24 @@ class Classical:
 
     A view counts as one of those that made a joint if its residual is within the estimator's ``reach``; where fewer
     than two views are, all that were given to it count, and the error and covariance say so. ``reject``: a joint on
-    which no two views agree so is REJECTED; false: kept with its large error and covariance.
+    which no two views agree so is REJECTED; false: kept with its large error and covariance. ``swaps``: how exchanged
+    sides are looked for and undone; null: they are not.
     """
 
-    def __init__(self, estimator: Baseline, quality: Quality, reject: bool) -> None:
-        self.estimator, self.quality, self.reject = estimator, quality, reject
+    def __init__(self, estimator: Baseline, quality: Quality, swaps: Swaps | None, reject: bool) -> None:
+        self.estimator, self.quality, self.swaps, self.reject = estimator, quality, swaps, reject
 
     def fitted(self, batch: KeyPointBatch) -> Classical:
-        clean, _ = cleaned(batch)
+        clean, _, _ = _prepared(batch, self.swaps)
         result = self.estimator.triangulate(clean)
         placed = result.ok | (result.status == Status.NOT_CONVERGED)
         views, _ = self._views(clean, result.points, placed)
-        return Classical(self.estimator, self.quality.fitted(clean, result.points, views), self.reject)
+        quality = self.quality.fitted(clean, result.points, views)
+        return Classical(self.estimator, quality, self.swaps, self.reject)
 
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> Reconstruction:
-        clean, spoilt = cleaned(batch)
+        clean, spoilt, swapped = _prepared(batch, self.swaps)
         result = self.estimator.triangulate(clean)
         state = _states(result.status, spoilt)
         views, agreed = self._views(clean, result.points, state == State.OBSERVED)
@@ -68,7 +71,7 @@ class Classical:
             views &= (state == State.OBSERVED)[:, None]
         found = self.quality(clean, result.points, views)
         score = torch.zeros(len(batch), dtype=torch.float32)
-        return _reconstruction(batch, result.points, state, views, found.error, found.covariance, score)
+        return _reconstruction(batch, result.points, state, views, found, score, swapped)
 
     def _views(
         self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
@@ -91,20 +94,19 @@ class Learned:
     these views contradict each other. The score is the mean logit under the weights.
     """
 
-    def __init__(self, model: StochasticEstimator, quality: Quality, spread: float) -> None:
+    def __init__(self, model: StochasticEstimator, quality: Quality, swaps: Swaps | None, spread: float) -> None:
         check(spread >= 0, "spread", f"is {spread}", "It must be >= 0.")
-        self.model, self.quality, self.spread = model.eval(), quality, spread
+        self.model, self.quality, self.swaps, self.spread = model.eval(), quality, swaps, spread
 
     def fitted(self, batch: KeyPointBatch) -> Learned:
-        clean, _ = cleaned(batch)
+        clean, _, _ = _prepared(batch, self.swaps)
         linear = triangulate(clean.cameras, clean.key_points, clean.seen.double())
-        return Learned(
-            self.model, self.quality.fitted(clean, linear.points, clean.seen & linear.ok[:, None]), self.spread
-        )
+        quality = self.quality.fitted(clean, linear.points, clean.seen & linear.ok[:, None])
+        return Learned(self.model, quality, self.swaps, self.spread)
 
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> Reconstruction:
-        clean, spoilt = cleaned(batch)
+        clean, spoilt, swapped = _prepared(batch, self.swaps)
         status = triangulate(clean.cameras, clean.key_points, clean.seen.double()).status
         state = _states(status, spoilt)
         pool = self.model.pool(clean, self.model.keys("predict", clean))
@@ -115,9 +117,20 @@ class Learned:
         offset = (pool.hypotheses.points - estimate.points[:, None]).double()
         i, j = torch.triu_indices(3, 3)
         scatter = torch.einsum("bh,bhjk->bjk", weights.double(), offset[..., i] * offset[..., j])
-        covariance = found.covariance + self.spread * scatter
+        found = replace(found, covariance=found.covariance + self.spread * scatter)
         score = (weights * pool.logits).sum(-1)
-        return _reconstruction(batch, estimate.points, state, views, found.error, covariance, score)
+        return _reconstruction(batch, estimate.points, state, views, found, score, swapped)
+
+
+def _prepared(
+    batch: KeyPointBatch, swaps: Swaps | None
+) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"], Bool[Tensor, "B V"]]:
+    """The batch to triangulate, what was taken out of it, and in which views left and right were exchanged."""
+    clean, spoilt = cleaned(batch)
+    if swaps is None:
+        return clean, spoilt, torch.zeros_like(batch.seen[..., 0])
+    clean, swapped = undo_swaps(clean, swaps)
+    return clean, spoilt, swapped
 
 
 def cleaned(batch: KeyPointBatch) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"]]:
@@ -139,12 +152,16 @@ def _states(status: Int8[Tensor, "B J"], spoilt: Bool[Tensor, "B V J"]) -> Int8[
 
 
 def _reconstruction(
-    batch: KeyPointBatch, points: Tensor, state: Tensor, views: Tensor, error: Tensor, covariance: Tensor, score: Tensor
+    batch: KeyPointBatch,
+    points: Float[Tensor, "B J 3"],
+    state: Int8[Tensor, "B J"],
+    views: Bool[Tensor, "B V J"],
+    found: JointQuality,
+    score: Float[Tensor, " B"],
+    swapped: Bool[Tensor, "B V"],
 ) -> Reconstruction:
     placed = state == State.OBSERVED
-    swapped = torch.zeros(views.shape[:2], dtype=torch.bool)
-    fields = (
-        batch.sample, torch.where(placed[..., None], points, 0.0).float(), state, torch.where(placed, error, 0.0).float(),
-        views, torch.where(placed[..., None], covariance, 0.0).float(), score.float(), swapped,
-    )  # fmt: skip
+    points = torch.where(placed[..., None], points, 0.0).float()
+    error, covariance = found.error.float(), found.covariance.float()
+    fields = (batch.sample, points, state, error, views, covariance, score.float(), swapped)
     return Reconstruction(*(x.cpu() for x in fields))
