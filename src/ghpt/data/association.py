@@ -57,6 +57,8 @@ def associate(
     there at once are joined, the longest first: a person who was seen beside another is not that one. The best person
     has the greatest sum, over frames and views, of size times mean confidence, over that of the best in the view.
     """
+    if not len(row):
+        return []
     size, sure = extent(key_points, seen), np.where(seen, confidence, 0).mean(-1)
     quality = size * sure
     best = np.array([quality[view == v].max(initial=0) for v in range(int(view.max(initial=0)) + 1)])

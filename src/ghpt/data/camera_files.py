@@ -8,6 +8,7 @@ COLMAP's models have a unit of their own.
 from __future__ import annotations
 
 import logging
+import re
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,8 +28,8 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import vector_to_matrix
 
 _MM_PER_M, _MM_PER_CM = 1000.0, 10.0
-_LARGEST = 16 << 20
-"""Bytes of a TOML file."""
+_LARGEST, _DEEPEST = 1 << 20, 100
+"""Bytes of a TOML file; parts of a key in it, which cost their square to read."""
 _MOST_CAMERAS = 10_000
 _LARGEST_NUMBER = 1e15
 """No focal length or distance; its square would still be one, though."""
@@ -130,6 +131,8 @@ def _toml(path: Path) -> tuple[str, list[_Entry]]:
         data = handle.read(_LARGEST + 1)
     if len(data) > _LARGEST:
         raise GhptDataError(path, "", f"has more than {_LARGEST >> 20} MiB", "Check that this is the right file.")
+    if any(part.count(b".") > _DEEPEST for part in re.split(rb"[=,\n]", data)):
+        raise GhptDataError(path, "", f"has a key of more than {_DEEPEST} parts", _FORMATS)
     try:
         content = tomllib.loads(data.decode("utf-8-sig"))
     except (ValueError, RecursionError) as error:
@@ -169,6 +172,9 @@ def _opencv(path: Path) -> list[_Entry]:
         if f"K_{name}" not in intrinsic:
             raise GhptDataError(path, f"K_{name}", "is missing", "Calibrate the intrinsics of this camera.")
         lens = intrinsic.get(f"dist_{name}", intrinsic.get(f"D_{name}"))
+        if lens is None and any(key.startswith(("dist_", "D_")) for key in intrinsic):
+            problem = "is missing, and other cameras have it"
+            raise GhptDataError(path, f"dist_{name}", problem, "Write zeros if this lens does not distort.")
         size = [intrinsic.get(f"{side}_{name}") for side in "WH"]
         vector, matrix = extrinsic.get(f"R_{name}"), extrinsic.get(f"Rot_{name}")
         entries.append(_Entry(name, "", intrinsic[f"K_{name}"], [0.0] * 5 if lens is None else lens,

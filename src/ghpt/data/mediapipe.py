@@ -7,6 +7,7 @@ import csv
 import io
 import re
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from ghpt.errors import GhptDataError
 
 COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
 _LARGEST = 2 << 30
+_LONGEST_LINE = 1 << 12
 _MOST_PORTS = 1000
 _WRITE = "It must be an xy_*.csv that caliscope wrote."
 _JOINTS = len(SKELETONS["mediapipe_33"])
@@ -71,6 +73,10 @@ def _table(path: Path) -> Float[np.ndarray, "N 5"]:
     with open_input(path) as raw:
         utf16 = raw.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
         encoding = "utf-16" if utf16 else "utf-8-sig"
+        raw.seek(-min(2, path.stat().st_size), 2)
+        if not raw.read().strip(b"\0").endswith((b"\n", b"\r")):
+            raise GhptDataError(path, "", "ends in the middle of a line: it is truncated", "Copy it again.")
+        raw.seek(0)
         with io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline="") as handle:
             table = _rows(path, handle)
     whole = table[:, :3][np.isfinite(table[:, :3])]
@@ -79,8 +85,15 @@ def _table(path: Path) -> Float[np.ndarray, "N 5"]:
     return table
 
 
+def _lines(handle: io.TextIOBase) -> Iterator[str]:
+    while line := handle.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise ValueError("a line of it does not end")
+        yield line
+
+
 def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
-    line = handle.readline(1 << 16)
+    line = handle.readline(_LONGEST_LINE)
     if ";" in line or "\t" in line:
         mend = "Save it with commas between the columns and points in the numbers (a spreadsheet may have changed it)."
         raise GhptDataError(path, "", "has columns that commas do not part", mend)
@@ -91,7 +104,7 @@ def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
         empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a table without rows
-            table = np.loadtxt(handle, delimiter=",", usecols=columns, converters=empty, ndmin=2)
+            table = np.loadtxt(_lines(handle), delimiter=",", usecols=columns, converters=empty, ndmin=2)
     except (ValueError, StopIteration, csv.Error) as error:
         raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
     return table.reshape(-1, len(COLUMNS))

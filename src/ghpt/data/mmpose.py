@@ -71,7 +71,7 @@ def _joints(file: Path, meta: Any) -> tuple[str, ...] | None:
     names = meta.get("keypoint_id2name") if isinstance(meta, dict) else None
     if names is None:
         return None
-    numbers = [str(index) for index in range(len(names))]
-    if not isinstance(names, dict) or set(names) != set(numbers) or not all(type(n) is str for n in names.values()):
+    numbers = [str(index) for index in range(len(names))] if isinstance(names, dict) else []
+    if not numbers or set(names) != set(numbers) or not all(type(name) is str for name in names.values()):
         raise GhptDataError(file, "meta_info.keypoint_id2name", "does not name the joints from 0 on", _MEND)
     return canonical([names[number] for number in numbers])

@@ -5,6 +5,7 @@ Read without FileStorage: it reads names without quotes as numbers, and aborts t
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from ghpt.data.validate import open_input
 from ghpt.errors import GhptDataError
 
 Node = str | float | list[str] | Float[np.ndarray, "..."]
-_LARGEST = 4 << 20
+_LARGEST, _DEEPEST = 4 << 20, 100
 _MEND = "It must be a yml file that OpenCV or EasyMocap wrote."
 
 
@@ -26,10 +27,16 @@ def read_yml(path: Path) -> dict[str, Node | None]:
         data = handle.read(_LARGEST + 1)
     if len(data) > _LARGEST:
         raise GhptDataError(path, "", f"has more than {_LARGEST >> 20} MiB", _MEND)
+    if not data.endswith((b"\n", b"\r")):
+        raise GhptDataError(path, "", "ends in the middle of a line: it is truncated", "Copy it again.")
+    characters = np.frombuffer(data, np.uint8)
+    deeper, higher = (np.isin(characters, list(signs)).astype(np.int32) for signs in (b"[{", b"]}"))
+    if np.cumsum(deeper - higher).max(initial=0) > _DEEPEST:
+        raise GhptDataError(path, "", f"has more than {_DEEPEST} lists in lists", _MEND)
     # %YAML:1.0 is no directive of YAML's
-    body = b"\n".join(line for line in data.splitlines() if not line.startswith(b"%"))
+    body = b"\n".join(line for line in data.removeprefix(codecs.BOM_UTF8).splitlines() if not line.startswith(b"%"))
     try:
-        content = yaml.load(body.decode("utf-8-sig"), Loader=yaml.BaseLoader)  # builds texts, lists and dicts alone
+        content = yaml.load(body.decode(), Loader=yaml.BaseLoader)  # builds texts, lists and dicts alone
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise GhptDataError(path, "", f"is not valid yml ({' '.join(str(error).split())})", _MEND) from error
     if not isinstance(content, dict):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zipfile
 import zlib
 from pathlib import Path
@@ -10,10 +11,11 @@ import numpy as np
 
 from ghpt.data.people import KeyPoints, joints_for
 from ghpt.data.skeletons import recognise
-from ghpt.data.validate import npy_header, read_npz
+from ghpt.data.validate import npy_header, open_input, read_npz
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
 
+_MOST_MEMBERS = 1000
 _LONGEST_NAMES = 1 << 20
 """Bytes of a list of texts."""
 
@@ -21,13 +23,15 @@ _LONGEST_NAMES = 1 << 20
 def write_key_points(path: str | Path, points: KeyPoints) -> None:
     """Write the npz file that ``read_key_points`` reads."""
     arrays = {
-        "views": np.array(points.views, dtype=np.str_), "joints": np.array(points.joints, dtype=np.str_),
-        "frame": points.frame, "key_points": points.key_points, "confidence": points.confidence, "seen": points.seen,
+        "key_points": points.key_points, "views": np.array(points.views, dtype=np.str_),
+        "joints": np.array(points.joints, dtype=np.str_), "frame": points.frame, "confidence": points.confidence,
+        "seen": points.seen,
     }  # fmt: skip
     if points.rate_hz is not None:
         arrays["rate_hz"] = np.array(points.rate_hz)
     with atomic_write(path) as handle:
-        np.savez_compressed(handle, **arrays)
+        # zip's check sums guard the values but not the list of names, where damage may hide what comes after it
+        np.savez_compressed(handle, members=np.array(sorted(arrays)), **arrays)
 
 
 def read_own(path: Path, skeleton: str | None) -> KeyPoints:
@@ -36,6 +40,8 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
     for field in ("key_points", "views"):
         if field not in there:
             raise GhptDataError(path, field, "is missing", "See docs/calibration.md for what the file holds.")
+    if "members" in there and there - {"members"} != {*_texts(path, "members")}:
+        raise GhptDataError(path, "members", "are others than when it was written", "Write it again.")
     values = read_npz(path, {"key_points": ((None, None, None, 2), "f")})["key_points"].astype(np.float64)
     frames, count_views, count, _ = values.shape
     shape = (frames, count_views, count)
@@ -72,6 +78,12 @@ _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedErr
 
 def _members(path: Path) -> set[str]:
     try:
+        with open_input(path) as handle:
+            handle.seek(-min(path.stat().st_size, 1 << 16), io.SEEK_END)
+            ending = handle.read().rpartition(b"PK\x05\x06")[2]
+        # before zipfile makes an object of each
+        if (count := int.from_bytes(ending[6:8], "little")) > _MOST_MEMBERS:
+            raise GhptDataError(path, "", f"holds {count} arrays or more", "Write it again.")
         with zipfile.ZipFile(path) as archive:
             return {name.removesuffix(".npy") for name in archive.namelist()}
     except _DAMAGED as error:

@@ -1,0 +1,175 @@
+"""Several people in the views of calibrated cameras: the right one is followed, whoever the lists put first."""
+
+import json
+import logging
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import yaml
+
+from ghpt.data.association import associate
+from ghpt.data.camera_files import CameraFile
+from ghpt.data.detector import Detector
+from ghpt.data.embedded import motion
+from ghpt.data.key_points import read_people
+from ghpt.data.people import KeyPoints, People, everyone
+from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.data.skeletons import SKELETONS
+from ghpt.data.tracks import tracks
+from ghpt.data.views import look_through, who
+from ghpt.errors import GhptDataError
+
+FRAMES = 240
+
+
+@pytest.fixture(scope="module")
+def detector(pytestconfig) -> Detector:
+    return Detector(**yaml.safe_load((pytestconfig.rootpath / "conf" / "detector" / "human36m.yaml").read_text()))
+
+
+def rig_of(views: int) -> Rig:
+    rig = human36m_rig("S9")
+    at = list(range(views))
+    return Rig(tuple(rig.names[i] for i in at), rig.cameras.index(at), rig.distortion[at], rig.size[at])
+
+
+def camera_file(rig: Rig, calibrated: bool = True) -> CameraFile:
+    pose = (rig.cameras.R, rig.cameras.t) if calibrated else (None, None)
+    lens = rig.distortion * 0  # the detector's key points are out of the lens
+    return CameraFile("Calib.toml", "Pose2Sim", rig.names, ("",) * len(rig), rig.cameras.K, lens, None, *pose)
+
+
+def scene(detector: Detector, rig: Rig, seed: int = 1) -> tuple[People, np.ndarray]:
+    """One who walks and one who greets, each out of each view for a while, listed in any order; whose each is."""
+    rng = np.random.default_rng(seed)
+    parts, owner = [], []
+    for person, action in enumerate(("Walking", "Greeting")):
+        name = f"{person}-{seed}"
+        points = motion(seed, name, name, action, FRAMES, 50.0)
+        found = detector(points, rig, 50.0, seed, name, name)
+        there = found.seen.any(-1)
+        for view in range(len(rig)):
+            start = rng.integers(0, FRAMES)
+            there[start : start + 40, view] = False
+        row, view = np.nonzero(there)
+        parts.append((row, view, *(x[row, view] for x in (found.key_points, found.confidence, found.seen))))
+        owner.append(np.full(len(row), person))
+    row, view, points, sure, seen = (np.concatenate(part) for part in zip(*parts, strict=True))
+    order = np.lexsort((rng.random(len(row)), row, view))
+    arrays = (x[order] for x in (row, view, np.full(len(row), -1), points.astype(float), sure.astype(float), seen))
+    return People("pose", rig.names, SKELETONS["human36m"], np.arange(FRAMES), *arrays, 50.0), np.concatenate(owner)[
+        order
+    ]
+
+
+@pytest.mark.parametrize(("views", "seed"), [(4, 1), (4, 2), (3, 1)])
+def test_each_of_two_people_is_followed_in_all_views(views, seed, detector):
+    """In more than 99 % of the frames in which two views see them, and never mixed with the other."""
+    rig = rig_of(views)
+    people, owner = scene(detector, rig, seed)
+    assert ((people.counts() > 1).sum(1) >= 2).mean() > 0.5
+    followed = [who(people, camera_file(rig), range(views), person) for person in (0, 1)]
+    labels = [np.where(chosen >= 0, owner[chosen], -1) for chosen in followed]
+    assert {np.bincount(label[label >= 0]).argmax() for label in labels} == {0, 1}
+    for label in labels:
+        person = np.bincount(label[label >= 0]).argmax()
+        table = np.zeros((FRAMES, views), bool)
+        table[people.row[owner == person], people.view[owner == person]] = True
+        possible = table.sum(1) >= 2
+        right = ((label == person).sum(1) >= 2) & (label != 1 - person).all(1)
+        assert right[possible].mean() > 0.99
+        assert (label == person).sum() > 0.95 * table[possible].sum()
+
+
+def test_the_order_of_the_detections_does_not_matter(detector):
+    rig = rig_of(4)
+    people, _ = scene(detector, rig)
+    order = np.random.default_rng(5).permutation(len(people.row))
+    order = order[np.argsort(people.view[order] * FRAMES + people.row[order], kind="stable")]
+    fields = ("row", "view", "identity", "key_points", "confidence", "seen")
+    other = replace(people, **{name: getattr(people, name)[order] for name in fields})
+    one, again = (look_through(p, camera_file(rig)) for p in (people, other))
+    np.testing.assert_array_equal(one.key_points, again.key_points)
+    np.testing.assert_array_equal(one.seen, again.seen)
+
+
+def test_millimetres_or_metres_do_not_matter(detector):
+    rig = rig_of(3)
+    people, _ = scene(detector, rig)
+    cameras = replace(rig.cameras, t=rig.cameras.t / 1000)
+    small = who(people, camera_file(Rig(rig.names, cameras, rig.distortion, rig.size)), range(3))
+    np.testing.assert_array_equal(small, who(people, camera_file(rig), range(3)))
+
+
+def test_without_extrinsics_each_view_follows_its_own(detector, caplog):
+    """As it does, with a warning, where the extrinsics are another rig's."""
+    rig = rig_of(4)
+    people, _ = scene(detector, rig)
+    alone = who(people, camera_file(rig, calibrated=False), range(4))
+    turned = replace(rig.cameras, R=rig.cameras.R.mT.contiguous())
+    with caplog.at_level(logging.WARNING):
+        wrong = who(people, camera_file(Rig(rig.names, turned, rig.distortion, rig.size)), range(4))
+    assert "the views agree on nobody: check the extrinsics" in caplog.text
+    np.testing.assert_array_equal(alone, wrong)
+    with pytest.raises(GhptDataError, match="there is no person 1: 1 can be told apart"):
+        who(people, camera_file(rig, calibrated=False), range(4), 1)
+
+
+def test_whoever_is_alone_is_taken_as_they_are(detector):
+    rig = rig_of(4)
+    people, owner = scene(detector, rig)
+    points = people.pick(people.of(np.flatnonzero(owner == 0)))
+    assert isinstance(points, KeyPoints)
+    alone = everyone(points)
+    one, other = look_through(alone, camera_file(rig)), look_through(points, camera_file(rig))
+    np.testing.assert_array_equal(one.key_points, other.key_points)
+
+
+def test_identities_in_the_files_are_taken_as_they_are(tmp_path):
+    rng = np.random.default_rng(0)
+    bodies = {number: np.column_stack([rng.uniform(0, 400, (25, 2)), np.full(25, 0.5)]) for number in (3, 7)}
+    for view in ("a", "b"):
+        (tmp_path / view).mkdir()
+        for frame in range(4):
+            there = [number for number in rng.permutation([3, 7]).tolist() if number == 7 or frame != 2]
+            listed = [{"person_id": [n], "pose_keypoints_2d": (bodies[n] + frame).ravel().tolist()} for n in there]
+            (tmp_path / view / f"{frame}.json").write_text(json.dumps({"people": listed}))
+    people = read_people(tmp_path, "body_25b")
+    cameras = camera_file(Rig(("a", "b"), rig_of(2).cameras, rig_of(2).distortion, rig_of(2).size))
+    for person, number in enumerate((7, 3)):
+        points = people.pick(who(people, cameras, (0, 1), person))
+        there = np.array([number == 7 or frame != 2 for frame in range(4)])
+        assert (points.seen.any(-1) == there[:, None]).all()
+        expected = np.broadcast_to((bodies[number][:, 0] + np.arange(4)[:, None])[:, None], (4, 2, 25))
+        np.testing.assert_allclose(points.key_points[..., 0][there], expected[there])
+    with pytest.raises(GhptDataError, match="there is no person 2: 2 can be told apart"):
+        who(people, cameras, (0, 1), 2)
+
+
+def test_nobody_is_no_error():
+    rig = rig_of(3)
+    none = np.zeros((0, 17, 2), np.float32)
+    empty = np.zeros(0, np.int64)
+    assert associate(rig.cameras, 5, empty, empty, none, np.zeros((0, 17), bool), np.zeros((0, 17), np.float32)) == []
+
+
+def test_who_was_seen_beside_another_is_not_that_one():
+    """Two stand apart; one leaves and another comes far away: a third track, not the second's."""
+    body = np.random.default_rng(0).uniform(-1, 1, (17, 3)) * [300, 300, 900]
+    frame, place = np.array([0, 0, 1, 1, 2, 2, 3]), np.array([0, 4000, 30, 4020, 60, 9000, 9020])
+    bodies = body + place[:, None, None] * np.array([1.0, 0, 0])
+    assert tracks(frame, bodies, np.ones((7, 17), bool)).tolist() == [0, 1, 0, 1, 0, 2, 2]
+
+
+def test_the_real_recording_keeps_its_person(shared_data):
+    """Two or three people in two views, of whom one is in all: every frame of every view is that one's."""
+    from ghpt.data.camera_files import read_cameras
+
+    folder = shared_data / "pose2sim_single"
+    people = read_people(folder / "pose")
+    cameras = read_cameras(folder / "Calib_qualisys.toml")
+    chosen = who(people, cameras, range(4))
+    assert (chosen >= 0).all()
+    other = who(people, cameras, range(4), 1)
+    assert (other[:, 2:] < 0).all()
