@@ -21,7 +21,7 @@ from ghpt.export import WRITERS, Scene
 from ghpt.files import atomic_write, sweep_temporaries
 from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
-from ghpt.models.predictors import Classical, Learned, Predictor
+from ghpt.models.predictors import Predictor
 from ghpt.models.swaps import Swaps
 from ghpt.prediction.frames import Frames, calibrated, evidence, frames_of_views
 from ghpt.prediction.gaps import Gaps, after, gap_frames
@@ -57,7 +57,7 @@ class Settings(TypedDict):
     recording: str | None
     ckpt: str | None
     hypotheses: int | None
-    estimator: str
+    triangulation: str | None
     fill: int | str | None
     interpolation: str
     smooth: float | None
@@ -71,11 +71,8 @@ class Settings(TypedDict):
     data: dict[str, Any]
     baselines: dict[str, Any]
     trainer: dict[str, Any]
-    reject: bool
     swaps: bool
-    swap_search: dict[str, Any]
-    quality: dict[str, Any]
-    spread: float
+    estimator: dict[str, Any]
     fitted_frames: int
     seed: int
 
@@ -158,15 +155,15 @@ def summary(numbers: dict[str, Any]) -> str:
 def choose(config: dict[str, Any]) -> Chosen:
     """The checkpoint's model, or without one the classical estimator. Raises GhptCheckpointError for a model that does
     not predict poses."""
-    settings = {name: config[name] for name in ("quality", "swaps", "swap_search", "fitted_frames")}
-    quality = build(config["quality"], "quality")
-    swaps = build(config["swap_search"], "swap_search") if config["swaps"] else None
+    kind = "learned" if config["ckpt"] else "classical"
+    settings = config["estimator"][kind] | ({} if config["swaps"] else {"swaps": None})
     if not config["ckpt"]:
-        name = config["estimator"]
-        settings |= {"estimator": config["baselines"][name], "reject": config["reject"]}
+        name = config["triangulation"] or _name(config)
+        if config["triangulation"]:
+            settings |= {"estimator": config["baselines"][name]}
         text = f"{NAMES.get(name, name.replace('_', ' '))}, a classical estimator (no ckpt was given)"
-        predictor = Classical(build(settings["estimator"], f"baselines.{name}"), quality, swaps, config["reject"])
-        return Chosen(name, text, predictor, swaps, None, settings)
+        predictor = build(settings, "estimator.classical")
+        return Chosen(name, text, predictor, predictor.swaps, None, settings)
     model, trained = load_model(config["ckpt"], hypotheses=config["hypotheses"], seed=config["seed"])
     if not isinstance(model.problem, PoseTriangulation):
         problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
@@ -175,9 +172,16 @@ def choose(config: dict[str, Any]) -> Chosen:
     text = (
         f"the learned model of {Path(config['ckpt']).name}, trained on {trained['provenance'].get('data', 'unknown')}"
     )
-    settings |= {"ckpt_sha256": digest, "hypotheses": model.hypotheses, "seed": config["seed"],
-                 "spread": config["spread"]}  # fmt: skip
-    return Chosen("weight", text, Learned(model, quality, swaps, float(config["spread"])), swaps, model, settings)
+    predictor = build(settings, "estimator.learned")(model=model)
+    identity = settings | {"ckpt_sha256": digest, "hypotheses": model.hypotheses, "seed": config["seed"]}
+    return Chosen("weight", text, predictor, predictor.swaps, model, identity)
+
+
+def _name(config: dict[str, Any]) -> str:
+    """What the classical estimator is called among the baselines, or its class."""
+    target = config["estimator"]["classical"]["estimator"]["_target_"]
+    same = [name for name, settings in config["baselines"].items() if settings["_target_"] == target]
+    return same[0] if same else target.split(".")[-1]
 
 
 def from_files(config: dict[str, Any]) -> Frames:
@@ -227,7 +231,8 @@ def _check(config: dict[str, Any]) -> None:
     for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
         check(config[name] >= 1, name, f"is {config[name]}", "Give 1 or more.")
     for key, names, existing in (
-        ("estimator", [config["estimator"]], config["baselines"]), ("compare", config["compare"], config["baselines"]),
+        ("triangulation", [config["triangulation"] or "linear"], config["baselines"]),
+        ("compare", config["compare"], config["baselines"]),
         ("formats", config["formats"] or [], WRITERS),
     ):  # fmt: skip
         for name in names:

@@ -58,7 +58,7 @@ def test_b3_killed_predictions_end_in_the_same_bytes(tmp_path, nightly, record_r
     frames, shard, kills = (100_000, 1000, 200) if nightly else (5_000, 100, 20)
     monkeypatch.setattr(sys, "argv", ["predict.py"])  # it is in the files
     monkeypatch.setattr(command, "provenance", lambda seed: {"ghpt": "0", "commit": "", "seed": seed, "command": ""})
-    settings = config("estimator=linear", f"shard_frames={shard}", "batch=100", "formats=[npz,csv,trc]")
+    settings = config("triangulation=linear", f"shard_frames={shard}", "batch=100", "formats=[npz,csv,trc]")
     started = time.perf_counter()
     assert forked(tmp_path / "whole", frames, settings)
     took = time.perf_counter() - started

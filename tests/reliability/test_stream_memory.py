@@ -25,7 +25,7 @@ def measured(self, shard, part):
     seen.append(anonymous()["RssAnon"])
 run.Shards.write = measured
 command._from_data = lambda _: frames_of({frames})
-words = ("estimator=linear", "shard_frames=10000", "batch=1000", "formats=[npz,csv]", "trainer.accelerator=cpu")
+words = ("triangulation=linear", "shard_frames=10000", "batch=1000", "formats=[npz,csv]", "trainer.accelerator=cpu")
 command.predict(config(*words), Path({output!r}))
 half = seen[len(seen) // 3 :]
 print("figures", max(half[len(half) // 2 :]) - max(half[: len(half) // 2]), anonymous()["VmHWM"])
