@@ -16,7 +16,7 @@ from ghpt.geometry.triangulation import Status, triangulate
 from ghpt.models.baselines import Baseline, person_size
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.quality import JointQuality, Quality
-from ghpt.models.selection import softmax_weights
+from ghpt.models.selection import limit_spread, softmax_weights
 from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.reconstruction import Reconstruction, State
 from ghpt.recording import KeyPointBatch
@@ -91,7 +91,8 @@ class Learned:
 
     All seen views made each joint. The covariance is that of ``quality`` with all seen views, and of the hypotheses
     under their weights ``spread`` times: the first is what noise of this size does to any estimate, the second how far
-    these views contradict each other. The score is the mean logit under the weights.
+    these views contradict each other. The score is the mean logit under the weights, before
+    ``limit_spread``, which centres each frame's.
     """
 
     def __init__(self, model: StochasticEstimator, quality: Quality, swaps: Swaps | None, spread: float) -> None:
@@ -109,16 +110,18 @@ class Learned:
         clean, spoilt, swapped = _prepared(batch, self.swaps)
         status = triangulate(clean.cameras, clean.key_points, clean.seen.double()).status
         state = _states(status, spoilt)
-        pool = self.model.pool(clean, self.model.keys("predict", clean))
-        weights = softmax_weights(pool.logits, self.model.temperature)
-        estimate = self.model.problem.combine(pool.hypotheses, weights)
+        problem = self.model.problem
+        hypotheses = problem.generate(clean, self.model.hypotheses, self.model.keys("predict", clean))
+        logits = self.model.scorer(problem.describe(hypotheses))
+        weights = softmax_weights(limit_spread(logits, self.model.spread), self.model.temperature)
+        estimate = problem.combine(hypotheses, weights)
         views = clean.seen & (state == State.OBSERVED)[:, None]
         found = self.quality(clean, estimate.points, views)
-        offset = (pool.hypotheses.points - estimate.points[:, None]).double()
+        offset = (hypotheses.points - estimate.points[:, None]).double()
         i, j = torch.triu_indices(3, 3)
         scatter = torch.einsum("bh,bhjk->bjk", weights.double(), offset[..., i] * offset[..., j])
         found = replace(found, covariance=found.covariance + self.spread * scatter)
-        score = (weights * pool.logits).sum(-1)
+        score = (weights * logits).sum(-1)
         return _reconstruction(batch, estimate.points, state, views, found, score, swapped)
 
 

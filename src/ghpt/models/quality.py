@@ -14,10 +14,6 @@ from ghpt.geometry.triangulation import flat_cameras
 from ghpt.models.baselines import person_size
 from ghpt.recording import KeyPointBatch
 
-_EXPECTED = 2.0 ** -(2.0 / 3.0)
-"""Median of a squared residual over its mean where it is a sum of two squares: ln 2, near enough to this for one to
-three degrees of freedom."""
-
 
 @dataclass(frozen=True)
 class JointQuality:
@@ -94,10 +90,11 @@ class Quality:
 def pooled_noise(relative: Float[Tensor, "B V J"], views: Bool[Tensor, "B V J"]) -> Float[Tensor, ""]:
     """Deviation of a coordinate from squared residuals over squared sizes: robust, since the median joint's."""
     count = views.sum(1)
-    freedom = (2 * count - 3).clamp(min=1)
-    each = relative.sum(1) / freedom
+    freedom = (2 * count - 3).clamp(min=1).double()
+    middle = freedom * (1 - 2 / (9 * freedom)) ** 3  # median of chi-square (Wilson and Hilferty)
+    each = relative.sum(1) / middle
     each = each[count >= 3] if bool((count >= 3).any()) else each[count >= 2]
-    return (each.median() / _EXPECTED).sqrt() if each.numel() else relative.new_zeros(())
+    return each.median().sqrt() if each.numel() else relative.new_zeros(())
 
 
 def _inverse(normal: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 6"]:

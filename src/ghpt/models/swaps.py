@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.errors import check
-from ghpt.geometry.cameras import reprojection_error
+from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.models.baselines import Baseline, person_size
 from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import JOINTS, MIRROR
@@ -21,22 +21,28 @@ LIMBS = tuple(
 """What detectors exchange together: the legs, the arms."""
 
 
+_HYPOTHESES = ((True, True), (True, False), (False, True))
+"""What may be exchanged in a view."""
+
+
 @dataclass(frozen=True)
 class Swaps:
     """How swaps are looked for.
 
-    A view's cost is the sum over joints of ``log(1 + r^2)``, r the reprojection error of the estimate from all views
-    in ``scale`` (a fraction of the person's size): the Cauchy loss of the pose. Legs, arms or both are exchanged where
-    that lowers the cost by more than ``gain``; ``rounds``: how often, since each swap undone betters the estimate.
+    A pose's cost is the sum over views and limb joints of ``log(1 + r^2)``, r the reprojection error in ``scale`` (a
+    fraction of the person's size) of the pose that ``estimator`` gives: its Cauchy loss. Legs, arms or both are
+    exchanged in a view where estimating the pose anew lowers its cost by more than ``gain``. In each of ``rounds`` one
+    view of a frame, out of the ``views`` that fit worst.
     """
 
     estimator: Baseline
     scale: float
     gain: float
     rounds: int
+    views: int
 
     def __post_init__(self) -> None:
-        for name in ("scale", "gain", "rounds"):
+        for name in ("scale", "gain", "rounds", "views"):
             check(getattr(self, name) > 0, name, f"is {getattr(self, name)}", "It must be > 0.")
 
 
@@ -44,24 +50,46 @@ class Swaps:
 def undo_swaps(batch: KeyPointBatch, swaps: Swaps) -> tuple[KeyPointBatch, Bool[Tensor, "B V"]]:
     """The batch with left and right put right, and in which views of which frames they were not.
 
-    Only in frames with three views or more: of two that disagree neither is the swapped one. In each round the views
-    of a frame whose exchange gains most, fewer than half of them, are exchanged.
+    Only in frames with three views or more, and in fewer than half of these: of views that stand two against two
+    neither side is the swapped one. Frames in which no view fits badly cost one estimate.
     """
     exchanged = torch.zeros(*batch.seen.shape[:2], len(LIMBS), dtype=torch.bool, device=batch.seen.device)
-    current = batch
+    most = (batch.seen.any(-1).sum(-1) - 1) // 2
+    if not len(batch) or int(most.max()) < 1:
+        return batch, exchanged.any(-1)
+    before = _costs(batch, swaps)
+    doubtful = torch.nonzero((before.amax(-1) > swaps.gain / 2) & (most > 0))[:, 0]
     for _ in range(swaps.rounds):
-        gain = _gains(current, swaps)
-        both = gain.sum(-1, keepdim=True) > swaps.gain
-        wanted = (gain > swaps.gain) | (both & (gain > 0))
-        views = batch.seen.any(-1).sum(-1)
-        total = torch.where(wanted, gain, 0.0).sum(-1)
-        order = total.argsort(dim=-1, descending=True).argsort(dim=-1)
-        wanted &= (order < ((views - 1) // 2)[:, None])[..., None]
-        if not wanted.any():
+        if not len(doubtful):
             break
-        exchanged ^= wanted
-        current = _exchange(batch, exchanged)
-    return current, exchanged.any(-1)
+        own = exchanged[doubtful]
+        candidates = _candidates(own, before[doubtful], min(swaps.views, batch.seen.shape[1]))
+        count = candidates.shape[1]
+        hypotheses = _exchange(_frames(batch, doubtful.repeat_interleave(count)), candidates.flatten(0, 1))
+        costs = _costs(hypotheses, swaps).unflatten(0, (-1, count))
+        allowed = candidates.any(-1).sum(-1) <= most[doubtful, None]
+        best = torch.where(allowed, costs.sum(-1), torch.inf).argmin(-1)
+        row = torch.arange(len(best), device=best.device)
+        better = allowed[row, best] & (before[doubtful].sum(-1) - costs[row, best].sum(-1) > swaps.gain)
+        changed = doubtful[better]
+        exchanged[changed] = candidates[row, best][better]
+        before[changed] = costs[row, best][better]
+        doubtful = changed
+    return _exchange(batch, exchanged), exchanged.any(-1)
+
+
+def _candidates(exchanged: Bool[Tensor, "S V G"], costs: Float[Tensor, "S V"], views: int) -> Bool[Tensor, "S H V G"]:
+    """What is exchanged if one more of the worst views is."""
+    worst = costs.topk(views, dim=-1).indices
+    kinds = torch.tensor(_HYPOTHESES, device=costs.device)
+    one = torch.nn.functional.one_hot(worst, costs.shape[1]).bool()[:, :, None, :, None] & kinds[:, None]
+    return exchanged[:, None] ^ one.flatten(1, 2)
+
+
+def _frames(batch: KeyPointBatch, rows: Int[Tensor, " S"]) -> KeyPointBatch:
+    return KeyPointBatch(
+        **{name: x.index(rows) if isinstance(x, Cameras) else x[rows] for name, x in vars(batch).items()}
+    )
 
 
 def _exchange(batch: KeyPointBatch, which: Bool[Tensor, "B V G"]) -> KeyPointBatch:
@@ -77,19 +105,13 @@ def _exchange(batch: KeyPointBatch, which: Bool[Tensor, "B V G"]) -> KeyPointBat
     )
 
 
-def _gains(batch: KeyPointBatch, swaps: Swaps) -> Float[Tensor, "B V G"]:
-    """By how much exchanging each group of limbs lowers each view's cost; 0 where it cannot be told."""
-    result = swaps.estimator.triangulate(batch)
-    placed = swaps.estimator(batch).estimated
+def _costs(batch: KeyPointBatch, swaps: Swaps) -> Float[Tensor, "B V"]:
+    """Each view's share of its frame's cost: of the joints that it sees and the frame places, with their mirrors."""
+    estimate = swaps.estimator(batch)
     scale = (swaps.scale * person_size(batch.key_points, batch.seen).double()).clamp(min=1e-12)[..., None]
-    every = torch.ones(*batch.seen.shape[:2], len(LIMBS), dtype=torch.bool, device=batch.seen.device)
-    mirrored = _exchange(batch, every)
+    error = reprojection_error(batch.cameras, batch.key_points, estimate.points) / scale
     mirror = list(MIRROR)
-    known = placed & placed[:, mirror]
-    costs = []
-    for one in (batch, mirrored):
-        error = reprojection_error(one.cameras, one.key_points, result.points) / scale
-        counted = one.seen & one.seen[:, :, mirror] & known[:, None]
-        costs.append(torch.where(counted, torch.log1p(error.clamp(max=1e6) ** 2), 0.0))
-    difference = costs[0] - costs[1]
-    return torch.stack([difference[..., list(limbs)].sum(-1) for limbs in LIMBS], dim=-1)
+    known = estimate.estimated & estimate.estimated[:, mirror]
+    counted = batch.seen & batch.seen[:, :, mirror] & known[:, None]
+    limbs = [joint for group in LIMBS for joint in group]
+    return torch.where(counted, torch.log1p(error.clamp(max=1e6) ** 2), 0.0)[..., limbs].sum(-1)

@@ -1,0 +1,187 @@
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from ghpt.config import build
+from ghpt.errors import GhptConfigError
+from ghpt.geometry.cameras import Cameras
+from ghpt.models.baselines import Linear, LoRansac, MEstimator, Ransac, WeightedLinear
+from ghpt.models.loss import StochasticLoss
+from ghpt.models.module import StochasticEstimator
+from ghpt.models.pose import PoseTriangulation
+from ghpt.models.predictors import Classical, Learned
+from ghpt.models.quality import Quality
+from ghpt.models.scorer import Scorer
+from ghpt.reconstruction import Reconstruction, State
+from scenes import random_scene
+
+QUALITY = Quality(noise=0.003, prior=4.0, shared=0.0)
+ESTIMATORS = {
+    "linear": Linear(),
+    "weighted_linear": WeightedLinear(power=0.5),
+    "ransac": Ransac(threshold=0.02, pairs=64, seed=0),
+    "m_estimator": MEstimator(loss="geman_mcclure", scale=0.02, iterations=10, tolerance=1.0),
+    "lo_ransac": LoRansac(threshold=0.02, seed=0),
+}
+M = ESTIMATORS["m_estimator"]
+
+
+def classical(estimator=M, reject=False):
+    return Classical(estimator, QUALITY, None, reject)
+
+
+def learned(spread=0.3):
+    config = yaml.safe_load((Path(__file__).parents[1] / "conf/model/pose.yaml").read_text())
+    scorer = partial(Scorer, **{k: v for k, v in config["scorer"].items() if not k.startswith("_")})
+    loss = StochasticLoss(alpha=1.0, beta=0.0, gamma=0.0, relative_errors=True)
+    model = StochasticEstimator(
+        PoseTriangulation(True, True), scorer, loss, torch.optim.Adam, 50, 1.5, False, 1.5, "weight", 0
+    )
+    model.fit_statistics(iter([random_scene(0, frames=20).batch()]))
+    return Learned(model, QUALITY, None, spread)
+
+
+def single(batch):
+    return replace(batch, key_points=batch.key_points.float(), confidence=batch.confidence.float())
+
+
+def sound(result, batch):
+    """What any reconstruction keeps to."""
+    frames, _, joints = batch.seen.shape
+    assert result.points.shape == (frames, joints, 3)
+    for field in ("points", "error", "covariance", "score"):
+        assert torch.isfinite(getattr(result, field)).all(), field
+        assert getattr(result, field).dtype == torch.float32
+    assert torch.equal(result.frame, batch.sample)
+    missing = ~result.placed
+    for field in ("points", "error", "covariance"):
+        assert (getattr(result, field)[missing] == 0).all()
+    assert not result.views.mT[missing].any()
+    assert (result.views.sum(1)[result.placed] >= 2).all()
+    assert not (result.views & ~batch.seen).any()
+    return result
+
+
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_exact_key_points_give_the_truth_and_all_views(name):
+    scene = random_scene(0, frames=3, views=5)
+    result = sound(classical(ESTIMATORS[name])(scene.batch()), scene.batch())
+    assert (result.state == State.OBSERVED).all()
+    assert result.views.all()
+    assert result.error.max() < 1e-3
+    torch.testing.assert_close(result.points.double(), scene.points, rtol=0, atol=1e-2)
+
+
+def test_the_learned_model_gives_the_truth_of_exact_key_points_and_its_score():
+    scene = random_scene(1, frames=3, views=5)
+    result = sound(learned()(scene.batch()), scene.batch())
+    torch.testing.assert_close(result.points.double(), scene.points, rtol=0, atol=1e-1)
+    assert result.views.all()
+    assert (result.score != 0).all()
+
+
+def test_hypotheses_that_disagree_widen_the_learned_covariance():
+    batch = random_scene(2, frames=3, views=5).noisy(8, 0).batch()
+    narrow, wide = (learned(spread)(batch).covariance for spread in (0.0, 1.0))
+    assert (wide[..., [0, 3, 5]] > narrow[..., [0, 3, 5]]).all()
+
+
+@pytest.mark.parametrize("make", [classical, learned])
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, 1e6, -1e6, 1e30])
+def test_a_value_that_no_detector_means_costs_its_own_view_alone(make, value):
+    scene = random_scene(3, frames=2, views=4).noisy(1, 0)
+    batch = scene.batch()
+    key_points = batch.key_points.clone()
+    key_points[0, 1, 4] = value  # one of four views
+    key_points[1, :3, 7] = value  # three of four
+    broken = replace(batch, key_points=key_points)
+    result, good = (sound(make()(b), b) for b in (broken, batch))
+    assert result.state[0, 4] == State.OBSERVED
+    assert result.views[0, :, 4].tolist() == [True, False, True, True]
+    assert (result.points[0, 4].double() - scene.points[0, 4]).norm() < 30
+    assert result.state[1, 7] == State.BAD_INPUT
+    others = torch.ones_like(result.state, dtype=torch.bool)
+    others[0, 4] = others[1, 7] = False
+    assert torch.equal(result.state[others], good.state[others])
+    torch.testing.assert_close(result.points[others], good.points[others], rtol=0, atol=20)
+
+
+@pytest.mark.parametrize("make", [classical, learned])
+def test_each_reason_for_a_missing_joint_is_said(make):
+    scene = random_scene(4, frames=3, views=3).noisy(1, 0)
+    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    seen[0, 1:, 2] = False
+    cameras = scene.cameras
+    K, R, t = (x.clone() for x in (cameras.K, cameras.R, cameras.t))
+    for x in (K, R, t):
+        x[1, 1:] = x[1, :1]  # one camera three times
+    K[2, 0] = torch.nan
+    key_points = scene.key_points.clone()
+    key_points[1, 1:] = key_points[1, :1]
+    batch = replace(scene, cameras=Cameras(K, R, t), key_points=key_points).batch(seen)
+    result = sound(make()(single(batch)), batch)
+    assert result.state[0, 2] == State.FEW_VIEWS
+    assert (result.state[1] == State.PARALLEL).all()
+    assert (result.state[2] == State.OBSERVED).all()
+    assert not result.views[2, 0].any()
+
+
+def test_a_joint_on_which_no_views_agree_is_kept_unless_asked():
+    scene = random_scene(5, frames=2, views=3).noisy(1, 0)
+    key_points = scene.key_points.clone()
+    key_points[0, :, 3] += torch.tensor([[400.0, 0], [0, -400], [-300, 300]])
+    batch = replace(scene, key_points=key_points).batch()
+    kept, asked = (sound(classical(reject=r)(batch), batch) for r in (False, True))
+    assert kept.state[0, 3] == State.OBSERVED
+    assert asked.state[0, 3] == State.REJECTED
+    assert kept.error[0, 3] > 50
+    assert kept.covariance[0, 3, [0, 3, 5]].min() > 100 * kept.covariance[1, 3, [0, 3, 5]].max()
+    assert (asked.state != State.OBSERVED).sum() == 1
+
+
+def test_a_view_that_is_off_is_not_among_those_that_made_the_joint():
+    scene = random_scene(6, frames=2, views=6).noisy(1, 0)
+    key_points = scene.key_points.clone()
+    key_points[:, 2, 5] += 200
+    batch = replace(scene, key_points=key_points).batch()
+    for name in ("ransac", "m_estimator", "lo_ransac"):
+        result = classical(ESTIMATORS[name])(batch)
+        assert not result.views[:, 2, 5].any()
+        assert result.views.sum() == result.views.numel() - 2
+    assert classical(Linear())(batch).views.all()
+
+
+@pytest.mark.parametrize("make", [classical, learned])
+def test_a_frame_is_the_same_in_any_batch(make):
+    batch = random_scene(7, frames=4, views=4).noisy(3, 0).batch()
+    whole, one = make()(batch), make()(part(batch, slice(2, 3)))
+    for field in ("points", "covariance", "error"):
+        torch.testing.assert_close(getattr(one, field)[0], getattr(whole, field)[2], rtol=1e-5, atol=1e-4)
+    assert torch.equal(one.views[0], whole.views[2])
+
+
+def part(batch, rows):
+    return type(batch)(**{k: v.index(rows) if isinstance(v, Cameras) else v[rows] for k, v in vars(batch).items()})
+
+
+@pytest.mark.parametrize("make", [classical, learned])
+def test_no_frames_and_no_seen_joints_are_no_error(make):
+    batch = random_scene(8, frames=2).batch()
+    assert len(make()(part(batch, slice(0, 0)))) == 0
+    result = make()(replace(batch, seen=torch.zeros_like(batch.seen)))
+    assert isinstance(result, Reconstruction)
+    assert (result.state == State.FEW_VIEWS).all()
+
+
+def test_the_configuration_builds_both_and_refuses_what_cannot_be():
+    config = yaml.safe_load((Path(__file__).parents[1] / "conf/estimator/default.yaml").read_text())
+    predictor = build(config["classical"], "estimator.classical")
+    batch = random_scene(9, frames=30).noisy(2, 0).batch()
+    assert predictor.fitted(batch).quality.noise > 0
+    assert build(config["learned"], "estimator.learned")(model=learned().model)(batch).placed.all()
+    with pytest.raises(GhptConfigError):
+        learned(spread=-1.0)

@@ -1,0 +1,75 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ghpt.errors import GhptConfigError
+from ghpt.geometry.cameras import project, reprojection_error
+from ghpt.geometry.triangulation import triangulate
+from ghpt.models.baselines import Linear, person_size
+from ghpt.models.quality import Quality
+from scenes import random_scene
+
+
+def full(covariance):
+    return covariance[..., [0, 1, 2, 1, 3, 4, 2, 4, 5]].unflatten(-1, (3, 3))
+
+
+def test_the_covariance_is_the_inverse_of_the_normal_matrix_by_finite_differences():
+    scene = random_scene(0, frames=2, views=4)
+    batch = scene.batch()
+    views = batch.seen.clone()
+    views[:, 3, :5] = False
+    found = Quality(noise=0.004, prior=1e12, shared=0.0)(batch, scene.points, views)
+    step = 1e-3 * torch.eye(3, dtype=torch.float64)
+    pixels = [project(scene.cameras, scene.points + s * d)[0] for d in step for s in (1, -1)]
+    J = torch.stack([(pixels[2 * i] - pixels[2 * i + 1]) / 2e-3 for i in range(3)], dim=-1)
+    J = J / person_size(batch.key_points, batch.seen)[..., None, None, None] * views[..., None, None]
+    normal = torch.einsum("bvjpi,bvjpk->bjik", J, J)
+    torch.testing.assert_close(full(found.covariance), 0.004**2 * torch.linalg.inv(normal), rtol=1e-5, atol=0)
+
+
+def test_the_error_is_the_root_mean_square_over_the_used_views():
+    batch = random_scene(1, frames=3, views=5).noisy(4, 0).batch()
+    views = torch.rand(batch.seen.shape, generator=torch.Generator().manual_seed(0)) < 0.6
+    points = Linear()(batch).points
+    found = Quality(noise=0.004, prior=4.0, shared=0.0)(batch, points, views)
+    square = torch.where(views, reprojection_error(batch.cameras, batch.key_points, points) ** 2, 0.0)
+    enough = views.sum(1) >= 2
+    torch.testing.assert_close(found.error[enough], (square.sum(1) / views.sum(1)).sqrt()[enough])
+    assert (found.error[~enough] == 0).all()
+    assert (found.covariance[~enough] == 0).all()
+
+
+@pytest.mark.parametrize("views", [2, 3, 5, 10])
+def test_gaussian_noise_is_found_and_the_truth_is_inside_as_often_as_said(views):
+    frames = 400
+    scene = random_scene(2, frames, views)
+    size = person_size(scene.key_points, torch.ones(scene.key_points.shape[:-1], dtype=torch.bool))
+    noise = torch.randn(scene.key_points.shape, generator=torch.Generator().manual_seed(views), dtype=torch.float64)
+    batch = replace(scene, key_points=scene.key_points + 0.005 * size[..., None, None] * noise).batch()
+    depth = project(scene.cameras, scene.points)[1]
+    points = triangulate(scene.cameras, batch.key_points, (depth * size[..., None]) ** -2).points
+    quality = Quality(noise=None, prior=30.0, shared=0.0).fitted(batch, points, batch.seen)
+    assert quality.noise == pytest.approx(0.005, rel=0.35 if views == 2 else 0.1)
+    offset = (points - scene.points)[..., None]
+    covariance = full(quality(batch, points, batch.seen).covariance)
+    distance = (offset.mT @ torch.linalg.solve(covariance, offset)).flatten()
+    for share, limit in ((0.5, 2.366), (0.9, 6.251), (0.95, 7.815)):
+        assert (distance <= limit).double().mean() == pytest.approx(share, abs=0.15 if views == 2 else 0.05)
+
+
+def test_few_views_are_shrunk_towards_the_recordings_noise():
+    scene = random_scene(3, frames=1, views=8).noisy(5, 0)
+    batch = scene.batch()
+    points = Linear()(batch).points
+    one, two = (Quality(noise=1e-9, prior=p, shared=0.0)(batch, points, batch.seen).covariance for p in (1.0, 1e9))
+    assert (two[..., 0] < 1e-3 * one[..., 0]).all()
+    wide = Quality(noise=1e-9, prior=1e9, shared=3.0)(batch, points, batch.seen).covariance
+    torch.testing.assert_close(wide[..., [0, 3, 5]], torch.full_like(wide[..., :3], 9.0), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize("bad", [{"noise": 0.0}, {"prior": 0.0}, {"shared": -1.0}])
+def test_impossible_settings_are_refused(bad):
+    with pytest.raises(GhptConfigError):
+        Quality(**({"noise": 0.004, "prior": 4.0, "shared": 0.0} | bad))

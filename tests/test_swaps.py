@@ -1,0 +1,86 @@
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ghpt.errors import GhptConfigError
+from ghpt.geometry.cameras import Cameras
+from ghpt.models.baselines import MEstimator
+from ghpt.models.swaps import Swaps, undo_swaps
+from ghpt.skeleton import MIRROR
+from scenes import random_scene
+
+M = MEstimator(loss="geman_mcclure", scale=0.02, iterations=10, tolerance=1.0)
+SWAPS = Swaps(M, scale=0.02, gain=8.0, rounds=3, views=4)
+
+
+def good(views=4, frames=300):
+    scene = random_scene(views, frames, views)
+    return scene.noisy(4, 0).batch()
+
+
+def swapped(batch, share=0.05):
+    """At most one view of a frame with its sides exchanged, ``share`` of all views."""
+    frames, views, _ = batch.seen.shape
+    generator = torch.Generator().manual_seed(0)
+    hit = torch.rand(frames, 1, generator=generator) < share * views
+    hit = hit & (torch.randint(views, (frames, 1), generator=generator) == torch.arange(views))
+    points = torch.where(hit[..., None, None], batch.key_points[:, :, list(MIRROR)], batch.key_points)
+    return replace(batch, key_points=points), hit
+
+
+@pytest.mark.parametrize("views", [3, 4, 7])
+def test_nearly_all_swaps_are_found_and_nearly_none_invented(views):
+    batch = good(views)
+    bad, hit = swapped(batch)
+    mended, found = undo_swaps(bad, SWAPS)
+    assert (found & hit).sum() >= 0.95 * hit.sum()
+    assert (found & ~hit).sum() <= 0.005 * (~hit).sum()
+    right = (found == hit).all(1)
+    same = (mended.key_points == batch.key_points).all(-1).all(-1).all(-1)
+    assert same[right & hit.any(1)].double().mean() > 0.9  # the rest: one pair of limbs that overlap is left
+    error = [(M(b).points - batch.truth).norm(dim=-1).mean() for b in (batch, mended, bad)]
+    assert error[1] < error[0] + 0.1 * (error[2] - error[0])
+
+
+def test_good_views_stay_as_they_are():
+    batch = good()
+    mended, found = undo_swaps(batch, SWAPS)
+    assert found.double().mean() <= 0.001
+    assert (M(mended).points - batch.truth).norm(dim=-1).mean() <= (M(batch).points - batch.truth).norm(dim=-1).mean()
+
+
+def test_two_views_cannot_tell():
+    bad, _ = swapped(good(2, 50), share=0.3)
+    mended, found = undo_swaps(bad, SWAPS)
+    assert not found.any()
+    assert torch.equal(mended.key_points, bad.key_points)
+
+
+def test_what_is_not_seen_moves_with_its_key_point():
+    bad, hit = swapped(good())
+    seen = bad.seen.clone()
+    frame, view = (int(x[0]) for x in torch.nonzero(hit, as_tuple=True))
+    seen[frame, view, 0] = False
+    confidence = bad.confidence.clone()
+    confidence[frame, view, 1] = 0.25
+    mended, found = undo_swaps(replace(bad, seen=seen, confidence=confidence), SWAPS)
+    assert found[frame, view]
+    assert not mended.seen[frame, view, MIRROR[0]]
+    assert mended.seen[frame, view, 0]
+    assert mended.confidence[frame, view, MIRROR[1]] == 0.25
+
+
+def test_the_order_of_the_views_is_nothing():
+    bad, _ = swapped(good(5, 60))
+    order = torch.tensor([3, 1, 4, 0, 2])
+    cameras = Cameras(*(x[:, order] for x in (bad.cameras.K, bad.cameras.R, bad.cameras.t)))
+    fields = {name: getattr(bad, name)[:, order] for name in ("key_points", "confidence", "seen")}
+    assert torch.equal(
+        undo_swaps(replace(bad, cameras=cameras, **fields), SWAPS)[1], undo_swaps(bad, SWAPS)[1][:, order]
+    )
+
+
+def test_impossible_settings_are_refused():
+    with pytest.raises(GhptConfigError):
+        Swaps(M, scale=0.0, gain=8.0, rounds=3, views=4)
