@@ -109,10 +109,11 @@ def said(findings: tuple) -> str:
 
 
 def print_table(table: dict[str, Counter]) -> None:
-    columns = list(dict.fromkeys(["nothing", *(breakage.said for breakage in BREAKAGES.values()),
-                                  *(words for row in table.values() for words in row)]))  # fmt: skip
-    rows = [[kind, *(str(row[column] or "") for column in columns)] for kind, row in table.items()]
-    print(markdown(["broken", *columns], rows))
+    """A row for each way to spoil, with all that was said and how often."""
+    rows = [[kind, "nothing" if kind == "nothing" else BREAKAGES[kind].said,
+             ", ".join(f"{words} {count}" for words, count in row.most_common())]
+            for kind, row in table.items()]  # fmt: skip
+    print(markdown(["broken", "to be said", "said, times"], rows))
 
 
 if __name__ == "__main__":

@@ -186,6 +186,7 @@ class Doctor:
     def _of_views(self, look: Look, setup: Setup, now: Agreement) -> list[tuple[float, Candidate]]:
         found = []
         for view in range(len(setup)):
+            look.prepare(setup, view)
             tried = list(of_view(setup, view))
             tried += [shifted(setup, view, by) for by in self._shifts(look, setup, view)]
             tried += self._moved(look, setup, now, view)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.checkup.evidence import Evidence
@@ -89,25 +89,38 @@ class Look:
         """All views of a setup: leading dimension V."""
         return _stack([self.view(setup, view) for view in range(len(setup))])
 
-    def shifts(self, setup: Setup, view: int, shifts: Int[Tensor, " S"]) -> Rays:
-        """One view at several shifts: leading dimension S."""
-        return _stack([self._one(setup, view, int(shift)) for shift in shifts])
+    def prepare(self, setup: Setup, view: int) -> None:
+        """Look at one view at all shifts at once, which is many times faster than one by one."""
+        shifts = range(-self.evidence.reach, self.evidence.reach + 1)
+        if all(self._key(setup, view, shift) in self._kept for shift in shifts):
+            return
+        pixels, seen = self._pixels(setup, view, slice(None))
+        whole = rays(pixels.flatten(0, 1), seen.flatten(0, 1), setup.K[view], setup.lens[view])
+        parts = (x.unflatten(0, seen.shape[:2]) for x in (whole.xy, whole.seen, whole.size))
+        for shift, part in zip(shifts, zip(*parts, strict=True), strict=True):
+            self._kept[self._key(setup, view, shift)] = Rays(*part)
 
     def _one(self, setup: Setup, view: int, shift: int) -> Rays:
         if abs(shift) > self.evidence.reach:
             raise ValueError(f"a shift of {shift} frames is beyond the evidence's {self.evidence.reach}")
-        mirrored, sides = setup.mirrored[view], setup.sides[view]
-        key = (setup.source[view], shift, mirrored, sides, *setup.K[view].flatten().tolist(),
-               *setup.lens[view].tolist())  # fmt: skip
+        key = self._key(setup, view, shift)
         if key not in self._kept:
-            at = setup.source[view], self.evidence.reach + shift
-            pixels, seen = self.evidence.pixels[at], self.evidence.seen[at]
-            if mirrored:
-                pixels = torch.stack((setup.width[view] - 1 - pixels[..., 0], pixels[..., 1]), dim=-1)
-            if sides:
-                pixels, seen = pixels[:, list(MIRROR)], seen[:, list(MIRROR)]
+            pixels, seen = self._pixels(setup, view, self.evidence.reach + shift)
             self._kept[key] = rays(pixels, seen, setup.K[view], setup.lens[view])
         return self._kept[key]
+
+    @staticmethod
+    def _key(setup: Setup, view: int, shift: int) -> tuple:
+        how = setup.source[view], shift, setup.mirrored[view], setup.sides[view]
+        return (*how, *setup.K[view].flatten().tolist(), *setup.lens[view].tolist())
+
+    def _pixels(self, setup: Setup, view: int, at: int | slice) -> tuple[Tensor, Tensor]:
+        pixels, seen = (x[setup.source[view]][at] for x in (self.evidence.pixels, self.evidence.seen))
+        if setup.mirrored[view]:
+            pixels = torch.stack((setup.width[view] - 1 - pixels[..., 0], pixels[..., 1]), dim=-1)
+        if setup.sides[view]:
+            pixels, seen = pixels[..., list(MIRROR), :], seen[..., list(MIRROR)]
+        return pixels, seen
 
 
 def rays(

@@ -1,0 +1,211 @@
+"""The camera doctor: every breakage is named, a good rig is left alone, and what is mended is right again."""
+
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+import torch
+
+from ghpt.checkup.agreement import agreement, errors, median
+from ghpt.checkup.breakages import BREAKAGES
+from ghpt.checkup.candidates import POSES, exchanged
+from ghpt.checkup.evidence import Evidence, choose, gather
+from ghpt.checkup.examination import Finding, merged
+from ghpt.checkup.resection import resect
+from ghpt.checkup.setup import Look, Setup, as_filed
+from ghpt.config import build, plain
+from ghpt.data.camera_files import CameraFile, read_cameras
+from ghpt.data.embedded import motion
+from ghpt.data.key_points import KeyPoints, read_key_points
+from ghpt.data.lens import distort
+from ghpt.data.rigs import human36m_rig, panoptic_rig
+from ghpt.errors import GhptConfigError, GhptDataError
+from ghpt.geometry.cameras import project
+from ghpt.skeleton import JOINTS
+from rigs_with_people import people
+
+ROOT = Path(__file__).resolve().parents[1]
+LENSES = {"already_undistorted", "lens_missing", "one_already_undistorted", "one_lens_missing"}
+
+
+@cache
+def doctor(**changed):
+    with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        config = plain(hydra.compose("cameras", ["output=unused"]))["doctor"]
+    return build(config | {"frames": 24, "shift": 12} | changed, "doctor")
+
+
+@cache
+def case(views: int = 4, reach: int = 2, noise: float = 0.006, frames: int = 90) -> tuple[Evidence, Setup]:
+    """A person walking before Panoptic's cameras, through their lenses; noise in sizes of the person, about."""
+    rig = panoptic_rig((10, 12, 16, 18, 22, 6)[:views])
+    walk = motion(3, "P", "P/Walking", "Walking", frames, 25.0)
+    points = torch.from_numpy(np.stack([walk[..., 0], -walk[..., 2], walk[..., 1]], axis=-1))
+    pixels, depth = project(rig.cameras.index(None), points)
+    bent = distort(pixels.transpose(0, 1).flatten(1, 2), rig.cameras.K, rig.distortion)
+    bent = bent.unflatten(1, points.shape[:2]).transpose(0, 1)
+    seen = (depth > 0) & (bent >= 0).all(-1) & (bent <= rig.size[:, None] - 1).all(-1)
+    random = torch.randn(bent.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    file = CameraFile(path="", format="", names=rig.names, other_names=("",) * views, K=rig.cameras.K,
+                      distortion=rig.distortion, size=rig.size, R=rig.cameras.R, t=rig.cameras.t)  # fmt: skip
+    found = choose(rig.names, (bent + 500 * noise * random).numpy(), seen.numpy(), np.arange(frames), 20, reach, "")
+    return found, as_filed(file)
+
+
+@pytest.mark.parametrize("views", [2, 3, 4, 6])
+def test_a_good_rig_has_nothing_wrong(views):
+    checkup = doctor()(*case(views))
+    assert checkup.findings == ()
+    assert 1500 < checkup.stature < 2000
+    assert float(checkup.error_px.max()) < 10
+
+
+@cache
+def checked(kind):
+    return doctor()(*BREAKAGES[kind].spoil(case(reach=12 if kind in ("late", "early") else 2)))
+
+
+@pytest.mark.parametrize("kind", sorted(set(BREAKAGES) - {"one_axes_flipped", "one_camera_to_world_flipped"}))
+def test_every_breakage_is_found_and_nothing_else(kind):
+    names = case()[0].names
+    assert [finding.code for finding in checked(kind).findings] == [BREAKAGES[kind].said]
+    finding = checked(kind).findings[0]
+    assert finding.cameras == () if BREAKAGES[kind].every else names[-1] in finding.cameras
+    assert finding.mended
+    assert float(checked(kind).error_px.max()) < 10
+
+
+def test_numbers_of_the_mistakes_are_those_that_were_made():
+    kinds = ("late", "early", "metres", "centimetres", "one_metres", "resolution", "moved")
+    values = {kind: checked(kind).findings[0].value for kind in kinds}
+    assert values.pop("moved") == pytest.approx(3.0, abs=0.5)
+    assert values == {"late": 5, "early": -10, "metres": 1000, "centimetres": 10, "one_metres": 1000,
+                      "resolution": pytest.approx(0.5)}  # fmt: skip
+
+
+def test_mended_poses_are_the_true_ones():
+    _, setup = case()
+    for kind in (*POSES, "metres", "one_metres"):
+        mended = checked(kind).setup
+        torch.testing.assert_close(mended.R, setup.R, rtol=0, atol=1e-9)
+        torch.testing.assert_close(mended.t, setup.t, rtol=0, atol=1e-6)
+
+
+def test_two_mistakes_in_one_recording_are_both_found():
+    spoilt = BREAKAGES["late"].spoil(BREAKAGES["camera_to_world"].spoil(case(reach=12)))
+    checkup = doctor()(*spoilt)
+    assert [finding.code for finding in checkup.findings] == ["camera_to_world", "out_of_sync"]
+
+
+def test_the_unit_of_the_world_does_not_change_who_agrees():
+    evidence, setup = case()
+    estimator = doctor().estimator
+    one = agreement(Look(evidence), setup, estimator, 0.05, 100)
+    other = agreement(Look(evidence), replace(setup, t=setup.t * 1e-3), estimator, 0.05, 100)
+    torch.testing.assert_close(one.error, other.error, rtol=1e-3, atol=1e-6)
+    assert bool((one.core == other.core).all())
+
+
+def test_errors_are_in_sizes_of_the_person_and_bounded():
+    evidence, setup = case(noise=0.0)
+    now = agreement(Look(evidence), setup, doctor().estimator, 0.05, 100)
+    assert float(now.error.max()) < 1e-4
+    rays = Look(evidence).view(setup, 0)
+    far = errors(rays, setup.R[0], setup.t[0], now.points[0] + 1e5, now.known[0])
+    assert float(far[~far.isnan()].max()) <= 0.1
+    assert float(median(torch.full((2, 3), torch.nan, dtype=torch.float64))) == pytest.approx(0.1)
+
+
+def test_resection_gives_the_camera_back():
+    evidence, setup = case(noise=0.0)
+    now = agreement(Look(evidence), setup, doctor().estimator, 0.05, 100)
+    R, t = resect(Look(evidence).view(setup, 2), now.points[2], now.known[2], 0.1, 0)
+    torch.testing.assert_close(R, setup.R[2], rtol=0, atol=1e-4)
+    torch.testing.assert_close(t, setup.t[2], rtol=0, atol=2.0)
+    nothing = torch.zeros_like(now.known[2])
+    assert resect(Look(evidence).view(setup, 2), now.points[2], nothing, 0.1, 0) is None
+
+
+def test_an_exchange_is_its_own_inverse():
+    _, setup = case()
+    assert exchanged(exchanged(setup, 0, 2).setup, 2, 0).setup.source == setup.source
+    assert exchanged(setup, 0, 2).setup.source == (2, 1, 0, 3)
+
+
+def test_a_shift_beyond_the_evidence_is_refused():
+    evidence, setup = case()
+    with pytest.raises(ValueError, match="beyond"):
+        Look(evidence).view(setup.changed(1, shift=3), 1)
+
+
+def test_frames_that_are_left_out_are_gaps():
+    pixels = np.random.default_rng(0).uniform(0, 100, (20, 2, 17, 2)).astype(np.float32)
+    frame = np.delete(np.arange(21), 7)
+    found = choose(("a", "b"), pixels, np.ones(pixels.shape[:-1], bool), frame, 100, 2, "")
+    at = int(torch.nonzero(found.frame == 8))
+    assert found.seen[0, :, at].any(-1).tolist() == [True, False, True, True, True]
+    torch.testing.assert_close(found.pixels[1, 0, at], torch.from_numpy(pixels[6, 1]).double())
+
+
+def test_a_person_of_no_human_size_is_said_without_inventing_a_unit():
+    evidence, setup = case()
+    checkup = doctor()(evidence, replace(setup, t=3 * setup.t))
+    assert [(finding.code, finding.mended) for finding in checkup.findings] == [("scale", False)]
+
+
+def test_views_that_nothing_explains_are_said_to_be_off():
+    evidence, setup = case()
+    pixels = evidence.pixels.clone()
+    pixels[3] += 300 * torch.randn(pixels[3].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    found = doctor()(replace(evidence, pixels=pixels), setup).findings
+    assert [(finding.code, finding.cameras, finding.mended) for finding in found] == [
+        ("off", (evidence.names[3],), False)
+    ]
+
+
+def test_steps_of_one_kind_are_one_finding():
+    first = Finding("out_of_sync", ("a",), "3 late", 3.0, 20.0, 8.0, True)
+    second = replace(first, text="4 late", value=4.0, before_px=8.0, after_px=5.0)
+    assert merged([first, second]) == [replace(second, before_px=20.0)]
+
+
+@pytest.mark.parametrize(
+    ("changed", "key"),
+    [
+        ({"fitted": 1.0}, "fitted"),
+        ({"frames": 0}, "frames"),
+        ({"shift": -1}, "shift"),
+        ({"statures": [2.0, 1.0]}, "stat"),
+    ],
+)
+def test_bad_settings_are_named(changed, key):
+    with pytest.raises(GhptConfigError, match=key):
+        replace(doctor(), **changed)
+
+
+def test_real_rigs(shared_data):
+    """Pose2Sim's third camera is off, and not in time; caliscope's rig is good."""
+    folder, whole = shared_data / "pose2sim_single", doctor(frames=64, shift=20)
+    found = gather(read_key_points(folder / "pose"), read_cameras(folder / "Calib_qualisys.toml"), {}, None, 64, 20)
+    checkup = whole(found[0], as_filed(found[1]))
+    assert [(finding.code, finding.cameras) for finding in checkup.findings] == [("moved", ("cam03",))]
+    assert checkup.findings[0].before_px > 35
+    assert checkup.findings[0].after_px < 20
+    folder = shared_data / "caliscope"
+    found = gather(read_key_points(folder / "xy_HOLISTIC.csv"), read_cameras(folder / "camera_array.toml"), {}, None,
+                   64, 20)  # fmt: skip
+    assert whole(found[0], as_filed(found[1])).findings == ()
+
+
+def test_cameras_without_extrinsics_are_refused():
+    rig, crowd = human36m_rig("S8"), people(frames=30)
+    file = CameraFile(path="intrinsics", format="", names=rig.names, other_names=("",) * 4, K=rig.cameras.K,
+                      distortion=rig.distortion, size=rig.size, R=None, t=None)  # fmt: skip
+    values = crowd.key_points.numpy()
+    points = KeyPoints("", rig.names, JOINTS, np.arange(30), values, np.ones(values.shape[:-1]), crowd.seen.numpy(),
+                       None, (0,) * 4)  # fmt: skip
+    with pytest.raises(GhptDataError, match="extrinsics"):
+        gather(points, file, {}, None, 24, 5)
