@@ -21,7 +21,7 @@ from ghpt.export import WRITERS, Scene
 from ghpt.files import atomic_write, sweep_temporaries
 from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
-from ghpt.models.predictors import Predictor
+from ghpt.models.predictors import Classical, Learned
 from ghpt.models.swaps import Swaps
 from ghpt.prediction.frames import Frames, calibrated, evidence, frames_of_views
 from ghpt.prediction.gaps import Gaps, after, gap_frames
@@ -84,7 +84,7 @@ class Chosen:
     name: str
     text: str
     """In words, for people."""
-    predictor: Predictor
+    predictor: Classical | Learned
     swaps: Swaps | None
     weights: torch.nn.Module | None
     identity: dict[str, Any]

@@ -15,11 +15,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.data import DataLoader
 
-from ghpt.models.predictors import Predictor
 from ghpt.prediction.frames import Frames
 from ghpt.prediction.shards import Shards
 from ghpt.reconstruction import Reconstruction
+from ghpt.recording import KeyPointBatch
 from ghpt.train import make_trainer, shell_status
+
+Predictor = Callable[[KeyPointBatch], Reconstruction]
 
 
 class ShardPrediction(L.LightningModule):

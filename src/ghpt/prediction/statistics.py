@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.geometry.cameras import reprojection_error
-from ghpt.models.predictors import Predictor
 from ghpt.models.scale import SEGMENTS
 from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.prediction.frames import Frames
@@ -68,7 +67,7 @@ def evaluate(
     return {"frames": len(rows), "estimators": result}
 
 
-def estimate_of(predictor: Predictor) -> Estimate:
+def estimate_of(predictor: Callable[[KeyPointBatch], Reconstruction]) -> Estimate:
     """What a predictor gives, as the other estimators give it."""
 
     def estimate(batch: KeyPointBatch) -> PoseEstimate:
