@@ -33,7 +33,7 @@ from ghpt.data.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
 
 SECONDS, BATCH, MEMORY = 1.0, 200, 1 << 30
-"""For one file; files in a process; bytes that a process may add to those of the imports."""
+"""Of the processor for one file; files in a process; bytes that a process may add to those of the imports."""
 RNG = np.random.default_rng(0)
 BODY = np.column_stack([RNG.uniform(0, 400, (17, 2)).round(2), RNG.uniform(0.1, 1, 17).round(3)])
 
@@ -340,13 +340,13 @@ def late(*_: Any) -> None:
 def batch(row: str, form: Format, numbers: range, folder: Path, target: Path) -> dict[str, Any]:
     """Reads one file after the other; what each gave, and by how much the memory grew."""
     whole, reference, outcomes, notes = target.read_bytes(), form.read(folder), Counter(), []
-    signal.signal(signal.SIGALRM, late)
+    signal.signal(signal.SIGPROF, late)
     held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for number, data in zip(numbers, spoilt(row, whole, form, numbers), strict=True):
         target.write_bytes(data)
-        signal.setitimer(signal.ITIMER_REAL, SECONDS)
+        signal.setitimer(signal.ITIMER_PROF, SECONDS)
         try:
             found = form.read(folder)
             outcome = "same" if same(found, reference) else "part" if part_of(found, reference) else "different"
@@ -358,7 +358,7 @@ def batch(row: str, form: Format, numbers: range, folder: Path, target: Path) ->
             outcome = "leak"
             notes.append(f"{number}: {type(error).__name__}: {error}"[:300])
         finally:
-            signal.setitimer(signal.ITIMER_REAL, 0)
+            signal.setitimer(signal.ITIMER_PROF, 0)
         outcomes[outcome] += 1
         if outcome == "hang" or (outcome == "different" and row != "A1" and len(notes) < 20):
             notes.append(f"{number}: {outcome}")
