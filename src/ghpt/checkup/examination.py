@@ -23,6 +23,9 @@ _FEW = 80
 _FITTED_LENS = 0.85
 """A lens that was fitted must explain so much more than none."""
 
+_ONE_FRAME = 0.85
+"""A shift by one frame must explain so much more than a longer one: cameras without a trigger are half a frame off."""
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -155,7 +158,7 @@ class Doctor:
 
     def _ratio(self, candidate: Candidate) -> float:
         if candidate.code == "out_of_sync":
-            return self.shifted
+            return self.shifted * (_ONE_FRAME if abs(candidate.value) == 1 else 1.0)
         if candidate.code in ("already_undistorted", "lens"):
             return (self.lens if candidate.views else self.lenses) * (_FITTED_LENS if candidate.fitted else 1.0)
         return self.fitted if candidate.fitted else self.discrete
