@@ -1,8 +1,16 @@
 from dataclasses import replace
+from itertools import islice
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+import yaml
 
+from ghpt.config import build
+from ghpt.data.detector import Detector
+from ghpt.data.embedded import embedded_recordings
+from ghpt.data.frames import Frames
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import project, reprojection_error
 from ghpt.geometry.triangulation import triangulate
@@ -67,6 +75,25 @@ def test_few_views_are_shrunk_towards_the_recordings_noise():
     assert (two[..., 0] < 1e-3 * one[..., 0]).all()
     wide = Quality(noise=1e-9, prior=1e9, shared=3.0)(batch, points, batch.seen).covariance
     torch.testing.assert_close(wide[..., [0, 3, 5]], torch.full_like(wide[..., :3], 9.0), rtol=1e-3, atol=0)
+
+
+@pytest.mark.parametrize(
+    ("split", "bands"),
+    [("validation", ((0.7, 0.9), (0.95, 1.0), (0.97, 1.0))), ("test", ((0.35, 0.65), (0.75, 0.95), (0.82, 0.98)))],
+)
+def test_calibration_on_embedded_people_known_to_the_detector_and_not(split, bands):
+    """Absolute positions: people that the detector was trained on are inside more often than said, others as often."""
+    conf = Path(__file__).parents[1] / "conf"
+    detector = Detector(**yaml.safe_load((conf / "detector/human36m.yaml").read_text()))
+    predictor = build(yaml.safe_load((conf / "estimator/default.yaml").read_text())["classical"], "estimator.classical")
+    takes = list(islice(embedded_recordings("h36m", split, 0, detector), 4))
+    frames = Frames(takes, np.arange(0, sum(map(len, takes)), 16))
+    batch = frames[range(len(frames))]
+    result = predictor.fitted(batch)(batch)
+    offset = (result.points - batch.truth).double()[result.placed][..., None]
+    distance = (offset.mT @ torch.linalg.solve(full(result.covariance)[result.placed].double(), offset)).flatten()
+    for limit, (low, high) in zip((2.366, 6.251, 7.815), bands, strict=True):
+        assert low < (distance <= limit).double().mean() < high
 
 
 @pytest.mark.parametrize("bad", [{"noise": 0.0}, {"prior": 0.0}, {"shared": -1.0}])

@@ -238,7 +238,7 @@ class LoRansac(Baseline):
         rig = [x.double().cpu().numpy() for x in (K, batch.cameras.R, batch.cameras.t)]
         mask = usable.cpu().numpy()
         for frame in range(len(batch)):
-            cameras, poses = _pycolmap_cameras(*(x[frame] for x in rig), mask[frame].any(-1))
+            cameras, poses = pycolmap_cameras(*(x[frame] for x in rig), mask[frame].any(-1))
             for joint in range(mask.shape[-1]):
                 views = np.flatnonzero(mask[frame, :, joint])
                 if len(views) < 2:
@@ -252,7 +252,7 @@ class LoRansac(Baseline):
         return _otherwise(triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch))
 
 
-def _pycolmap_cameras(
+def pycolmap_cameras(
     K: np.ndarray, R: np.ndarray, t: np.ndarray, valid: np.ndarray
 ) -> tuple[dict[int, pycolmap.Camera], dict[int, pycolmap.Rigid3d]]:
     """The valid cameras by view: pycolmap refuses others."""

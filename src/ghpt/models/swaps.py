@@ -11,7 +11,7 @@ from torch import Tensor
 from ghpt.errors import check
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.models.baselines import Baseline, person_size
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import KeyPointBatch, PoseEstimate
 from ghpt.skeleton import JOINTS, MIRROR
 
 LIMBS = tuple(
@@ -57,8 +57,12 @@ def undo_swaps(batch: KeyPointBatch, swaps: Swaps) -> tuple[KeyPointBatch, Bool[
     most = (batch.seen.any(-1).sum(-1) - 1) // 2
     if not len(batch) or int(most.max()) < 1:
         return batch, exchanged.any(-1)
-    before = _costs(batch, swaps)
-    doubtful = torch.nonzero((before.amax(-1) > swaps.gain / 2) & (most > 0))[:, 0]
+    estimate = swaps.estimator(batch)
+    before = _costs(batch, estimate, swaps.scale)
+    # a view that is right in a pose that is nearly right is far from its mirror image
+    mirrored = _costs(_exchange(batch, ~exchanged), estimate, swaps.scale)
+    doubtful = ((before > swaps.gain / 2) & (mirrored < before + swaps.gain)).any(-1)
+    doubtful = torch.nonzero(doubtful & (most > 0))[:, 0]
     for _ in range(swaps.rounds):
         if not len(doubtful):
             break
@@ -66,7 +70,7 @@ def undo_swaps(batch: KeyPointBatch, swaps: Swaps) -> tuple[KeyPointBatch, Bool[
         candidates = _candidates(own, before[doubtful], min(swaps.views, batch.seen.shape[1]))
         count = candidates.shape[1]
         hypotheses = _exchange(_frames(batch, doubtful.repeat_interleave(count)), candidates.flatten(0, 1))
-        costs = _costs(hypotheses, swaps).unflatten(0, (-1, count))
+        costs = _costs(hypotheses, swaps.estimator(hypotheses), swaps.scale).unflatten(0, (-1, count))
         allowed = candidates.any(-1).sum(-1) <= most[doubtful, None]
         best = torch.where(allowed, costs.sum(-1), torch.inf).argmin(-1)
         row = torch.arange(len(best), device=best.device)
@@ -105,11 +109,10 @@ def _exchange(batch: KeyPointBatch, which: Bool[Tensor, "B V G"]) -> KeyPointBat
     )
 
 
-def _costs(batch: KeyPointBatch, swaps: Swaps) -> Float[Tensor, "B V"]:
+def _costs(batch: KeyPointBatch, estimate: PoseEstimate, scale: float) -> Float[Tensor, "B V"]:
     """Each view's share of its frame's cost: of the joints that it sees and the frame places, with their mirrors."""
-    estimate = swaps.estimator(batch)
-    scale = (swaps.scale * person_size(batch.key_points, batch.seen).double()).clamp(min=1e-12)[..., None]
-    error = reprojection_error(batch.cameras, batch.key_points, estimate.points) / scale
+    size = (scale * person_size(batch.key_points, batch.seen).double()).clamp(min=1e-12)[..., None]
+    error = reprojection_error(batch.cameras, batch.key_points, estimate.points) / size
     mirror = list(MIRROR)
     known = estimate.estimated & estimate.estimated[:, mirror]
     counted = batch.seen & batch.seen[:, :, mirror] & known[:, None]
