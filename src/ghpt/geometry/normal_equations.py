@@ -121,7 +121,7 @@ def view_equations(
     all 0 where the view is not usable. ``cameras`` are used as they are: pass valid ones near the origin."""
     usable = usable.permute(1, 2, 0)
     each = products(*views_of(cameras, key_points, usable).rows())
-    return torch.where(usable[:, None], each, 0.0).permute(3, 0, 2, 1)
+    return torch.where(usable[:, None], each, 0.0).permute(3, 0, 2, 1).contiguous()
 
 
 def minors(m: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
