@@ -125,7 +125,7 @@ class Doctor:
             after = self._agreement(look, candidate.setup)
             old, new = self._contrast(look, setup, candidate, now, after)
             gain = max(now.cost - after.cost, self._gain(candidate, old, new, len(setup)))
-            gain *= self.fitted if candidate.fitted else 1.0
+            gain *= (self.fitted if candidate.fitted else 1.0) ** (1 if candidate.views else 2)  # one lens before all
             if self._passes(candidate, old, new) and after.cost <= 1.02 * now.cost and gain > most:
                 best, most = (candidate, after), gain
         return best
