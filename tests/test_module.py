@@ -32,7 +32,7 @@ class Numbers:
 class GuessTheNumber:
     """Hypotheses are the truth plus noise; the feature is the noise, so a scorer can learn to prefer little of it."""
 
-    feature_size = 1
+    measures, feature_size = "distance", 1
 
     def generate(self, batch, count, keys):
         return batch.truth[:, None] + 10 * (randomness.uniform(keys, (count,)).float() - 0.3)
