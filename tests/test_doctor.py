@@ -42,5 +42,5 @@ def test_a_mistake_is_an_error_and_the_mended_cameras_are_good_again(tmp_path):
 def test_what_cannot_be_is_named(tmp_path):
     with pytest.raises(GhptConfigError, match="spoil"):
         examine(settings("data=h36m", "spoil=nothing_known"), tmp_path)
-    with pytest.raises(GhptDataError, match="no such|not there|cannot be read|does not exist"):
+    with pytest.raises(GhptDataError, match="missing"):
         examine(settings(f"keypoints={tmp_path}/missing", f"cameras={tmp_path}/missing.toml"), tmp_path)

@@ -78,7 +78,8 @@ def test_nothing_else_in_the_package_writes_files():
         r"""np\.savez?|torch\.save\(|\.to_csv\(|write_text\(|write_bytes\(|open\([^)]*["'][wax]b?\+?["']"""
     )
     package = Path(files.__file__).parent
-    # the writer; into atomic_write's handle; torch.save into memory; the files of an atomic_folder; rows that finish() zips through atomic_write
+    # the writer; into atomic_write's handle; torch.save into memory; the files of an atomic_folder; rows that
+    # finish() zips through atomic_write
     allowed = {
         "files.py": 1,
         "data/own_npz.py": 1,
