@@ -49,9 +49,12 @@ class Settings(TypedDict):
 
     keypoints: str | None
     cameras: str | None
+    subject: str | None
+    unit_mm: float | None
     views: list[str] | None
     match: dict[str, str] | None
     skeleton: str | None
+    format: str | None
     rate_hz: float | None
     recording: str | None
     scale: Scale
@@ -147,8 +150,9 @@ def from_files(config: Mapping[str, Any]) -> Case:
     """The user's own key points and cameras."""
     if not config["cameras"]:
         raise GhptConfigError("cameras", "is missing", "Name the file of the intrinsics: cameras=intrinsics.toml")
-    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"])
-    views = look_through(points, read_cameras(config["cameras"]), config["match"], config["views"])
+    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"], config["format"])
+    cameras = read_cameras(config["cameras"], config["subject"], config["unit_mm"])
+    views = look_through(points, cameras, config["match"], config["views"])
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
     return Case(
         title, str(Path(config["keypoints"]).resolve()), views, "the file's own calibration", people_note(points)

@@ -42,9 +42,12 @@ class Settings(TypedDict):
 
     keypoints: str | None
     cameras: str | None
+    subject: str | None
+    unit_mm: float | None
     views: list[str] | None
     match: dict[str, str] | None
     skeleton: str | None
+    format: str | None
     rate_hz: float | None
     recording: str | None
     spoil: str | None
@@ -108,8 +111,8 @@ def from_files(config: Mapping[str, Any], doctor: Doctor) -> Patient:
         raise GhptConfigError("cameras", "is missing", "Name the file to examine: cameras=Calib.toml")
     if config["spoil"]:
         raise GhptConfigError("spoil", "is for demonstrations", "Leave it out, or leave out keypoints.")
-    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"])
-    file = read_cameras(config["cameras"])
+    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"], config["format"])
+    file = read_cameras(config["cameras"], config["subject"], config["unit_mm"])
     evidence, cameras, at = gather(points, file, config["match"] or {}, config["views"], doctor.frames, doctor.shift)
     for note in people_note(points):
         _log.warning(note.text)

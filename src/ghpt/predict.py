@@ -48,6 +48,8 @@ class Settings(TypedDict):
 
     keypoints: str | None
     cameras: str | None
+    subject: str | None
+    unit_mm: float | None
     views: list[str] | None
     match: dict[str, str] | None
     skeleton: str | None
@@ -188,7 +190,7 @@ def from_files(config: dict[str, Any]) -> Frames:
     """The user's own key points and cameras."""
     if not config["cameras"]:
         raise GhptConfigError("cameras", "is missing", "Name the file of the calibrated cameras: cameras=Calib.toml")
-    cameras = read_cameras(config["cameras"])
+    cameras = read_cameras(config["cameras"], config["subject"], config["unit_mm"])
     calibrated(str(config["cameras"]), cameras)
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
     rate = None if config["rate_hz"] is None else float(config["rate_hz"])
