@@ -103,7 +103,7 @@ def test_lenses_that_are_not_known_are_named(form, kind, parameters, says, tmp_p
 def test_a_damaged_model_is_read_or_named(form, file, tmp_path):
     model(tmp_path, form, points=2)
     path = tmp_path / f"{file}.{'bin' if form == 'binary' else 'txt'}"
-    damage(path, lambda _: read_cameras(tmp_path, unit_mm=1), 150)
+    assert damage(path, lambda _: read_cameras(tmp_path, unit_mm=1), 150) == {"read", "named"}
 
 
 def test_human36m_s_camera_parameters(shared_data, tmp_path):

@@ -168,7 +168,7 @@ def test_a_damaged_npz_is_read_or_named(tmp_path):
     """Whatever byte is lost, and wherever the file ends."""
     path = tmp_path / "p.npz"
     write_key_points(path, key_points(frames=2))
-    damage(path, read_key_points, 150)
+    assert damage(path, read_key_points, 150) == {"read", "named"}
 
 
 def test_a_damaged_json_is_read_or_named(tmp_path):
@@ -177,4 +177,7 @@ def test_a_damaged_json_is_read_or_named(tmp_path):
         (tmp_path / view).mkdir()
         content = {"people": [{"pose_keypoints_2d": body.ravel().tolist()}]}
         (tmp_path / view / "x_000000000001.json").write_text(json.dumps(content))
-    damage(tmp_path / "a" / "x_000000000001.json", lambda _: read_key_points(tmp_path, "body_25"), 150)
+    assert damage(tmp_path / "a" / "x_000000000001.json", lambda _: read_key_points(tmp_path, "body_25"), 150) == {
+        "read",
+        "named",
+    }

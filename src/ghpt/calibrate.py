@@ -17,11 +17,11 @@ from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.millimetres import check_scale, in_millimetres, of_scale
 from ghpt.calibration.rig import RigEstimate
 from ghpt.config import build, check_type, suggest
-from ghpt.data.camera_files import CameraFile, read_cameras
-from ghpt.data.key_points import KeyPoints, read_key_points
-from ghpt.data.store import prepared
+from ghpt.data.camera_files import CameraFile
+from ghpt.data.chosen import InputSettings, own_cameras, own_key_points, recording_of
+from ghpt.data.key_points import KeyPoints
 from ghpt.data.views import Views, look_through
-from ghpt.errors import GhptConfigError, GhptDataError, check
+from ghpt.errors import GhptDataError, check
 from ghpt.files import sweep_temporaries
 from ghpt.geometry.cameras import Cameras
 from ghpt.provenance import provenance
@@ -44,21 +44,10 @@ class Scale(TypedDict):
     assumed_height: float
 
 
-class Settings(TypedDict):
+class Settings(InputSettings):
     """What `calibrate` needs of the configuration."""
 
-    keypoints: str | None
-    cameras: str | None
-    subject: str | None
-    unit_mm: float | None
-    views: list[str] | None
-    match: dict[str, str] | None
-    skeleton: str | None
-    format: str | None
-    rate_hz: float | None
-    recording: str | None
     scale: Scale
-    data: dict[str, Any]
     calibration: dict[str, Any]
     baselines: dict[str, Any]
     triangulation: str
@@ -148,10 +137,7 @@ def summary(numbers: dict[str, Any]) -> str:
 
 def from_files(config: Mapping[str, Any]) -> Case:
     """The user's own key points and cameras."""
-    if not config["cameras"]:
-        raise GhptConfigError("cameras", "is missing", "Name the file of the intrinsics: cameras=intrinsics.toml")
-    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"], config["format"])
-    cameras = read_cameras(config["cameras"], config["subject"], config["unit_mm"])
+    cameras, points = own_cameras(config, "intrinsics.toml"), own_key_points(config)
     views = look_through(points, cameras, config["match"], config["views"])
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
     return Case(
@@ -171,14 +157,7 @@ def people_note(points: KeyPoints) -> tuple[Diagnosis, ...]:
 
 def from_data(config: Mapping[str, Any]) -> Case:
     """One recording of a data set, whose true extrinsics serve the comparison alone."""
-    data = build(config["data"], "data")
-    made = {"source": data.source, "split": data.evaluate}
-    stored = prepared(data.cache, data.key(data.evaluate), lambda: data.make(data.evaluate), made)
-    recordings = {recording.name: recording for recording in stored}
-    name = config["recording"] or ("S9/Walking-1" if "S9/Walking-1" in recordings else next(iter(recordings), ""))
-    if name not in recordings:
-        raise GhptConfigError("recording", f"there is no {name!r}", suggest(name, recordings))
-    found = recordings[name]
+    data, found = recording_of(config)
     rig = found.cameras
     file = CameraFile(
         path=data.source, format="ghpt", names=found.camera_names, other_names=("",) * len(found.camera_names),
@@ -186,7 +165,7 @@ def from_data(config: Mapping[str, Any]) -> Case:
     )  # fmt: skip
     arrays = (np.array(getattr(found, field)) for field in ("key_points", "confidence", "seen", "frame"))
     views = Views(file, *arrays, found.rate_hz)
-    return Case(f"{name} of {words(data.name, data.source)}", data.source, views, "the truth")
+    return Case(f"{found.name} of {words(data.name, data.source)}", data.source, views, "the truth")
 
 
 def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:

@@ -7,7 +7,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import numpy as np
 import torch
@@ -21,11 +21,11 @@ from ghpt.checkup.examination import Checkup, Doctor
 from ghpt.checkup.mending import MENDED, write_mended
 from ghpt.checkup.setup import Setup, as_filed
 from ghpt.config import build, check_type, suggest
-from ghpt.data.camera_files import CameraFile, read_cameras
-from ghpt.data.key_points import KeyPoints, read_key_points
+from ghpt.data.camera_files import CameraFile
+from ghpt.data.chosen import InputSettings, own_cameras, own_key_points, recording_of
+from ghpt.data.key_points import KeyPoints
 from ghpt.data.lens import distort
 from ghpt.data.rigs import human36m_rig, panoptic_rig
-from ghpt.data.store import prepared
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.files import atomic_write, sweep_temporaries
 from ghpt.provenance import provenance
@@ -37,21 +37,10 @@ _log = logging.getLogger(__name__)
 _HEADER = ["camera", "error px", "mended px"]
 
 
-class Settings(TypedDict):
+class Settings(InputSettings):
     """What `examine` needs of the configuration."""
 
-    keypoints: str | None
-    cameras: str | None
-    subject: str | None
-    unit_mm: float | None
-    views: list[str] | None
-    match: dict[str, str] | None
-    skeleton: str | None
-    format: str | None
-    rate_hz: float | None
-    recording: str | None
     spoil: str | None
-    data: dict[str, Any]
     doctor: dict[str, Any]
     seed: int
 
@@ -107,12 +96,9 @@ def summary(numbers: dict[str, Any]) -> str:
 
 def from_files(config: Mapping[str, Any], doctor: Doctor) -> Patient:
     """The user's own key points and cameras."""
-    if not config["cameras"]:
-        raise GhptConfigError("cameras", "is missing", "Name the file to examine: cameras=Calib.toml")
     if config["spoil"]:
         raise GhptConfigError("spoil", "is for demonstrations", "Leave it out, or leave out keypoints.")
-    points = read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"], config["format"])
-    file = read_cameras(config["cameras"], config["subject"], config["unit_mm"])
+    file, points = own_cameras(config, "Calib.toml"), own_key_points(config)
     evidence, cameras, at = gather(points, file, config["match"] or {}, config["views"], doctor.frames, doctor.shift)
     for note in people_note(points):
         _log.warning(note.text)
@@ -122,22 +108,16 @@ def from_files(config: Mapping[str, Any], doctor: Doctor) -> Patient:
 
 def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
     """An embedded recording, spoilt on request."""
-    data = build(config["data"], "data")
-    if data.source != "embedded":
-        raise GhptConfigError("data", "is a data set on disk", "Give keypoints and cameras, or the embedded data.")
-    made = {"source": data.source, "split": data.evaluate}
-    stored = prepared(data.cache, data.key(data.evaluate), lambda: data.make(data.evaluate), made)
-    recordings = {recording.name: recording for recording in stored}
-    name = config["recording"] or ("S9/Walking-1" if "S9/Walking-1" in recordings else next(iter(recordings), ""))
-    if name not in recordings:
-        raise GhptConfigError("recording", f"there is no {name!r}", suggest(name, recordings))
-    evidence, cameras = from_recording(recordings[name], data, doctor, len(recordings[name]))
+    if config["data"]["root"] is not None:
+        raise GhptConfigError("data.root", "is a data set on disk", "Give keypoints and cameras, or the embedded data.")
+    data, found = recording_of(config)
+    evidence, cameras = from_recording(found, data, doctor, len(found))
     setup = as_filed(cameras)
     if config["spoil"]:
         if config["spoil"] not in BREAKAGES:
             raise GhptConfigError("spoil", f"there is no {config['spoil']!r}", suggest(config["spoil"], BREAKAGES))
         evidence, setup = BREAKAGES[config["spoil"]].spoil((evidence, setup))
-    title = f"{name} of {words(data.name, data.source)}" + f", spoilt: {config['spoil']}" * bool(config["spoil"])
+    title = f"{found.name} of {words(data.name, data.source)}" + f", spoilt: {config['spoil']}" * bool(config["spoil"])
     return Patient(title, data.source, evidence, cameras, setup, None, ())
 
 

@@ -7,16 +7,16 @@ import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any
 
 import torch
 
 from ghpt.calibrate import from_data
 from ghpt.config import build, check_type, suggest
-from ghpt.data.camera_files import read_cameras
+from ghpt.data.chosen import InputSettings, own_cameras
 from ghpt.data.key_points import read_people
 from ghpt.data.views import look_through
-from ghpt.errors import GhptCheckpointError, GhptConfigError, check
+from ghpt.errors import GhptCheckpointError, check
 from ghpt.export import WRITERS, Scene
 from ghpt.files import atomic_write, sweep_temporaries
 from ghpt.models.checkpoint import load_model
@@ -43,20 +43,10 @@ _TIMED = ("trc", "c3d")
 _log = logging.getLogger(__name__)
 
 
-class Settings(TypedDict):
+class Settings(InputSettings):
     """What `predict` needs of the configuration."""
 
-    keypoints: str | None
-    cameras: str | None
-    subject: str | None
-    unit_mm: float | None
-    views: list[str] | None
-    match: dict[str, str] | None
-    skeleton: str | None
-    rate_hz: float | None
-    format: str | None
     person: int
-    recording: str | None
     ckpt: str | None
     hypotheses: int | None
     triangulation: str | None
@@ -70,7 +60,6 @@ class Settings(TypedDict):
     shard_frames: int
     batch: int
     progress_bar: bool
-    data: dict[str, Any]
     baselines: dict[str, Any]
     trainer: dict[str, Any]
     swaps: bool
@@ -188,9 +177,7 @@ def _name(config: dict[str, Any]) -> str:
 
 def from_files(config: dict[str, Any]) -> Frames:
     """The user's own key points and cameras."""
-    if not config["cameras"]:
-        raise GhptConfigError("cameras", "is missing", "Name the file of the calibrated cameras: cameras=Calib.toml")
-    cameras = read_cameras(config["cameras"], config["subject"], config["unit_mm"])
+    cameras = own_cameras(config, "Calib.toml")
     calibrated(str(config["cameras"]), cameras)
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
     rate = None if config["rate_hz"] is None else float(config["rate_hz"])
