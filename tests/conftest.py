@@ -1,10 +1,16 @@
 """Fixtures shared by all tests."""
 
+import logging
 import os
+import sys
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
+
+from ghpt.app import run
 
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if WORKER:  # each of several test processes has its own core, and so have the commands that it runs
@@ -26,3 +32,31 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
     """Prepared recordings go to a folder of the test session, shared by its tests, never to the user's cache."""
     base = tmp_path_factory.getbasetemp()
     monkeypatch.setenv("GHPT_CACHE", str((base.parent if WORKER else base) / "cache"))
+
+
+@pytest.fixture
+def typed(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """``typed(conf, "train", words, task, summary)`` runs train.py in this process: (exit status, stdout, stderr)."""
+    handlers, level = list(logging.root.handlers), logging.root.level
+    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
+
+    def call(conf: Path, name: str, words: Any, task: Any, summary: Any) -> tuple[int, str, str]:
+        os.environ["HYDRA_FULL_ERROR"] = "0"
+        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
+        status = 0
+        capfd.readouterr()
+        try:
+            run(conf, name, task, summary)
+        except SystemExit as stop:
+            status = stop.code
+            if isinstance(status, str):  # what Python itself would do with it
+                print(status, file=sys.stderr)
+                status = 1
+        finally:
+            for handler in set(logging.root.handlers) - set(handlers):
+                handler.close()
+            logging.root.handlers[:] = handlers
+            logging.root.setLevel(level)
+        return (status, *capfd.readouterr())
+
+    return call

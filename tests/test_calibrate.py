@@ -1,10 +1,7 @@
 """calibrate.py as a user meets it: what it writes and says, with and without a scale, and how it fails."""
 
 import json
-import logging
-import os
 import re
-import sys
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.app import run
 from ghpt.calibrate import calibrate, people_note, summary
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.data.camera_files import read_cameras
@@ -35,32 +31,10 @@ OUTPUTS = {
 
 
 @pytest.fixture
-def command(monkeypatch, capfd):
+def command(monkeypatch, typed):
     """``command(*words)`` runs calibrate.py in this process: (exit status, stdout, stderr)."""
-    handlers, level = list(logging.root.handlers), logging.root.level
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     monkeypatch.setenv("COLUMNS", "120")
-
-    def call(*words):
-        os.environ["HYDRA_FULL_ERROR"] = "0"
-        monkeypatch.setattr(sys, "argv", ["calibrate.py", *map(str, words)])
-        status = 0
-        capfd.readouterr()
-        try:
-            run(ROOT / "conf", "calibrate", calibrate, summary)
-        except SystemExit as stop:
-            status = stop.code
-            if isinstance(status, str):
-                print(status, file=sys.stderr)
-                status = 1
-        finally:
-            for handler in set(logging.root.handlers) - set(handlers):
-                handler.close()
-            logging.root.handlers[:] = handlers
-            logging.root.setLevel(level)
-        return (status, *capfd.readouterr())
-
-    return call
+    return lambda *words: typed(ROOT / "conf", "calibrate", words, calibrate, summary)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,6 @@
 """The command line as a user meets it: what it writes and says, how it fails, how it is stopped and goes on."""
 
 import json
-import logging
 import os
 import re
 import shutil
@@ -20,7 +19,6 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import ghpt.test as testing
 import toys
-from ghpt.app import run
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
 from ghpt.train import summary, train, typed
@@ -39,31 +37,10 @@ def conf(tmp_path_factory):
 
 
 @pytest.fixture
-def command(conf, monkeypatch, capfd):
+def command(conf, typed):
     """``command("train", *words)`` runs train.py in this process: (exit status, stdout, stderr)."""
-    handlers, level = list(logging.root.handlers), logging.root.level
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
-
-    def call(name, *words):
-        os.environ["HYDRA_FULL_ERROR"] = "0"
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *words])
-        status = 0
-        capfd.readouterr()
-        try:
-            run(conf, name, *((train, summary) if name == "train" else (testing.test, testing.summary)))
-        except SystemExit as stop:
-            status = stop.code
-            if isinstance(status, str):  # what Python itself would do with it
-                print(status, file=sys.stderr)
-                status = 1
-        finally:
-            for handler in set(logging.root.handlers) - set(handlers):
-                handler.close()
-            logging.root.handlers[:] = handlers
-            logging.root.setLevel(level)
-        return (status, *capfd.readouterr())
-
-    return call
+    tasks = {"train": (train, summary), "test": (testing.test, testing.summary)}
+    return lambda name, *words: typed(conf, name, words, *tasks[name])
 
 
 def files(folder):

@@ -1,8 +1,6 @@
 """predict.py as a user meets it: what it writes and says, how it goes on, and how it fails."""
 
 import json
-import logging
-import os
 import re
 import subprocess
 import sys
@@ -14,7 +12,6 @@ import pytest
 import torch
 
 from ghpt import predict as module
-from ghpt.app import run
 from ghpt.config import build, plain
 from ghpt.data.camera_writers import write_pose2sim
 from ghpt.data.key_points import KeyPoints, write_key_points
@@ -32,32 +29,10 @@ PIXELS = project(RIG.cameras, walk())[0].numpy()
 
 
 @pytest.fixture
-def command(monkeypatch, capfd):
+def command(monkeypatch, typed):
     """``command(*words)`` runs predict.py in this process: (exit status, stdout, stderr)."""
-    handlers, level = list(logging.root.handlers), logging.root.level
-    monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
     monkeypatch.setenv("COLUMNS", "120")
-
-    def call(*words):
-        os.environ["HYDRA_FULL_ERROR"] = "0"
-        monkeypatch.setattr(sys, "argv", ["predict.py", *map(str, words), *QUICK])
-        status = 0
-        capfd.readouterr()
-        try:
-            run(CONF, "predict", predict, summary)
-        except SystemExit as stop:
-            status = stop.code
-            if isinstance(status, str):
-                print(status, file=sys.stderr)
-                status = 1
-        finally:
-            for handler in set(logging.root.handlers) - set(handlers):
-                handler.close()
-            logging.root.handlers[:] = handlers
-            logging.root.setLevel(level)
-        return (status, *capfd.readouterr())
-
-    return call
+    return lambda *words: typed(CONF, "predict", [*words, *QUICK], predict, summary)
 
 
 def points_file(folder: Path, values=None, name="points.npz", frames=40, **changed) -> Path:
