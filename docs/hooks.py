@@ -1,0 +1,36 @@
+"""What mkdocs does for this site: pages that lie outside of docs/, where GitHub wants them, and API pages."""
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mkdocs.structure.files import File, Files
+
+ROOT = Path(__file__).resolve().parents[1]
+OUTSIDE = {"benchmarks.md": "benchmarks/README.md", "changelog.md": "CHANGELOG.md"}
+"""Page of the site -> file."""
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add the pages from outside."""
+    for page, file in OUTSIDE.items():
+        files.append(File.generated(config, page, content=(ROOT / file).read_text(encoding="utf-8")))
+    return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Links that are right on GitHub lead to the same pages here; ``::: ghpt.models.*`` is every module of it."""
+    for page, file in OUTSIDE.items():
+        markdown = markdown.replace(f"](../{file}", f"]({page}")
+    return re.sub(r"^::: ([\w.]+)\.\*$", lambda match: "\n\n".join(_entries(match[1])), markdown, flags=re.MULTILINE)
+
+
+def _entries(package: str) -> Iterator[str]:
+    """One ``:::`` for the package, where it says something, and each public module in it."""
+    folder = ROOT / "src" / package.replace(".", "/")
+    for path in sorted(folder.glob("*.py"), key=lambda path: (path.stem != "__init__", path.stem)):
+        if path.stem == "__init__" and path.read_text(encoding="utf-8").strip():
+            yield f"::: {package}"
+        elif not path.stem.startswith("_"):
+            yield f"::: {package}.{path.stem}"
