@@ -1,8 +1,21 @@
 """The errors that a user can cause and mend. Each names where, what is wrong and the mend."""
 
+from typing import Any
+
 
 class GhptError(ValueError):
-    """Base of all errors that ghpt raises on purpose."""
+    """Base of all errors that ghpt raises on purpose. They can be sent from one process to another."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _again, (type(self), str(self), vars(self))
+
+
+def _again(kind: type[GhptError], text: str, attributes: dict[str, Any]) -> GhptError:
+    """An unpickled error: its constructor takes other arguments than its text."""
+    error = kind.__new__(kind, text)
+    error.args = (text,)
+    error.__dict__.update(attributes)
+    return error
 
 
 class GhptDataError(GhptError):

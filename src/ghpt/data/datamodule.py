@@ -73,18 +73,19 @@ class KeyPointDataModule(L.LightningDataModule):
         """Prepare what is not yet in the cache (one process; the others then open it)."""
         stage = "test" if self.trainer and self.trainer.state.fn == "test" else "fit"
         for split in self._roles(stage).values():
-            self._open(split)
+            self.recordings(split)
 
     def setup(self, stage: str) -> None:
         for role, split in self._roles(stage).items():
             if role not in self.frames:
-                self.frames[role] = self._choose(self._open(split), role == "train")
+                self.frames[role] = self._choose(self.recordings(split), role == "train")
 
     def _roles(self, stage: str) -> dict[str, str]:
         """What the stage needs: role -> split."""
         return {"test": self.evaluate} if stage == "test" else {"train": "train", "validation": "validation"}
 
-    def _open(self, split: str) -> list[Recording]:
+    def recordings(self, split: str) -> list[Recording]:
+        """The split's recordings, prepared first where they are not in the cache. Raises GhptDataError."""
         recordings = prepared(
             self.cache, self.key(split), lambda: self.make(split), {"source": self.source, "split": split}
         )

@@ -1,0 +1,131 @@
+"""Cells on several processes, in the order of their needs, under one progress bar."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+
+import torch
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+
+from ghpt.errors import GhptError
+from ghpt.files import sweep_temporaries
+from ghpt.reproduction.cells import Cell, perform, with_needs
+
+_log = logging.getLogger(__name__)
+
+
+def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> int:
+    """Do every cell that is wanted or needed and is not yet done, ``jobs`` at a time; returns how many that were.
+
+    A cell's result is kept as soon as it is there: after an error or an interruption, which end this at once, the same
+    call goes on where it was. Raises what the cell raised, a GhptError with the cell's name before it.
+    """
+    cells.mkdir(parents=True, exist_ok=True)
+    sweep_temporaries(cells)
+    missing = {key: cell for key, cell in with_needs(wanted).items() if not cell.done(cells)}
+    number = len(missing)
+    with _progress(list(missing.values()), show) as finished, _executor(min(jobs, len(missing))) as submit:
+        waiting, running = dict(missing), {}
+        while waiting or running:
+            ready = [c for c in waiting.values() if not any(b.key in missing for b in c.needs.values())]
+            for cell in sorted(ready, key=lambda c: -c.seconds)[: jobs - len(running)]:
+                running[submit(cell, cells)] = waiting.pop(cell.key)
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                cell = running.pop(future)
+                try:
+                    finished(cell, future.result())
+                except GhptError as error:
+                    error.args = (f"{cell.name}: {error}",)
+                    raise
+                del missing[cell.key]
+    return number
+
+
+@contextlib.contextmanager
+def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[float]]]:
+    """Submit cells to ``jobs`` processes, or with one to this process; on the way out nothing is left running."""
+    if jobs <= 1:
+        yield _here
+        return
+    threads = max(1, (os.cpu_count() or 1) // jobs)
+    executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _start, (threads, os.getpid()))
+    try:
+        yield lambda cell, cells: executor.submit(_quietly, cell, cells)
+    except BaseException:
+        executor.shutdown(wait=False, cancel_futures=True)
+        for process in multiprocessing.active_children():
+            process.kill()  # what it was writing has a temporary name
+        raise
+    finally:
+        executor.shutdown()
+
+
+def _here(cell: Cell, cells: Path) -> Future[float]:
+    future: Future[float] = Future()
+    try:
+        future.set_result(_quietly(cell, cells))
+    except Exception as error:
+        future.set_exception(error)
+    return future
+
+
+def _start(threads: int, parent: int) -> None:
+    """In a new process: its share of the processors, and an end when the parent's comes."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    torch.set_num_threads(threads)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+def _end_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(1)
+    os._exit(1)
+
+
+def _quietly(cell: Cell, cells: Path) -> float:
+    """`perform` without what the commands would say on the way."""
+    loggers = [logging.getLogger(name) for name in ("ghpt", "lightning.pytorch", "lightning.fabric")]
+    levels = [logger.level for logger in loggers]
+    try:
+        for logger in loggers:
+            logger.setLevel(logging.ERROR)
+        with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore")
+            return perform(cell, cells)
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
+
+
+@contextlib.contextmanager
+def _progress(cells: Sequence[Cell], show: bool) -> Iterator[Callable[[Cell, float], None]]:
+    """A bar over all cells, as long as their expected seconds; without it a line in the log for each."""
+    columns = (TextColumn("{task.fields[count]}"), BarColumn(None), TaskProgressColumn(), TimeElapsedColumn(),
+               TextColumn("{task.description}"))  # fmt: skip
+    bar = Progress(*columns, console=Console(stderr=True), disable=not show)
+    done: list[Cell] = []
+
+    def count() -> str:
+        return f"{len(done)} of {len(cells)}"
+
+    with bar:
+        task = bar.add_task("", total=sum(cell.seconds for cell in cells), count=count())
+
+        def finished(cell: Cell, seconds: float) -> None:
+            done.append(cell)
+            bar.update(task, advance=cell.seconds, count=count(), description=cell.name)
+            (_log.debug if show else _log.info)("%s: %s, %.0f s", count(), cell.name, seconds)
+
+        yield finished

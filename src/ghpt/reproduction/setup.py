@@ -1,0 +1,100 @@
+"""What the cells of one seed share, and how the commonest of them are asked for."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import hydra
+
+from ghpt.config import build, plain
+from ghpt.reproduction.cells import Cell
+from ghpt.train import typed
+
+OVERHEAD = 3.0
+"""Seconds of any cell beyond its arithmetic."""
+
+
+@functools.cache
+def compose(conf: Path, name: str, overrides: tuple[str, ...]) -> dict[str, Any]:
+    """``<conf>/<name>.yaml`` under ``overrides``, as plain data. Do not change it."""
+    with hydra.initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+        return plain(hydra.compose(name, [*overrides, "output=unused", "progress_bar=false"]))
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Makes cells. All paths of real data and all sizes come from conf/reproduce.yaml."""
+
+    conf: Path
+    roots: Mapping[str, str | None]
+    """``human36m`` and ``panoptic``: folder of the real data set, None for the embedded one."""
+    overrides: tuple[str, ...]
+    """Of every training, in the words of train.py's command line."""
+    sizes: Mapping[str, Any]
+    """``conf/reproduce.yaml``'s ``sizes``."""
+    seed: int
+
+    def root(self, data: str) -> str | None:
+        return self.roots["human36m" if data == "h36m" else "panoptic"]
+
+    def source(self, data: str) -> str:
+        """As metrics.json has it: ``embedded``, or the path of the real data."""
+        root = self.root(data)
+        return "embedded" if root is None else str(Path(root).expanduser().resolve())
+
+    def words(self, data: str, *overrides: str) -> tuple[str, ...]:
+        """What a command line says of the data and the seed."""
+        root = self.root(data)
+        return (f"data={data}", *([] if root is None else [typed("data.root", root)]), f"seed={self.seed}", *overrides)
+
+    def composed(self, name: str, data: str, *overrides: str) -> dict[str, Any]:
+        """A command's whole configuration; of real data also what identifies the files."""
+        config = compose(self.conf, name, (*self.words(data), "trainer.devices=1", *overrides))
+        config = {key: value for key, value in config.items() if key not in ("output", "progress_bar")}
+        return config | ({} if self.root(data) is None else {"files": _files(self.conf, self.words(data))})
+
+    def prepared(self, data: str, split: str) -> Cell:
+        """The recordings of a split in the cache."""
+        config = {"data": _of_source(self.composed("test", data)["data"]), "split": split}
+        files = {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
+        return Cell(f"prepare-{data}-{split}", "ghpt.reproduction.work.prepare_split", config | files, seconds=8)
+
+    def trained(self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 18.0) -> Cell:
+        """A model trained on a data set; ``overrides`` are those of train.py, ``name`` tells them apart."""
+        words = (f"model={model}", *self.overrides, *overrides)
+        config = {k: v for k, v in self.composed("train", data, *words).items() if k not in ("save_every", "resume")}
+        needs = {split: self.prepared(data, split) for split in ("train", "validation")}
+        command = " ".join(["python train.py", *self.words(data), *words])
+        name = "-".join(filter(None, ["train", model, data, name, f"seed{self.seed}"]))
+        return Cell(name, "ghpt.reproduction.work.train_model", config, needs, command, seconds)
+
+    def tested(
+        self, model: Cell, data: str, *overrides: str, name: str = "", baselines: bool = True, seconds: float = 7.0
+    ) -> Cell:
+        """The model of a `trained` cell on a data set; ``baselines`` False leaves the classical estimators out."""
+        config = self.composed("test", data, *overrides)
+        unused = "baselines" if model.config["model"]["problem"].get("frames") else "camera_baselines"
+        config = {key: value for key, value in config.items() if key not in (unused, "ckpt")}
+        if not baselines:
+            config |= {key: {} for key in ("baselines", "camera_baselines") if key in config}
+        needs = {"model": model, "data": self.prepared(data, config["data"]["evaluate"])}
+        command = " ".join(["python test.py ckpt=...", *self.words(data), *overrides])
+        trained = model.name.removeprefix("train-").removesuffix(f"-seed{self.seed}")
+        name = "-".join(filter(None, ["test", trained, "on", data, name, f"seed{self.seed}"]))
+        return Cell(name, "ghpt.reproduction.work.test_model", config, needs, command, seconds)
+
+
+def _of_source(data: Mapping[str, Any]) -> dict[str, Any]:
+    """The data settings that do not change the recordings set to one value, so that seeds share them."""
+    return dict(data) | {"seed": 0, "evaluate": "test", "stride": 64}
+
+
+@functools.cache
+def _files(conf: Path, words: tuple[str, ...]) -> dict[str, Any]:
+    """The key of each split: it changes when a file of the real data set does."""
+    data = build(compose(conf, "test", words)["data"], "data")
+    return {split: data.key(split) for split in ("train", "validation", "test")}

@@ -1,0 +1,36 @@
+"""The work of the commonest cells: prepare a split, train, test."""
+
+import contextlib
+import io
+from pathlib import Path
+from typing import Any
+
+from ghpt.config import build
+from ghpt.reproduction.cells import write_json
+from ghpt.test import test
+from ghpt.train import train
+
+QUIET = {"progress_bar": False}
+CHECKPOINT = "last.ckpt"
+
+
+def prepare_split(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+    """Have the recordings of ``config["data"]``, split ``config["split"]``, in the cache of prepared recordings."""
+    recordings = build(config["data"], "data").recordings(config["split"])
+    write_json(folder / "result.json", {"frames": sum(map(len, recordings))})
+
+
+def train_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+    """What train.py does. result.json: the validation errors (mm)."""
+    errors = train(config | QUIET | {"save_every": 1_000_000, "resume": False}, folder)
+    (folder / "best.ckpt").unlink(missing_ok=True)
+    write_json(folder / "result.json", errors)
+
+
+def test_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+    """What test.py does with the model of ``needs["model"]``: metrics.json, predictions.npz."""
+    with contextlib.redirect_stdout(io.StringIO()):  # its table is for a terminal
+        test(config | QUIET | {"ckpt": str(needs["model"] / CHECKPOINT)}, folder)
+
+
+test_model.__test__ = False  # not one for pytest
