@@ -1,0 +1,176 @@
+"""The jobs of a sweep, where Hydra's launchers leave something open: one that dies, an interrupt, several processes."""
+
+import os
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.types import Override
+from hydra.core.utils import JobReturn, JobStatus
+from omegaconf import open_dict, read_write
+
+import __main__
+from ghpt.config import suggest
+from ghpt.errors import GhptConfigError
+
+LAUNCHER = "hydra/launcher"
+_LAUNCHERS = ("basic", "submitit_local", "submitit_slurm")
+_PATIENCE = 10.0
+"""Seconds that interrupted jobs have to save their state."""
+
+
+class Job(NamedTuple):
+    """A job of a sweep, ended."""
+
+    name: str
+    """Of its folder, in the sweep's."""
+    config: dict[str, Any]
+    result: Any
+    """What the task returned; None if it failed."""
+    said: str
+    """One line: the result's summary, or the error."""
+    failed: bool
+
+
+def chosen_launcher(overrides: Sequence[Override], compose_only: bool) -> str:
+    """The launcher of Hydra that the command line names, or ``basic``.
+
+    Raises GhptConfigError for one whose jobs are not reported, that is not installed, or, unless ``compose_only``,
+    that needs a cluster where there is none.
+    """
+    name = next((o.value() for o in reversed(overrides) if o.key_or_group == LAUNCHER), "basic")
+    if name not in _LAUNCHERS:
+        raise GhptConfigError(LAUNCHER, f"there is no {str(name)!r}", suggest(str(name), _LAUNCHERS))
+    if name != "basic" and find_spec("submitit") is None:
+        raise GhptConfigError(LAUNCHER, f"{name} needs hydra-submitit-launcher", "Run: pip install -e '.[slurm]'")
+    if name == "submitit_slurm" and not (compose_only or (shutil.which("sbatch") and shutil.which("srun"))):
+        mend = f"Start it on a machine of the cluster, or with {LAUNCHER}=submitit_local."
+        raise GhptConfigError(LAUNCHER, "submitit_slurm needs Slurm's sbatch and srun, which are not here", mend)
+    return str(name)
+
+
+@contextmanager
+def awaited(ended: list[Job]) -> Iterator[None]:
+    """Within the block, every job that submitit's launchers start is added to ``ended`` when it ends, however it does.
+
+    Hydra's launcher leaves the others alone when one dies without a result, or when it is interrupted; here they are
+    waited for, and stopped.
+    """
+    import submitit
+
+    submit = submitit.AutoExecutor.map_array
+
+    def map_array(executor: Any, launcher: Any, *columns: Any) -> list[_Awaited]:
+        # Interrupts are for this process, which then stops its jobs in order.
+        previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+        try:
+            jobs = submit(executor, launcher, *columns)
+        finally:
+            signal.signal(signal.SIGINT, previous)
+        folder = Path(str(launcher.config.hydra.sweep.dir))
+        submitted = [_Awaited(job, folder, number, ended) for job, number in zip(jobs, columns[2], strict=True)]
+        for job in submitted:
+            job.others = submitted
+        return submitted
+
+    submitit.AutoExecutor.map_array = map_array
+    try:
+        yield
+    finally:
+        submitit.AutoExecutor.map_array = submit
+
+
+class _Awaited:
+    """A submitit job whose end is noted; what Hydra's launcher asks of it."""
+
+    def __init__(self, job: Any, folder: Path, number: int, ended: list[Job]) -> None:
+        self.job, self.folder, self.number, self.ended = job, folder, number, ended
+        self.others: list[_Awaited] = []
+
+    def results(self) -> list[JobReturn]:
+        try:
+            job = self._end()
+        except KeyboardInterrupt:
+            remaining = [other for other in self.others if other.number >= self.number]
+            _stop([other.job for other in remaining])
+            self.ended += [other._end() for other in remaining if other.job.paths.result_pickle.exists()]
+            raise
+        self.ended.append(job)
+        return [JobReturn(status=JobStatus.COMPLETED, _return_value=job)]
+
+    def _end(self) -> Job:
+        from submitit.core.utils import FailedJobError, UncompletedJobError
+
+        try:
+            return self.job.results()[0].return_value
+        except (FailedJobError, UncompletedJobError):
+            name = next((path.name for path in self.folder.glob(f"{self.number}_*")), str(self.number))
+            said = f"error: it ended without a result; {self.job.paths.stderr} may say why"
+            return Job(name, {}, None, said, failed=True)
+
+
+def _stop(jobs: list[Any]) -> None:
+    """End the jobs that still run; a training saves its state first."""
+    import submitit
+
+    if not isinstance(jobs[0], submitit.LocalJob):
+        for job in jobs:
+            job.cancel(check=False)
+        return
+    end = time.monotonic() + _PATIENCE
+    grace = end - 0.8 * _PATIENCE
+    while time.monotonic() < end and (running := [job for job in jobs if not job.done()]):
+        if time.monotonic() > grace:  # it was no Ctrl-C of a terminal, which reaches the jobs too
+            grace = end
+            for job in running:
+                with suppress(ProcessLookupError):
+                    os.kill(int(job.job_id), signal.SIGTERM)  # submitit hands it on
+        time.sleep(0.05)
+
+
+def take_signals() -> None:
+    """Within a job of a local pool: an interrupt, or SIGTERM, stops it (`awaited` and submitit have them ignored)."""
+    if os.environ.get("SUBMITIT_EXECUTOR") == "local":
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+@contextmanager
+def own_command(script: str) -> Iterator[None]:
+    """Within the block, the running job of a sweep is a command of its own to Lightning.
+
+    Lightning starts a training's other processes with this process's command, which is the whole sweep's; and leaves
+    its variables behind, with which the next job would believe to have been started by the one before.
+    """
+    hydra = HydraConfig.get()
+    before = list(sys.argv), __main__.__spec__, dict(os.environ)
+    with read_write(hydra), open_dict(hydra):
+        hydra.run.dir = hydra.runtime.output_dir
+    settings = [word for word in hydra.overrides.task if not word.startswith("output=")]
+    sys.argv[:], __main__.__spec__ = [script, *settings, f"output='{hydra.runtime.output_dir}'"], None
+    try:
+        yield
+    finally:
+        sys.argv[:], __main__.__spec__ = before[:2]
+        for name in set(os.environ) - set(before[2]):
+            del os.environ[name]
+        if torch.distributed.is_available() and torch.distributed.is_initialized():
+            torch.distributed.destroy_process_group()
+
+
+def first_of_several_ends() -> bool:
+    """Whether this is one of a training's several processes, but the first, and that one ends too: it says why."""
+    if os.environ.get("LOCAL_RANK", "0") == "0":
+        return False
+    first, end = os.getppid(), time.monotonic() + _PATIENCE / 2
+    while os.getppid() == first and time.monotonic() < end:
+        time.sleep(0.05)
+    return os.getppid() != first
