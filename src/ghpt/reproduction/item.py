@@ -40,6 +40,11 @@ class Spread:
         return f"{self.mean:.{digits}f}{deviation}"
 
 
+def over_seeds(function: Callable[..., float], *spreads: Spread) -> Spread:
+    """A function of several numbers, seed by seed."""
+    return Spread(tuple(function(*values) for values in zip(*(spread.values for spread in spreads), strict=True)))
+
+
 @dataclass(frozen=True)
 class Compared:
     """One number of the paper beside ours."""
