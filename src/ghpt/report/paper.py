@@ -124,6 +124,12 @@ FUNDAMENTAL_DISSECTION = {
 }
 """Appendix A, tab:fundamental-dissection: the errors when one part of the pose is estimated and the other is true."""
 
+UNKNOWN_EXTRINSICS = {
+    "h36m": {"known": 29.1, "R": 29.4, "t": 36.7, "both": 37.3},
+    "cmu3": {"known": 31.0, "R": 33.6, "t": 42.2, "both": 44.5},
+}
+"""Appendix A, tab:unknown-extrinsics-evaluation: training set -> which part of Human3.6M's extrinsics is estimated."""
+
 
 def paper_value(data: str, selection: str, trained_on: str | None) -> float | None:
     """The paper's pelvis-relative MPJPE of a selection on the test split of ``data``; None where it prints none.
