@@ -1,0 +1,339 @@
+"""The site builds and fetches nothing; every command and every piece of code in the documentation runs."""
+
+import argparse
+import importlib.util
+import re
+import runpy
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Callable
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+import documented
+import ghpt.test as testing
+from documented import PAGES, ROOT, Block, Command
+from ghpt import calibrate, doctor, predict, train
+from ghpt.app import check_overrides
+from ghpt.data import embedded
+
+MAINS = {
+    "train.py": ((train.train, train.summary), {"last.ckpt", "best.ckpt"}),
+    "test.py": ((testing.test, testing.summary), {"predictions.npz", "metrics.json", "report.md"}),
+    "predict.py": ((predict.predict, predict.summary), {"poses.npz", "report.md", "prediction.json"}),
+    "cameras.py": ((doctor.examine, doctor.summary), {"checkup.json", "report.md"}),
+    "calibrate.py": ((calibrate.calibrate, calibrate.summary), {"rig.toml", "calibration.json", "report.md"}),
+}
+"""What a script runs, and what its output folder then holds."""
+
+QUICK = ("trainer.accelerator=cpu", "progress_bar=false")
+SMALL = {
+    "train.py": (*QUICK, "data.train_samples=16", "model.hypotheses=8", "model.scorer.layers=[8]",
+                 "trainer.max_epochs=1"),
+    "test.py": (*QUICK, "data.stride=40"),
+    "predict.py": (*QUICK, "evaluated_frames=8"),
+    "cameras.py": ("doctor.frames=16", "doctor.shift=2"),
+    "calibrate.py": ("evaluated_frames=8", "calibration.frames=40"),
+}  # fmt: skip
+"""What makes a command quick, where it does not say otherwise itself."""
+SMALL_PAIRS = ("model.problem.draws=1", "model.problem.frames=20")
+
+LAID_OUT = ("runs/cmu2", "runs/camera")
+"""Trained models that every page may start from."""
+PLACEHOLDERS = {"/path/to/human36m": "human36m", "ckpt=...": "ckpt=runs/cmu2/last.ckpt"}
+
+
+class Accepted(Exception):
+    """A script has understood its arguments."""
+
+
+# The site
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    found = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert found.returncode == 0, found.stderr
+    return folder
+
+
+class Fetched(HTMLParser):
+    """The addresses that a browser loads for a page, and what the page can be pointed at."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.addresses: list[str] = []
+        self.anchors: set[str] = set()
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        self.anchors.add(values.get("id") or "")
+        if tag in ("script", "img", "iframe", "source", "video", "audio", "embed"):
+            self.addresses.append(values.get("src") or "")
+        if tag == "link" and values.get("rel") not in ("canonical", "next", "prev"):
+            self.addresses.append(values.get("href") or "")
+
+
+def test_the_site_builds_without_a_warning_and_fetches_nothing_from_elsewhere(site):
+    pages = list(site.rglob("*.html"))
+    assert len(pages) >= len(PAGES)
+    for page in pages:
+        elsewhere = [a for a in Fetched(page.read_text()).addresses if re.match(r"(\w+:)?//", a)]
+        assert not elsewhere, page
+    for style in site.rglob("*.css"):
+        assert not re.search(r"url\([\"']?(\w+:)?//|@import", style.read_text()), style
+
+
+def test_every_public_module_is_in_the_api_reference(site):
+    anchors = set().union(*(Fetched(page.read_text()).anchors for page in (site / "api").glob("*.html")))
+    source = ROOT / "src"
+    modules = [
+        ".".join(path.relative_to(source).with_suffix("").parts)
+        for path in (source / "ghpt").rglob("*.py")
+        if not path.stem.startswith("_")
+    ]
+    assert {"ghpt.models.pose", "ghpt.geometry.cameras"} <= set(modules)
+    assert sorted(set(modules) - anchors) == []
+
+
+def test_every_page_is_reached_from_the_navigation():
+    nav = str(yaml.safe_load((ROOT / "mkdocs.yml").read_text())["nav"])
+    pages = [str(page.relative_to(ROOT / "docs")) for page in (ROOT / "docs").rglob("*.md")]
+    assert [page for page in pages if repr(page) not in nav] == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_between_files_are_right_on_github(page):
+    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text())
+    assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
+
+
+# The commands and the code
+
+
+@pytest.fixture(scope="module")
+def models(tmp_path_factory):
+    """A folder in which the models of ``LAID_OUT`` will lie."""
+    return tmp_path_factory.mktemp("models")
+
+
+@pytest.fixture
+def small(tmp_path_factory, monkeypatch):
+    """Little embedded data, in a cache of its own, and a wide terminal."""
+    monkeypatch.setattr(embedded, "HUMAN36M_FRAMES", {"train": 16, "validation": 16, "test": 80})
+    monkeypatch.setattr(embedded, "HUMAN36M_SUBJECTS", {"train": ("S1",), "validation": ("S8",), "test": ("S9",)})
+    monkeypatch.setattr(embedded, "PANOPTIC_FRAMES", 400)
+    monkeypatch.setattr(embedded, "PANOPTIC_SUBJECTS", ("P1",))
+    monkeypatch.setenv("GHPT_CACHE", str(tmp_path_factory.getbasetemp() / "small"))
+    monkeypatch.setenv("COLUMNS", "120")
+
+
+class Page:
+    """Runs what a page holds, in a folder that has what the page speaks of."""
+
+    def __init__(self, folder: Path, typed: Callable[..., tuple[int, str, str]], monkeypatch: Any) -> None:
+        self.folder, self.typed, self.monkeypatch = documented.workplace(folder), typed, monkeypatch
+        self.conf = documented.own_conf(folder)
+        self.names: dict[str, Any] = {"detect": documented.detected}
+
+    def execute(self, block: Block) -> None:
+        """Write the file that the first line names, or run the code."""
+        named = re.match(r"# (\S+\.(?:py|yaml))\n", block.text)
+        where = f"{block.page.relative_to(ROOT)}:{block.line}"
+        if block.language == "yaml":
+            assert named, f"{where}: say in the first line which file this is"
+            assert named[1].startswith("conf/"), where
+            self.write(self.conf.parent / named[1], block.text)
+        elif named:
+            path = self.folder / named[1]
+            self.write(path, block.text)
+            package = sys.modules[".".join(path.parent.relative_to(self.folder / "src").parts)]
+            self.monkeypatch.setattr(package, "__path__", [*package.__path__, str(path.parent)])
+            self.monkeypatch.delitem(sys.modules, f"{package.__name__}.{path.stem}", raising=False)
+        else:
+            exec(compile("\n" * (block.line - 1) + block.text, where, "exec"), self.names)
+
+    def write(self, path: Path, text: str) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+
+    def run(self, command: Command) -> None:
+        """Run a command, made small, and look at what it leaves behind."""
+        words = list(command.words[2:])
+        for old, new in PLACEHOLDERS.items():
+            words = [word.replace(old, new) for word in words]
+        given = {word.split("=")[0] for word in words}
+        more = SMALL[command.script] + (SMALL_PAIRS if "model=camera" in words else ())
+        words += [word for word in more if word.split("=")[0] not in given]
+        task, files = MAINS[command.script]
+        if "resume=true" in words:  # what was stopped was begun by the same command
+            self.typed(self.conf, "train", [word for word in words if word != "resume=true"], *task)
+        status, said, errors = self.typed(self.conf, command.script.removesuffix(".py"), words, *task)
+        spoilt = next((word.split("=")[1] for word in words if word.startswith("spoil=")), None)
+        if spoilt:
+            assert (status, spoilt in errors) == (1, True), f"{command.where}\n{said}{errors}"
+        else:
+            assert status == 0, f"{command.where}\n{said}{errors}"
+        output = next((word.split("=")[1] for word in words if word.startswith("output=")), None)
+        if output and "-m" not in words:
+            assert {path.name for path in (self.folder / output).iterdir()} >= files, command.where
+
+
+def check_pip(command: Command) -> None:
+    """What it installs is there to be installed: the file of pins, the extras."""
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    words = command.words[2:]
+    assert command.words[1] == "install"
+    for option, value in zip(words, [*words[1:], ""], strict=True):
+        if option == "-c":
+            assert (ROOT / value).is_file()
+    named = re.findall(r"\[([\w,]+)\]", " ".join(words))
+    assert set(",".join(named).split(",")) - {""} <= set(extras)
+    assert set(words) <= {"-q", "-c", "constraints.txt", "-e", "."} | {
+        word for word in words if re.fullmatch(r"(ghpt|\.)\[[\w,]+\]", word)
+    }
+
+
+def check_program(command: Command) -> None:
+    """The program is installed, and its folders are there."""
+    assert importlib.util.find_spec(command.words[0]), command.where
+    paths = [word for word in command.words[1:] if not word.startswith("-") and not word.isdigit()]
+    assert all((ROOT / path).exists() for path in paths if path not in ("check", "format", "serve")), command.where
+
+
+def check_tensorboard(command: Command) -> None:
+    """There are events where it looks."""
+    assert command.words[1] == "--logdir"
+    assert list(Path(command.words[2]).rglob("events.out.tfevents*"))
+
+
+SHELL = {
+    ("python3", "-m", "venv", ".venv"): lambda command: None,  # Python's own
+    (".", ".venv/bin/activate"): lambda command: None,
+    ("pip",): check_pip,
+    ("ruff",): check_program,
+    ("pytest",): check_program,
+    ("mkdocs", "serve"): check_program,
+    ("tensorboard",): check_tensorboard,
+}
+"""Commands that need a shell, or that this test suite is part of: how they are checked instead, by how they begin."""
+
+
+def check_arguments(command: Command, monkeypatch: Any) -> None:
+    """Scripts and benchmarks of many minutes: started, and stopped when they have understood their arguments."""
+
+    def stop(function: Callable[..., Any]) -> Callable[..., Any]:
+        def stopping(*args: Any, **kwargs: Any) -> None:
+            raise Accepted(function(*args, **kwargs))
+
+        return stopping
+
+    path = ROOT / command.script
+    assert path.is_file(), command.where
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "path", [str(path.parent), str(ROOT / "benchmarks"), *sys.path])
+        import measure
+
+        patch.setattr(measure, "settings", stop(measure.settings))
+        patch.setattr(argparse.ArgumentParser, "parse_args", stop(argparse.ArgumentParser.parse_args))
+        patch.setattr(sys, "argv", list(command.words[1:]))
+        with pytest.raises(Accepted):
+            runpy.run_path(str(path), run_name="__main__")
+
+
+def composed(name: str, command: Command, first: int = 2) -> None:
+    """A script whose words, from ``first`` on, are settings of a configuration."""
+    check_overrides(ROOT / "conf", name, command.words[first:])
+
+
+SCRIPTS = {
+    "scripts/generalization.py": lambda command: composed("train", command),
+    "scripts/real_recordings.py": lambda command: composed("predict", command, 3),
+    "tests/test_memory.py": lambda command: None,  # run by test_memory.py itself, with a folder and a number
+    "reproduce.py": lambda command: None,  # below
+}
+"""Scripts without a parser of their own."""
+
+
+def commands(page: Path) -> list[Command]:
+    fenced = [c for block in documented.blocks(page) if block.language == "bash" for c in documented.commands_of(block)]
+    return [*fenced, *documented.inline_commands(page)]
+
+
+FIRST: dict[tuple[str, ...], Path] = {}
+for _page in PAGES:
+    for _command in commands(_page):
+        FIRST.setdefault(_command.words, _page)
+
+
+def wanted(command: Command, page: Path) -> bool:
+    """Whether it is to be run here: no earlier page has it, or a command of this page goes on from its output."""
+    output = next((word.split("=")[1].rstrip("/") for word in command.words if word.startswith("output=")), None)
+    again = output and any(output in " ".join(c.words) for c in commands(page) if c.line > command.line)
+    return FIRST[command.words] == page or bool(again and output not in LAID_OUT)
+
+
+def lay_out(runner: Page, models: Path) -> None:
+    """Put the trained models there; the first page trains them."""
+    for output in LAID_OUT:
+        if not (models / output).exists():
+            kind = "camera" if output == "runs/camera" else "pose"
+            data = "h36m" if output == "runs/camera" else "cmu2"
+            words = ("python", "train.py", f"data={data}", f"model={kind}", f"output={output}")
+            runner.run(Command(PAGES[0], 0, words))
+            shutil.copytree(runner.folder / output, models / output)
+        elif not (runner.folder / output).exists():
+            shutil.copytree(models / output, runner.folder / output)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, typed, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(testing, "REPORTS", dict(testing.REPORTS))
+    runner = Page(tmp_path, typed, monkeypatch)
+    for block in documented.blocks(page):
+        assert block.language or not re.search(r"^python ", block.text, re.MULTILINE), f"{page}:{block.line}: bash?"
+        if block.language in ("python", "yaml"):
+            runner.execute(block)
+        elif block.language == "bash":
+            for command in documented.commands_of(block):
+                attempt(runner, command, page, models)
+    for command in documented.inline_commands(page):
+        attempt(runner, command, page, models)
+    assert Path.cwd() == tmp_path
+
+
+def attempt(runner: Page, command: Command, page: Path, models: Path) -> None:
+    if not wanted(command, page):
+        return
+    if command.script in MAINS:
+        lay_out(runner, models)
+        runner.run(command)
+    elif command.script in SCRIPTS:
+        SCRIPTS[command.script](command)
+    elif command.script and re.match(r"(scripts|benchmarks)/", command.script):
+        check_arguments(command, runner.monkeypatch)
+    else:
+        known = [how for begins, how in SHELL.items() if command.words[: len(begins)] == begins]
+        assert known, f"{command.where}: no test knows how to run this"
+        known[0](command)
+
+
+REPRODUCE = [command for page in PAGES for command in commands(page) if command.script == "reproduce.py"]
+
+
+@pytest.mark.parametrize("command", REPRODUCE, ids=lambda command: command.where)
+def test_the_settings_of_reproduce_exist(command):
+    if not (ROOT / "conf" / "reproduce.yaml").is_file():
+        pytest.skip("conf/reproduce.yaml does not exist yet")
+    words = [word for word in command.words[2:] if not word.startswith("-")]
+    assert len(check_overrides(ROOT / "conf", "reproduce", words)) == len(words)
