@@ -1,6 +1,6 @@
 """The sweep over the number of frames (fig:comparison-to-8-point), as a figure and a table."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -27,7 +27,7 @@ def frames_sweep(results: Sweep, heading: str) -> Figure:
     for name, by_frames in results.items():
         colour, style, marker = METHOD_STYLES.get(name, OTHER_STYLE)
         frames = sorted(by_frames)
-        mean, deviation, _ = np.array([_statistics(by_frames[m]) for m in frames]).T
+        mean, deviation, _ = np.array([statistics_of(by_frames[m]) for m in frames]).T
         low, high = (np.clip(np.nan_to_num(mean + s * deviation, nan=np.inf, posinf=np.inf), 0, CLIP) for s in (-1, 1))
         axes.fill_between(frames, low, high, color=colour, alpha=0.2 if name in _BANDS else 0.08, linewidth=0)
         axes.plot(
@@ -55,11 +55,33 @@ def sweep_table(results: Sweep) -> str:
 
 
 def _cell(values: Sequence[float]) -> str:
-    mean, deviation, median = (NONE if not np.isfinite(x) else f"{x:.1f}" for x in _statistics(values))
+    mean, deviation, median = (NONE if not np.isfinite(x) else f"{x:.1f}" for x in statistics_of(values))
     return NONE if not len(values) else f"{mean} ± {deviation} ({median})"
 
 
-def _statistics(values: Sequence[float]) -> tuple[float, float, float]:
+def pairs_table(results: Mapping[str, Sweep], methods: Sequence[str]) -> str:
+    """Medians of E_3D (mm) of some methods, by M and pair; a star where the first is not below all others."""
+    rows = []
+    for frames in sorted({m for sweep in results.values() for m in sweep[methods[0]]}):
+        cells = []
+        for sweep in results.values():
+            ours, *others = (statistics_of(sweep[method][frames])[2] for method in methods)
+            star = "" if all(ours < other for other in others) else " *"
+            cells.append(" / ".join(f"{x:.1f}" if np.isfinite(x) else NONE for x in (ours, *others)) + star)
+        rows.append([str(frames), *cells])
+    return markdown(["M", *results], rows)
+
+
+def wins(sweeps: Iterable[Sweep], ours: str, other: str, statistic: int) -> list[bool]:
+    """For each sweep and M, whether a statistic (its place in `statistics_of`) of one method is below another's."""
+    return [
+        statistics_of(sweep[ours][m])[statistic] < statistics_of(sweep[other][m])[statistic]
+        for sweep in sweeps
+        for m in sorted(sweep[ours])
+    ]
+
+
+def statistics_of(values: Sequence[float]) -> tuple[float, float, float]:
     """Mean, deviation (of a sample; NaN where there is none) and median."""
     array = np.array(values, dtype=np.float64)
     if not len(array):
