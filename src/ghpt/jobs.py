@@ -11,7 +11,6 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from hydra.core.utils import JobReturn, JobStatus
@@ -19,7 +18,7 @@ from omegaconf import open_dict, read_write
 
 import __main__
 from ghpt.config import suggest
-from ghpt.errors import GhptConfigError
+from ghpt.errors import GhptConfigError, GhptError
 
 LAUNCHER = "hydra/launcher"
 _LAUNCHERS = ("basic", "submitit_local", "submitit_slurm")
@@ -65,6 +64,7 @@ def awaited(ended: list[Job]) -> Iterator[None]:
     waited for, and stopped.
     """
     import submitit
+    from submitit.core.utils import FailedJobError
 
     submit = submitit.AutoExecutor.map_array
 
@@ -84,6 +84,10 @@ def awaited(ended: list[Job]) -> Iterator[None]:
     submitit.AutoExecutor.map_array = map_array
     try:
         yield
+    except (FailedJobError, ValueError) as error:  # sbatch refuses, or the executor
+        if isinstance(error, ValueError) and (isinstance(error, GhptError) or error.__cause__):
+            raise
+        raise GhptConfigError("hydra.launcher", str(error).rstrip("."), "--cfg hydra shows its settings.") from None
     finally:
         submitit.AutoExecutor.map_array = submit
 
@@ -162,8 +166,9 @@ def own_command(script: str) -> Iterator[None]:
         sys.argv[:], __main__.__spec__ = before[:2]
         for name in set(os.environ) - set(before[2]):
             del os.environ[name]
-        if torch.distributed.is_available() and torch.distributed.is_initialized():
-            torch.distributed.destroy_process_group()
+        distributed = sys.modules.get("torch.distributed")
+        if distributed and distributed.is_available() and distributed.is_initialized():
+            distributed.destroy_process_group()
 
 
 def first_of_several_ends() -> bool:
