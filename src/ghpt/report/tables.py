@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from ghpt.report.paper import (
 )
 
 NAMES = {
-    "h36m": "Human3.6M",
+    "h36m": "Human3.6M", "panoptic": "Panoptic",
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
     "weighted_linear": "weighted linear", "ransac": "RANSAC", "m_estimator": "M-estimator", "lo_ransac": "LO-RANSAC",
 }  # fmt: skip
@@ -162,17 +162,17 @@ def max_difference(values: Iterable[float]) -> float:
     return 100 * (max(values) / min(values) - 1)
 
 
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table, also aligned as plain text; the first column to the left, numbers to the right."""
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], text: Collection[int] = (0,)) -> str:
+    """A Markdown table, also aligned as plain text; the columns ``text`` to the left, numbers to the right."""
     table = [list(header), *(list(row) for row in rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = [
         " | ".join(
-            cell.ljust(w) if i == 0 else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+            cell.ljust(w) if i in text else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
         )
         for row in table
     ]
-    rule = "|".join(("-" * (w + 2)) if i == 0 else "-" * (w + 1) + ":" for i, w in enumerate(widths))
+    rule = "|".join(("-" * (w + 2)) if i in text else "-" * (w + 1) + ":" for i, w in enumerate(widths))
     return "\n".join([f"| {lines[0]} |", f"|{rule}|", *(f"| {line} |" for line in lines[1:])])
 
 

@@ -18,7 +18,7 @@ from ghpt.report.paper import (
 )
 from ghpt.report.tables import NAMES, NONE, markdown, max_difference
 from ghpt.reproduction.cells import Cell
-from ghpt.reproduction.item import Claim, Compared, Item, Results, Section, Spread, over_seeds
+from ghpt.reproduction.item import Claim, Compared, Item, Results, Section, Spread, over_seeds, signed
 from ghpt.reproduction.setup import Setup
 
 PANOPTIC = ARRANGEMENTS[:4]
@@ -50,8 +50,8 @@ def _generalization(results: Results) -> Section:
         compared += numbers
     header = ["test, mm \\ train", *(name.upper() for name in ARRANGEMENTS), "max. diff."]
     text = (
-        "A row is a test set, a column a training set, as the paper's text reads the table. The last column is (largest - "
-        "smallest) / smallest of a row. The average of the pool needs no training."
+        "A row is a test set, a column a training set, as the paper's text reads the table. The last column is "
+        "(largest - smallest) / smallest of a row. The average of the pool needs no training."
     )
     intra = max(_difference(results, test).mean for test in PANOPTIC)
     inter = _difference(results, "h36m").mean
@@ -62,8 +62,8 @@ def _generalization(results: Results) -> Section:
     ]  # fmt: skip
     explained = (
         "The pools differ: where the paper's plain average has 25.9 mm on Panoptic, the embedded one has 26.7 to 26.9, "
-        "nearly all of it a difference in the definition of the joints that no selection can remove; the learned numbers "
-        "lie below it by as much as the paper's do."
+        "nearly all of it a difference in the definition of the joints that no selection can remove; the learned "
+        "numbers lie below it by as much as the paper's do."
     )
     data = f"{results.words('cmu1').replace(' CMU1', ' CMU1 to CMU4')} and {results.words('h36m')}"
     return Section(data, f"{text}\n\n{markdown(header, rows)}", {}, compared, claims, explained)
@@ -106,7 +106,7 @@ def _remelli(results: Results) -> Section:
     rows = [
         [
             f"Remelli et al. ({name}; as published)",
-            f"{base:.1f} to {novel:.1f}, {_drop(base, novel):.1f} %",
+            _range(base, novel),
             NONE,
             NONE,
             NONE,
@@ -129,9 +129,9 @@ def _remelli(results: Results) -> Section:
     honest = over_seeds(lambda b, *n: _drop(b, statistics.fmean(n)), row[-1], *row[:-1])
     rows.append(_remelli_row("ours (to H36M)", REMELLI_INTER, row, inter, honest))
     text = (
-        "The paper's base and novel test of a training set are the smallest and the largest number of its column; we take "
-        "the same. The last column is the drop from the trained arrangement to the mean of the others, which can be "
-        "negative."
+        "The paper's base and novel test of a training set are the smallest and the largest number of its column; we "
+        "take the same. The last column is the drop from the trained arrangement to the mean of the others, which can "
+        "be negative."
     )
     header = ["trained on", "paper, mm", "ours, mm", "our drop", "base to mean of novel"]
     best = _drop(*REMELLI["TC1, baseline"])
@@ -145,8 +145,8 @@ def _remelli(results: Results) -> Section:
 
 
 _EXPLAINED_LEVEL = (
-    "The level is that of the embedded Panoptic (see tab:generalization-evaluation); the drops, which this table is about, "
-    "do not depend on it."
+    "The level is that of the embedded Panoptic (see tab:generalization-evaluation); the drops, which this table is "
+    "about, do not depend on it."
 )
 
 
@@ -154,8 +154,11 @@ def _remelli_row(
     name: str, published: tuple[float, float], row: Sequence[Spread], drop: Spread, honest: Spread
 ) -> list[str]:
     low, high = over_seeds(min, *row), over_seeds(max, *row)
-    paper = f"{published[0]:.1f} to {published[1]:.1f}, {_drop(*published):.1f} %"
-    return [name, paper, f"{low.text()} to {high.text()}", f"{drop.text()} %", f"{honest.text()} %"]
+    return [name, _range(*published), f"{low.text()} to {high.text()}", f"{drop.text()} %", f"{signed(honest.mean)} %"]
+
+
+def _range(base: float, novel: float) -> str:
+    return f"{base:.1f} to {novel:.1f}, {_drop(base, novel):.1f} %"
 
 
 def _drop(base: float, novel: float) -> float:
@@ -178,8 +181,8 @@ def _sota(results: Results) -> Section:
     )
     rows.append(["average of our pools", NONE, average.text(), NONE])
     text = (
-        "The published rows are other systems' on real images. Below ours, classical estimators on the same detections: "
-        "the mean of CMU1 to CMU4."
+        "The published rows are other systems' on real images. Below ours, classical estimators on the same "
+        "detections: the mean of CMU1 to CMU4."
     )
     ransac = same["ransac"].mean
     claims = [
@@ -205,7 +208,7 @@ ITEMS = (
     Item("generalization-evaluation", "table", "Generalisation between camera arrangements", grid, _generalization),
     Item("iskakov-comparison", "table", "From Panoptic to Human3.6M, beside Iskakov et al.",
          lambda setup: grid(setup, ("cmu3",), ("h36m",)), _iskakov),
-    Item("remelli-comparison", "table", "Drop between base and novel arrangement, beside Remelli et al.", grid, _remelli),
+    Item("remelli-comparison", "table", "Drop from base to novel arrangement, beside Remelli et al.", grid, _remelli),
     Item("sota-comparison", "table", "Panoptic, novel arrangements, beside other systems",
          lambda setup: grid(setup, PANOPTIC, PANOPTIC), _sota),
 )  # fmt: skip

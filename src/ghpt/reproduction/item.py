@@ -40,6 +40,11 @@ class Spread:
         return f"{self.mean:.{digits}f}{deviation}"
 
 
+def signed(value: float) -> str:
+    """``+1.2``, ``-0.4``, and ``+0.0`` for what rounds to nothing."""
+    return f"{round(value, 1) + 0.0:+.1f}"
+
+
 def over_seeds(function: Callable[..., float], *spreads: Spread) -> Spread:
     """A function of several numbers, seed by seed."""
     return Spread(tuple(function(*values) for values in zip(*(spread.values for spread in spreads), strict=True)))
@@ -69,7 +74,7 @@ class Compared:
 
     def cells(self) -> list[str]:
         """*paper | ours | difference* as text; a miss is marked."""
-        difference = NONE if self.difference is None else f"{100 * self.difference:+.1f} %{' (miss)' * self.miss}"
+        difference = NONE if self.difference is None else f"{signed(100 * self.difference)} %{' (miss)' * self.miss}"
         paper = NONE if self.paper is None else f"{self.paper:.{self.digits}f}"
         return [paper, NONE if self.ours is None else self.ours.text(self.digits), difference]
 
@@ -90,6 +95,9 @@ class Claim:
     by: str
     """By how much, with the paper's own numbers where it has them."""
 
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "holds", bool(self.holds))  # numpy's own is no plain data
+
 
 @dataclass(frozen=True)
 class Section:
@@ -104,7 +112,7 @@ class Section:
     """Every number that the paper prints, for the summary and the list of misses."""
     claims: Sequence[Claim] = ()
     explained: str = ""
-    """What explains the misses; shown where there are any."""
+    """What explains the misses of embedded data; shown where there are any."""
 
 
 class Results:

@@ -49,7 +49,7 @@ def _qualitative(results: Results) -> Section:
         order == sorted(order),
         ", ".join(f"{name} {error:.1f}" for name, error in zip(SHOWN, order, strict=True)) + " mm on the mean",
     )
-    text = "Two frames, chosen by a rule: the median and the 90 % quantile of the errors under *weight*, mm beside the name."
+    text = "Two frames, chosen by a rule: the median and the 90 % quantile of the errors (mm) under *weight*."
     pictures = "\n\n".join(f"![{kind} frame]({name}.svg)" for kind, name in zip(QUANTILES, figures, strict=True))
     return Section(results.words("h36m"), f"{text}\n\n{pictures}", figures, (), [claim])
 
@@ -86,8 +86,8 @@ def _pose_prior(results: Results) -> Section:
         Claim("best is comparable to weight", "4.3", 0.5 < ratio < 2, f"weight / best = {ratio:.2f} on the mean"),
     ]  # fmt: skip
     text = (
-        f"Variance over the frames of {SUBJECT} of the ratio of left to right length, six pairs of parts, eight hypotheses. "
-        "The paper prints no numbers here, so there is nothing to set beside them but its sentences."
+        f"Variance over the frames of {SUBJECT} of the ratio of left to right length, six pairs of parts, eight "
+        "hypotheses. The paper prints no numbers here, so there is nothing to set beside them but its sentences."
     )
     table = markdown(*prior_table(metrics[0], SUBJECT))
     body = f"{text}\n\n![pose prior](pose-prior.svg)\n\n1000 S², seed {results.setup.seed}:\n\n{table}"

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.global_hydra import GlobalHydra
 
 from ghpt.config import build, plain
 from ghpt.reproduction.cells import Cell
@@ -21,7 +23,9 @@ OVERHEAD = 3.0
 @functools.cache
 def compose(conf: Path, name: str, overrides: tuple[str, ...]) -> dict[str, Any]:
     """``<conf>/<name>.yaml`` under ``overrides``, as plain data. Do not change it."""
-    with hydra.initialize_config_dir(str(conf.resolve()), version_base="1.3"):
+    with contextlib.ExitStack() as stack:
+        if not GlobalHydra.instance().is_initialized():  # as it is under a command, whose folder is ``conf`` too
+            stack.enter_context(hydra.initialize_config_dir(str(conf.resolve()), version_base="1.3"))
         return plain(hydra.compose(name, [*overrides, "output=unused", "progress_bar=false"]))
 
 
@@ -32,8 +36,8 @@ class Setup:
     conf: Path
     roots: Mapping[str, str | None]
     """``human36m`` and ``panoptic``: folder of the real data set, None for the embedded one."""
-    overrides: tuple[str, ...]
-    """Of every training, in the words of train.py's command line."""
+    overrides: Mapping[str, Sequence[str]]
+    """``train``: of every training, in the words of train.py's command line; ``test``: of every test."""
     sizes: Mapping[str, Any]
     """``conf/reproduce.yaml``'s ``sizes``."""
     seed: int
@@ -65,27 +69,34 @@ class Setup:
 
     def trained(self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 18.0) -> Cell:
         """A model trained on a data set; ``overrides`` are those of train.py, ``name`` tells them apart."""
-        words = (f"model={model}", *self.overrides, *overrides)
+        words = (f"model={model}", *self.overrides["train"], *overrides)
         config = {k: v for k, v in self.composed("train", data, *words).items() if k not in ("save_every", "resume")}
         needs = {split: self.prepared(data, split) for split in ("train", "validation")}
-        command = " ".join(["python train.py", *self.words(data), *words])
         name = "-".join(filter(None, ["train", model, data, name, f"seed{self.seed}"]))
+        command = " ".join(["python train.py", *self.words(data), *words, _output(name)])
         return Cell(name, "ghpt.reproduction.work.train_model", config, needs, command, seconds)
 
     def tested(
         self, model: Cell, data: str, *overrides: str, name: str = "", baselines: bool = True, seconds: float = 7.0
     ) -> Cell:
         """The model of a `trained` cell on a data set; ``baselines`` False leaves the classical estimators out."""
+        overrides = (*self.overrides["test"], *overrides)
         config = self.composed("test", data, *overrides)
         unused = "baselines" if model.config["model"]["problem"].get("frames") else "camera_baselines"
         config = {key: value for key, value in config.items() if key not in (unused, "ckpt")}
         if not baselines:
             config |= {key: {} for key in ("baselines", "camera_baselines") if key in config}
         needs = {"model": model, "data": self.prepared(data, config["data"]["evaluate"])}
-        command = " ".join(["python test.py ckpt=...", *self.words(data), *overrides])
         trained = model.name.removeprefix("train-").removesuffix(f"-seed{self.seed}")
         name = "-".join(filter(None, ["test", trained, "on", data, name, f"seed{self.seed}"]))
+        checkpoint = f"ckpt={_output(model.name).removeprefix('output=')}/last.ckpt"
+        command = " ".join(["python test.py", checkpoint, *self.words(data), *overrides, _output(name)])
         return Cell(name, "ghpt.reproduction.work.test_model", config, needs, command, seconds)
+
+
+def _output(name: str) -> str:
+    """Where a command that one types puts the run."""
+    return f"output=runs/{name}"
 
 
 def _of_source(data: Mapping[str, Any]) -> dict[str, Any]:
