@@ -1,0 +1,42 @@
+"""The cells of the ablations: a model with a setting changed, and its errors on validation and test subjects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ghpt.reproduction.cells import Cell
+from ghpt.reproduction.item import Results, Spread
+from ghpt.reproduction.setup import Setup
+
+BASE = "h36m"
+"""The data set that all are tested on."""
+SETS = {"validation": "S8 (validation)", "test": "test"}
+"""Split -> in tables."""
+DEFAULT = "default"
+_SELDOM = 4096
+"""Every so many frames are validated in training, for these models are tested here."""
+
+
+def trained(setup: Setup, data: str, *overrides: str, name: str, seconds: float = 16.0) -> Cell:
+    """A model with other settings than the default."""
+    return setup.trained(data, *overrides, f"data.stride={_SELDOM}", name=name, seconds=seconds)
+
+
+def evaluated(
+    setup: Setup, model: Cell, settings: Sequence[tuple[float | None, ...]] = ((None, None),), seconds: float = 6.0
+) -> Cell:
+    """A model on Human3.6M's validation and test subjects, with other (hypotheses, temperature) where not None."""
+    strides, sets = setup.sizes["ablation"]["stride"], {}
+    for split in SETS:
+        whole = setup.composed("test", BASE, f"data.evaluate={split}", f"data.stride={strides[split]}")
+        sets[split] = whole["data"]
+    config = {"sets": sets, "settings": [list(pair) for pair in settings], "seed": setup.seed}
+    config |= {"files": whole["files"]} if "files" in whole else {}
+    needs = {"model": model} | {split: setup.prepared(BASE, split) for split in SETS}
+    name = model.name.replace("train-pose", "ablation")
+    return Cell(name, "ghpt.reproduction.ablation_work.evaluate", config, needs, seconds=seconds)
+
+
+def number(results: Results, cell: str, split: str, selection: str = "weight", setting: int = 0) -> Spread:
+    """Pelvis-relative MPJPE of an `evaluated` cell, mm."""
+    return Spread(tuple(float(each[split][setting][selection]) for each in results.read(cell)))

@@ -1,0 +1,183 @@
+"""Ablations over a quantity: temperature, hypotheses, training samples; a table and a figure each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ghpt.report.tables import NONE, markdown
+from ghpt.reproduction.ablation_cells import BASE, DEFAULT, SETS, evaluated, number, trained
+from ghpt.reproduction.cells import Cell
+from ghpt.reproduction.item import Claim, Results, Section, Spread
+from ghpt.reproduction.robustness_figure import LABELS, Panel, curves
+from ghpt.reproduction.setup import Setup
+
+Row = tuple[str, str, int]
+"""Cell, selection, number of the setting."""
+Lines = Mapping[str, Mapping[float, Row]]
+"""Style -> place -> what stands there."""
+
+
+def default(setup: Setup, *keys: str) -> Any:
+    """Of the configuration of training."""
+    value: Any = setup.trained(BASE).config
+    for key in keys:
+        value = value[key]
+    return value
+
+
+def levels(setup: Setup, name: str, *keys: str) -> list[float]:
+    """Of ``sizes.ablation``, and the default, which ``keys`` lead to."""
+    return sorted({*setup.sizes["ablation"][name], default(setup, *keys)})
+
+
+def temperature_cells(setup: Setup) -> dict[str, Cell]:
+    values = levels(setup, "temperature", "model", "temperature")
+    cells = {DEFAULT: evaluated(setup, setup.trained(BASE), [(None, value) for value in values])}
+    for value in values:
+        if value != default(setup, "model", "temperature"):
+            model = trained(setup, BASE, f"model.temperature={value}", name=f"temperature{value:g}")
+            cells[f"{value:g}"] = evaluated(setup, model)
+    return cells
+
+
+def temperature(results: Results) -> Section:
+    setup = results.setup
+    values, usual = (f(setup, *x, "model", "temperature") for f, x in ((levels, ("temperature",)), (default, ())))
+    lines: Lines = {
+        "weight": {v: (DEFAULT, "weight", i) if v == usual else (f"{v:g}", "weight", 0) for i, v in enumerate(values)},
+        "tested": {v: (DEFAULT, "weight", i) for i, v in enumerate(values)},
+        "average": {v: (DEFAULT, "average", i) for i, v in enumerate(values)},
+    }
+    labels = {
+        "weight": "trained and tested with it", "tested": f"trained with {usual:g}, tested with it",
+        "average": LABELS["average"],
+    }  # fmt: skip
+    text = (
+        "The temperature divides the logits before the softmax. Low, the weights gather on the best-scored hypotheses; "
+        "high, they become the average."
+    )
+    return _section(results, "temperature", "temperature", lines, labels, text, usual)
+
+
+def hypotheses_cells(setup: Setup) -> dict[str, Cell]:
+    values, usual = levels(setup, "hypotheses", "model", "hypotheses"), default(setup, "model", "hypotheses")
+    cells = {DEFAULT: evaluated(setup, setup.trained(BASE), [(value, None) for value in values], 20)}
+    for value in setup.sizes["ablation"]["hypotheses_trained"]:
+        if value != usual:
+            seconds = 4 + 16 * value / usual
+            model = trained(setup, BASE, f"model.hypotheses={value}", name=f"hypotheses{value}", seconds=seconds)
+            cells[f"{value}"] = evaluated(setup, model, [(usual, None)])
+    return cells
+
+
+def hypotheses(results: Results) -> Section:
+    setup = results.setup
+    values, usual = (f(setup, *x, "model", "hypotheses") for f, x in ((levels, ("hypotheses",)), (default, ())))
+    lines: dict[str, Mapping[float, Row]] = {
+        name: {v: (DEFAULT, name, i) for i, v in enumerate(values)} for name in ("weight", "average", "best")
+    }
+    taught = sorted({*setup.sizes["ablation"]["hypotheses_trained"], usual})
+    lines["trained"] = {
+        v: (DEFAULT, "weight", values.index(usual)) if v == usual else (f"{v}", "weight", 0) for v in taught
+    }
+    labels = LABELS | {
+        "weight": f"learned, trained with {usual}, tested with it",
+        "trained": f"learned, trained with it, tested with {usual}",
+    }  # fmt: skip
+    text = (
+        "Hypotheses in a pool. A smaller pool is the beginning of a larger one. The best hypothesis looks at the truth."
+    )
+    return _section(results, "hypotheses", "hypotheses", lines, labels, text, usual)
+
+
+def samples_cells(setup: Setup) -> dict[str, Cell]:
+    usual = default(setup, "data", "train_samples")
+    cells = {DEFAULT: evaluated(setup, setup.trained(BASE)), "model": setup.trained(BASE)}
+    for value in levels(setup, "samples", "data", "train_samples"):
+        if value != usual:
+            seconds = 4 + 16 * value / usual
+            model = trained(setup, BASE, f"data.train_samples={value}", name=f"samples{value}", seconds=seconds)
+            cells[f"{value}"] = evaluated(setup, model)
+    return cells
+
+
+def samples(results: Results) -> Section:
+    setup = results.setup
+    values, usual = (f(setup, *x, "data", "train_samples") for f, x in ((levels, ("samples",)), (default, ())))
+    name = {v: DEFAULT if v == usual else f"{v}" for v in values}
+    lines: Lines = {
+        "weight": {v: (name[v], "weight", 0) for v in values},
+        "average": {v: (name[v], "average", 0) for v in values},
+    }
+    text = (
+        "Training samples, each seen once, in batches of 16: a model trained on 50 has had four steps. More samples "
+        "mean more steps too, as in appendix C, where an iteration is a sample."
+    )
+    claims = [_enough(results, name, usual), _minutes(results)]
+    return _section(results, "samples", "training samples", lines, LABELS, text, usual, claims)
+
+
+def _enough(results: Results, cells: Mapping[float, str], usual: float) -> Claim:
+    """Appendix C on the number of samples."""
+    errors = {n: number(results, cell, "test").mean for n, cell in cells.items()}
+    best = min(errors, key=lambda n: errors[n])
+    by = (
+        f"{errors[usual]:.1f} mm of {usual:g}; the best of {', '.join(f'{n:g}' for n in cells)} is {best:g} with "
+        f"{errors[best]:.1f} mm ({100 * (errors[best] / errors[usual] - 1):+.1f} %)"
+    )
+    return Claim("best results with only 500 samples (held if within 1 % of the best)", "C",
+                 errors[usual] <= 1.01 * errors[best], by)  # fmt: skip
+
+
+def _minutes(results: Results) -> Claim:
+    seconds = Spread(tuple(about["seconds"] for about in results.read("model", "cell.json")))
+    return Claim("about 3 minutes to train", "C", seconds.mean <= 180,
+                 f"{seconds.mean:.0f} s on a processor, beside other work")  # fmt: skip
+
+
+def _section(
+    results: Results, name: str, head: str, lines: Lines, labels: Mapping[str, str], text: str, usual: float,
+    claims: Sequence[Claim] = (),
+) -> Section:  # fmt: skip
+    """A table with a row for each place, and a panel for each set."""
+    numbers = {
+        split: {style: {x: number(results, cell, split, selection, i) for x, (cell, selection, i) in row.items()}
+                for style, row in lines.items()}
+        for split in SETS
+    }  # fmt: skip
+    panels = [
+        Panel(f"{head}; {SETS[split]}", {style: (list(row), list(row.values())) for style, row in rows.items()},
+              logarithmic=True, mark=usual)
+        for split, rows in numbers.items()
+    ]  # fmt: skip
+    data = results.words(BASE)
+    figure = curves(panels, f"{data}, trained on its training subjects", "pelvis-relative MPJPE, mm", labels, False)
+    rows = []
+    for place in sorted({x for row in lines.values() for x in row}):
+        cells = [_text(numbers[split][style].get(place)) for split in SETS for style in lines]
+        rows.append([f"{place:g}{' (default)' * (place == usual)}", *cells])
+    columns = [f"{SETS[split]}: {labels.get(style, style)}" for split in SETS for style in lines]
+    body = [
+        f"{text} Trained and tested on Human3.6M.",
+        f"![Pelvis-relative MPJPE against {head}, {data}](ablation_{name}.svg)",
+        f"Pelvis-relative MPJPE, mm:\n\n{markdown([head, *columns], rows)}",
+        _chosen(numbers["validation"]["weight"], numbers["test"]["weight"], usual),
+    ]
+    return Section(data, "\n\n".join(body), {f"ablation_{name}": figure}, claims=claims)
+
+
+def _chosen(validation: Mapping[float, Spread], test: Mapping[float, Spread], usual: float) -> str:
+    """What the validation subject would choose, and what that is worth on the test."""
+    best = min(validation, key=lambda x: validation[x].mean)
+    if best == usual:
+        return f"Validation chooses the default, {usual:g}."
+    gain, worth = (100 * (errors[best].mean / errors[usual].mean - 1) for errors in (validation, test))
+    return (
+        f"Validation would choose {best:g} ({validation[best].mean:.2f} mm against {validation[usual].mean:.2f} of the "
+        f"default, {gain:+.1f} %); on the test subjects that is {worth:+.1f} %."
+    )
+
+
+def _text(spread: Spread | None) -> str:
+    return NONE if spread is None else spread.text()

@@ -1,0 +1,88 @@
+"""Ablations: one setting of the pose model changed at a time; validation chooses, the test says what it is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
+from ghpt.report.tables import NAMES, markdown
+from ghpt.reproduction import ablation_sweeps as sweeps
+from ghpt.reproduction.ablation_cells import BASE, SETS, evaluated, number, trained
+from ghpt.reproduction.cells import Cell
+from ghpt.reproduction.item import Item, Results, Section, Spread
+from ghpt.reproduction.setup import Setup
+
+NOVEL = "cmu3"
+"""The other training set."""
+COLUMNS = ((BASE, "validation"), (BASE, "test"), (NOVEL, "test"))
+
+Variants = Mapping[str, str]
+"""Name -> experiment of conf/experiment; none for the default."""
+GUMBEL: Variants = {"with Gumbel noise (default)": "", "without": "no_gumbel"}
+FEATURES: Variants = {
+    "coordinates and lengths (default)": "", "coordinates only": "coordinates_only", "lengths only": "lengths_only",
+}  # fmt: skip
+SELECTION: Variants = {"weighted average (default)": "", "one drawn, straight through": "selection_stochastic"}
+
+
+def _cells(setup: Setup, variants: Variants) -> dict[str, Cell]:
+    def model(data: str, experiment: str) -> Cell:
+        if not experiment:
+            return setup.trained(data)
+        return trained(setup, data, f"experiment={experiment}", name=experiment)
+
+    return {
+        f"{data}: {name}": evaluated(setup, model(data, experiment))
+        for data in (BASE, NOVEL)
+        for name, experiment in variants.items()
+    }
+
+
+def _section(results: Results, variants: Variants, about: str) -> Section:
+    numbers = {name: [number(results, f"{data}: {name}", split) for data, split in COLUMNS] for name in variants}
+    usual = next(iter(variants))
+    average = [number(results, f"{data}: {usual}", split, "average") for data, split in COLUMNS]
+    rows = [[name, *(s.text() for s in spreads)] for name, spreads in numbers.items()]
+    rows.append(["average of the same pool", *(s.text() for s in average)])
+    head = [
+        "MPJPE, mm",
+        *(SETS[split] if data == BASE else f"test, trained on {NAMES[data]}" for data, split in COLUMNS),
+    ]
+    table = (
+        "Pelvis-relative MPJPE of the weighted selection on Human3.6M, trained on Human3.6M but for the last column."
+    )
+    body = [f"{about} {table}", markdown(head, rows), _chosen(numbers)]
+    return Section(results.words(BASE), "\n\n".join(body))
+
+
+def _chosen(numbers: Mapping[str, Sequence[Spread]]) -> str:
+    """What the validation subject would choose, and what each other setting changes."""
+    usual = next(iter(numbers))
+    best = min(numbers, key=lambda name: numbers[name][0].mean)
+    parts = [f"Validation chooses: {best}."]
+    for name, spreads in numbers.items():
+        if name != usual:
+            changes = (100 * (a.mean / b.mean - 1) for a, b in zip(spreads, numbers[usual], strict=True))
+            parts.append(f"Against the default, {name}: {', '.join(f'{change:+.1f} %' for change in changes)}.")
+    return " ".join(parts)
+
+
+def _training(label: str, title: str, variants: Variants, about: str) -> Item:
+    return Item(label, "ablation", title, partial(_cells, variants=variants),
+                partial(_section, variants=variants, about=about))  # fmt: skip
+
+
+ITEMS = (
+    _training("ablation-gumbel", "Gumbel noise in training", GUMBEL,
+              "With the noise the weights of training are drawn from the Gumbel-softmax, without it they are the plain "
+              "softmax of the test."),
+    _training("ablation-features", "What the scorer sees", FEATURES,
+              "The scorer sees the normalised coordinates of the 17 joints and the 16 body part lengths."),
+    _training("ablation-selection", "The hypothesis of the estimation loss", SELECTION,
+              "The estimation loss is that of the weighted average, or of one hypothesis drawn from the weights (its "
+              "gradient is that of the weights)."),
+    Item("ablation-temperature", "ablation", "Temperature of the softmax",
+         sweeps.temperature_cells, sweeps.temperature),
+    Item("ablation-hypotheses", "ablation", "Number of hypotheses", sweeps.hypotheses_cells, sweeps.hypotheses),
+    Item("ablation-samples", "ablation", "Number of training samples", sweeps.samples_cells, sweeps.samples),
+)  # fmt: skip
