@@ -26,6 +26,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     return re.sub(r"^::: ([\w.]+)\.\*$", lambda match: "\n\n".join(_entries(match[1])), markdown, flags=re.MULTILINE)
 
 
+def on_page_content(html: str, **_: Any) -> str:
+    """A docstring's ``::`` before an example is a colon."""
+    return html.replace("::</p>", ":</p>")
+
+
 def _entries(package: str) -> Iterator[str]:
     """One ``:::`` for the package, where it says something, and each public module in it."""
     folder = ROOT / "src" / package.replace(".", "/")

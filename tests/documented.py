@@ -64,15 +64,9 @@ def blocks(page: Path) -> list[Block]:
 
 
 def commands_of(block: Block) -> Iterator[Command]:
-    """The commands of a bash block; ``a && b`` are two."""
+    """The commands of a bash block, a line each or more."""
     for number, line in enumerate(block.text.splitlines()):
-        words: list[str] = []
-        for word in [*shlex.split(line, comments=True), "&&"]:
-            if word != "&&":
-                words.append(word)
-            elif words:
-                yield Command(block.page, block.line + number, tuple(words))
-                words = []
+        yield from _split(block.page, block.line + number, line)
 
 
 def inline_commands(page: Path) -> Iterator[Command]:
@@ -80,7 +74,18 @@ def inline_commands(page: Path) -> Iterator[Command]:
     text = page.read_text(encoding="utf-8")
     prose = re.sub(r"^```.*?^```$", lambda m: "\n" * m[0].count("\n"), text, flags=re.MULTILINE | re.DOTALL)
     for match in re.finditer(r"`((?:python|pip|tensorboard|mkdocs|pytest)\s[^`]+)`", prose):
-        yield Command(page, prose[: match.start()].count("\n") + 1, tuple(shlex.split(match[1])))
+        yield from _split(page, prose[: match.start()].count("\n") + 1, match[1])
+
+
+def _split(page: Path, line: int, text: str) -> Iterator[Command]:
+    """``a && b`` are two."""
+    words: list[str] = []
+    for word in [*shlex.split(text, comments=True), "&&"]:
+        if word != "&&":
+            words.append(word)
+        elif words:
+            yield Command(page, line, tuple(words))
+            words = []
 
 
 def workplace(folder: Path) -> Path:

@@ -278,7 +278,7 @@ for _page in PAGES:
 def wanted(command: Command, page: Path) -> bool:
     """Whether it is to be run here: no earlier page has it, or a command of this page goes on from its output."""
     output = next((word.split("=")[1].rstrip("/") for word in command.words if word.startswith("output=")), None)
-    again = output and any(output in " ".join(c.words) for c in commands(page) if c.line > command.line)
+    again = output and any(f"={output}/" in " ".join(c.words) for c in commands(page) if c.line > command.line)
     return FIRST[command.words] == page or bool(again and output not in LAID_OUT)
 
 
