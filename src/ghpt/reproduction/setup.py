@@ -65,7 +65,7 @@ class Setup:
         """The recordings of a split in the cache."""
         config = {"data": _of_source(self.composed("test", data)["data"]), "split": split}
         files = {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
-        return Cell(f"prepare-{data}-{split}", "ghpt.reproduction.work.prepare_split", config | files, seconds=8)
+        return Cell(f"prepare-{data}-{split}", "ghpt.reproduction.work.prepare_split", config | files, seconds=8.0)
 
     def trained(self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 18.0) -> Cell:
         """A model trained on a data set; ``overrides`` are those of train.py, ``name`` tells them apart."""
