@@ -1,0 +1,149 @@
+"""Training and testing on two processes, as typed: the numbers of one, everything written and said once."""
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+import ghpt.test as testing
+import toys
+from ghpt.config import plain
+from ghpt.train import train
+
+ROOT = Path(__file__).resolve().parents[1]
+SMALL = ("data=toy", "progress_bar=false", "trainer.accelerator=cpu")
+MODELS = {
+    "pose": ("model=pose", "model.hypotheses=5", "model.scorer.layers=[8]"),
+    "camera": (
+        "model=camera", "model.hypotheses=5", "model.scorer.layers=[8]", "trainer.max_epochs=2",
+        "model.problem.frames=6", "model.problem.draws=3", "model.problem.sample=30", "model.problem.points=20",
+    ),
+}  # fmt: skip
+TWO = ("trainer.devices=2", "trainer.strategy=ddp")
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    """The project's commands and configuration, with a toy data set of 77 training samples."""
+    folder = tmp_path_factory.mktemp("project")
+    shutil.copytree(ROOT / "conf", folder / "conf")
+    (folder / "conf" / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA | {"train_samples": 77}))
+    for name in ("train.py", "test.py"):
+        shutil.copy(ROOT / name, folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def typed_for_two(project):
+    """``typed_for_two("train", *words)`` starts train.py on two processes."""
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "tests"), "OMP_NUM_THREADS": "1"}
+    environment.pop("HYDRA_FULL_ERROR", None)
+    return lambda name, *words: subprocess.Popen(
+        [sys.executable, str(project / f"{name}.py"), *SMALL, *TWO, *words],
+        env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def composed(project):
+    def compose(name, *words):
+        with hydra.initialize_config_dir(str(project / "conf"), version_base="1.3"):
+            return plain(hydra.compose(name, overrides=[*SMALL, "output=none", *words]))
+
+    return compose
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def trained(request, composed, typed_for_two, tmp_path_factory):
+    """(folder of one process, folder of two, stdout and stderr of two)."""
+    one, two = (tmp_path_factory.mktemp(f"{request.param}{n}") for n in (1, 2))
+    child = typed_for_two("train", *MODELS[request.param], f"output={two}")
+    train(composed("train", *MODELS[request.param]), one)
+    out, errors = child.communicate(timeout=100)
+    assert child.returncode == 0, errors
+    return one, two, out, errors
+
+
+def scalars(folder):
+    (file,) = folder.glob("*tfevents*")
+    log = EventAccumulator(str(file)).Reload()
+    return {tag: [event.value for event in log.Scalars(tag)] for tag in log.Tags()["scalars"]}
+
+
+def written(folder):
+    return sorted(re.sub(r"tfevents.*", "tfevents", path.name) for path in folder.iterdir() if path.is_file())
+
+
+def test_training_on_two_processes(trained):
+    folder, other, out, errors = trained
+    one, two = scalars(folder), scalars(other)
+    assert one.keys() == two.keys() >= {"train/total", "validation/weight", "final/weight"}
+    assert len(one["train/total"]) in (5, 10)
+    for tag, values in one.items():
+        assert values == pytest.approx(two[tag], rel=1e-5), tag
+    process, *ours = sorted(written(other), key=lambda name: "process" not in name)
+    assert sorted(ours) == sorted([*written(folder), "train.log"])
+    assert (other / process).read_text() == ""
+    assert out == ""
+    assert [line.split()[0] for line in errors.splitlines()] == ["Validation", "weight", "Checkpoint:", "Test"]
+
+
+def test_testing_on_two_processes(composed, typed_for_two, tmp_path, capsys):
+    checkpoint = tmp_path / "train" / "best.ckpt"
+    train(composed("train", *MODELS["pose"]), checkpoint.parent)
+    one, two = tmp_path / "one", tmp_path / "two"
+    child = typed_for_two("test", f"ckpt={checkpoint}", f"output={two}")
+    testing.test(composed("test", f"ckpt={checkpoint}"), one)
+    out, errors = child.communicate(timeout=100)
+    assert child.returncode == 0, errors
+    assert out == capsys.readouterr().out
+    assert [line.split()[0] for line in errors.splitlines()] == ["Report:", "Figures:"]
+    assert written(two) == sorted([*written(one), "test.log", "train_ddp_process_1.log"])
+    with np.load(one / "predictions.npz") as first, np.load(two / "predictions.npz") as second:
+        assert first.files == second.files
+        for name in set(first.files) - {"meta"}:
+            exact = name.startswith("points_") and name.removeprefix("points_") in composed("test")["baselines"]
+            if exact or first[name].dtype.kind != "f":
+                np.testing.assert_array_equal(first[name], second[name], err_msg=name)
+            else:
+                np.testing.assert_allclose(first[name], second[name], rtol=1e-5, atol=1e-3, err_msg=name)
+    first, second = (json.loads((folder / "metrics.json").read_text())["selections"] for folder in (one, two))
+    for name, numbers in first.items():
+        assert numbers["mpjpe_relative"] == pytest.approx(second[name]["mpjpe_relative"], rel=1e-6), name
+
+
+def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
+    child = typed_for_two("train", "data.missing=1.0", f"output={tmp_path}")
+    out, errors = child.communicate(timeout=60)
+    assert (child.returncode, out) == (1, "")
+    assert errors.startswith("error: embedded: toy train: no frame has a true pelvis")
+    assert errors.count("\n") == 1
+
+
+def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
+    child = typed_for_two("train", *MODELS["pose"], "trainer.max_epochs=5000", "save_every=2", f"output={tmp_path}")
+    end = time.monotonic() + 60
+    while not (tmp_path / "last.ckpt").exists():
+        assert time.monotonic() < end, "training did not begin"
+        time.sleep(0.05)
+    others = subprocess.run(["ps", "-o", "pid=", "--ppid", str(child.pid)], capture_output=True, text=True).stdout
+    child.send_signal(signal.SIGINT)
+    _, errors = child.communicate(timeout=30)
+    assert child.returncode == 130
+    assert re.match(r"Stopped\. .*last\.ckpt holds training step \d+\.\nGo on with the same command and", errors)
+    assert errors.count("\n") == 2
+    assert others.split()
+    for pid in others.split():
+        status = Path(f"/proc/{pid}/status")
+        assert not status.exists() or "State:\tZ" in status.read_text()
