@@ -22,7 +22,7 @@ from ghpt.reproduction.item import Item, Results
 from ghpt.reproduction.page import Entry, Page, write_page
 from ghpt.reproduction.pool import perform_all
 from ghpt.reproduction.setup import Setup
-from ghpt.train import shell_status, shown
+from ghpt.train import shown
 
 ITEMS: dict[str, Item] = {
     item.label: item
@@ -116,8 +116,12 @@ def _reproduce(config: dict[str, Any], seeds: Sequence[int], output: Path, conf:
     cells = {item.label: [item.cells(setup) for setup in setups] for item in items}
     wanted = [cell for of_item in cells.values() for of_seed in of_item for cell in of_seed.values()]
     folder = Path(config["cells"])
-    with shell_status():
-        done = perform_all(wanted, folder, config["jobs"] or min(processors(), MOST_JOBS), config["progress_bar"])
+    jobs = config["jobs"] or min(processors(), MOST_JOBS)
+    try:
+        done = perform_all(wanted, folder, jobs, config["progress_bar"])
+    except (KeyboardInterrupt, SystemExit):
+        _log.warning("Stopped. What was finished is in %s; the same command goes on.", shown(folder))
+        raise
     entries = [
         Entry(item, item.section(Results(setups, cells[item.label], folder)), _commands(cells[item.label][0]))
         for item in items

@@ -36,7 +36,11 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
     sweep_temporaries(cells)
     missing = {key: cell for key, cell in with_needs(wanted).items() if not cell.done(cells)}
     number = len(missing)
-    with _progress(list(missing.values()), show) as finished, _executor(min(jobs, len(missing))) as submit:
+    with (
+        _terminable(),
+        _progress(list(missing.values()), show) as finished,
+        _executor(min(jobs, len(missing))) as submit,
+    ):
         waiting, running = dict(missing), {}
         while waiting or running:
             ready = [c for c in waiting.values() if not any(b.key in missing for b in c.needs.values())]
@@ -70,6 +74,21 @@ def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[float]]]:
         raise
     finally:
         executor.shutdown()
+
+
+@contextlib.contextmanager
+def _terminable() -> Iterator[None]:
+    """SIGTERM ends the block as an interrupt does, with status 143."""
+
+    def stop(*_: object) -> None:
+        raise SystemExit(143)
+
+    previous = signal.signal(signal.SIGTERM, stop) if threading.current_thread() is threading.main_thread() else None
+    try:
+        yield
+    finally:
+        if previous is not None:
+            signal.signal(signal.SIGTERM, previous)
 
 
 def _here(cell: Cell, cells: Path) -> Future[float]:

@@ -1,0 +1,138 @@
+"""Cells are computed once, in the order of their needs, on several processes, and kept whatever happens."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ghpt.errors import GhptDataError
+from ghpt.reproduction.cells import read_json, with_needs
+from ghpt.reproduction.code import code_digest, meaning
+from ghpt.reproduction.pool import perform_all
+from toy_cells import cell
+
+
+@pytest.fixture
+def diary(tmp_path):
+    (tmp_path / "diary").touch()
+    return tmp_path / "diary"
+
+
+def numbers(diary):
+    return [float(line.split()[0]) for line in diary.read_text().splitlines()]
+
+
+def diamond(diary, first=1, last=4):
+    """Two cells that need the same one, and a last that needs both."""
+    a = cell(diary, first)
+    b, c = cell(diary, 2, a), cell(diary, 3, a)
+    return cell(diary, last, b, c)
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_each_cell_is_done_once_after_what_it_needs(diary, tmp_path, jobs):
+    last = diamond(diary)
+    assert perform_all([last, *last.needs.values()], tmp_path / "cells", jobs, show=False) == 4
+    assert sorted(numbers(diary)) == [1, 2, 3, 4]
+    assert numbers(diary)[0] == 1
+    assert numbers(diary)[-1] == 4
+    assert read_json(last.folder(tmp_path / "cells") / "result.json") == 4 + (2 + 1) + (3 + 1)
+    here = {int(line.split()[1]) for line in diary.read_text().splitlines()} == {os.getpid()}
+    assert here == (jobs == 1)
+
+
+def test_only_what_changed_is_done_again(diary, tmp_path):
+    cells = tmp_path / "cells"
+    perform_all([diamond(diary)], cells, 1, show=False)
+    assert perform_all([diamond(diary)], cells, 1, show=False) == 0
+    assert perform_all([diamond(diary, last=5)], cells, 1, show=False) == 1
+    assert perform_all([diamond(diary, first=7)], cells, 1, show=False) == 4
+    assert numbers(diary) == [1, 2, 3, 4, 5, 7, 2, 3, 4]
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_an_error_names_the_cell_and_keeps_what_is_finished(diary, tmp_path, jobs):
+    good, bad = cell(diary, 1), cell(diary, -1)
+    with pytest.raises(GhptDataError, match=r"^add--1: .*is negative. Give a positive one") as caught:
+        perform_all([cell(diary, 2, good, bad)], tmp_path / "cells", jobs, show=False)
+    assert caught.value.field == "number"
+    assert good.done(tmp_path / "cells")
+    assert not bad.done(tmp_path / "cells")
+
+
+def test_the_key_knows_config_needs_and_code(diary, monkeypatch):
+    assert diamond(diary).key == diamond(diary).key
+    assert len({diamond(diary).key, diamond(diary, first=9).key, diamond(diary, last=9).key}) == 3
+    before = diamond(diary).key
+    monkeypatch.setattr("ghpt.reproduction.cells.code_digest", lambda module: "changed")
+    assert diamond(diary).key != before
+    assert len(with_needs([diamond(diary), diamond(diary)])) == 4
+
+
+def test_comments_docstrings_and_layout_are_no_code(tmp_path):
+    def digest(name, text):
+        (tmp_path / name).write_text(text)
+        return meaning(tmp_path / name)
+
+    plain = digest("a.py", "def f(x):\n    return x + 1\n")
+    assert (
+        digest("b.py", '"""About."""\n\n\ndef f(x):\n    """More."""\n    # why\n    return (x\n            + 1)\n')
+        == plain
+    )
+    assert digest("c.py", "def f(x):\n    return x + 2\n") != plain
+    assert code_digest("toy_cells") != code_digest("ghpt.reproduction.work")
+
+
+PROGRAM = """
+import sys
+from pathlib import Path
+from test_cells import slow
+from ghpt.reproduction.pool import perform_all
+if __name__ == "__main__":
+    try:
+        perform_all(slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
+    except KeyboardInterrupt:  # as ghpt.app.run does
+        sys.exit(130)
+"""
+
+
+def slow(diary):
+    return [cell(diary, 1), *(cell(diary, n, sleep=60) for n in (2, 3))]
+
+
+@pytest.mark.parametrize(("stop", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGKILL", -9)])
+def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_path, stop, status):
+    program = tmp_path / "program.py"
+    program.write_text(PROGRAM)
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "OMP_NUM_THREADS": "1"}
+    command = [sys.executable, str(program), str(diary), str(tmp_path / "cells")]
+    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as run:
+        until(lambda: {2, 3} <= set(numbers(diary)), 60)
+        run.send_signal(getattr(signal, stop))
+        assert run.wait(20) == status
+    workers = {int(line.split()[1]) for line in diary.read_text().splitlines()}
+    until(lambda: not any(alive(worker) for worker in workers), 10)
+    first, *others = slow(diary)
+    assert first.done(tmp_path / "cells")
+    assert not any(other.done(tmp_path / "cells") for other in others)
+    assert perform_all([first, cell(diary, 4, first)], tmp_path / "cells", 1, show=False) == 1
+    if stop != "SIGKILL":  # orphans may stay in the table of processes for a while, and look alive
+        assert [path.name for path in (tmp_path / "cells").glob(".*.tmp")] == []
+
+
+def alive(process):
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def until(condition, seconds):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.1)

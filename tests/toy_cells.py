@@ -1,0 +1,25 @@
+"""Work for cells without models: numbers in, numbers out."""
+
+import os
+import time
+from pathlib import Path
+from typing import Any
+
+from ghpt.errors import GhptDataError
+from ghpt.reproduction.cells import Cell, read_json, write_json
+
+
+def add(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+    """The config's number and those of the needs; leaves a line in ``config["diary"]``."""
+    with open(config["diary"], "a") as diary:
+        diary.write(f"{config['number']} {os.getpid()}\n")
+    time.sleep(config.get("sleep", 0))
+    if config["number"] < 0:
+        raise GhptDataError(config["diary"], "number", "is negative", "Give a positive one")
+    before = [read_json(path / "result.json") for path in needs.values()]
+    write_json(folder / "result.json", config["number"] + sum(before))
+
+
+def cell(diary: Path, number: float, *needs: Cell, **config: Any) -> Cell:
+    config |= {"number": number, "diary": str(diary)}
+    return Cell(f"add-{number}", "toy_cells.add", config, {before.name: before for before in needs}, seconds=1.0)
