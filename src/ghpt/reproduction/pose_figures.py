@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import torch
 from jaxtyping import Float
@@ -73,8 +71,8 @@ def _pose_prior(results: Results) -> Section:
         for name in ("weight", "average", "most", "least", "stochastic", "random", "best", "worst")
     }
     others = [name for name in prior if name not in ("weight", "best")]
-    lowest = sum(prior["weight"] <= np.min([prior[name] for name in others], axis=0))
-    second = sum(prior["average"] <= np.min([prior[n] for n in others if n != "average"], axis=0))
+    lowest = int(sum(prior["weight"] <= np.min([prior[name] for name in others], axis=0)))
+    second = int(sum(prior["average"] <= np.min([prior[n] for n in others if n != "average"], axis=0)))
     ratio = _ratio(prior["weight"], prior["best"])
     claims = [
         Claim("the pose prior is generally lowest for weight", "4.3", lowest > len(PARTS) / 2,
@@ -94,9 +92,9 @@ def _pose_prior(results: Results) -> Section:
     return Section(results.words("h36m"), body, {"pose-prior": figure}, (), claims)
 
 
-def _ratio(a: Float[np.ndarray, " L"], b: Sequence[float]) -> float:
+def _ratio(a: Float[np.ndarray, " L"], b: Float[np.ndarray, " L"]) -> float:
     """Geometric mean over the parts."""
-    return float(np.exp(np.mean(np.log(a / np.asarray(b)))))
+    return float(np.exp(np.mean(np.log(a / b))))
 
 
 def _cells(setup: Setup) -> dict[str, Cell]:
