@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -17,6 +18,7 @@ import yaml
 import ghpt.jobs
 import toys
 from ghpt.models.checkpoint import read_checkpoint
+from ghpt.overrides import check_overrides
 from ghpt.train import summary, train
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -145,6 +147,16 @@ def test_slurm_s_settings_compose_where_there_is_no_slurm(typed):
     launcher = yaml.safe_load(said)["hydra"]["launcher"]
     assert status == 0
     assert {key: launcher[key] for key in settings} == settings
+
+
+def test_the_commands_of_the_page_about_clusters_are_understood():
+    text = (ROOT / "docs" / "clusters.md").read_text(encoding="utf-8")
+    found = [shlex.split(line) for line in re.findall(r"^\$ (python .*)$", text, flags=re.MULTILINE)]
+    launchers = set()
+    for _, script, *words in found:
+        overrides = check_overrides(ROOT / "conf", script.removesuffix(".py"), [w for w in words if w != "-m"])
+        launchers.add(ghpt.jobs.chosen_launcher(overrides, compose_only=True))
+    assert launchers == {"basic", "submitit_local", "submitit_slurm"}
 
 
 def test_trainings_of_a_local_pool_are_those_of_one_process(typed, tmp_path, monkeypatch):
