@@ -1,0 +1,104 @@
+"""The report: Markdown, one HTML file that needs no other, and data for programs."""
+
+import json
+import re
+from html.parser import HTMLParser
+
+import pytest
+from matplotlib.figure import Figure
+
+from ghpt.reproduction.item import Claim, Compared, Item, Section, Spread
+from ghpt.reproduction.page import Entry, Page, write_page
+
+
+def figure():
+    drawn = Figure(figsize=(3, 2))
+    drawn.subplots().plot([0, 1], [1, 0])
+    return drawn
+
+
+@pytest.fixture
+def page():
+    good = Compared("weight", 29.1, Spread((26.0, 27.0)))
+    bad = Compared("most <b>", 20.0, Spread((26.0, 27.0)))
+    claims = [Claim("most < least", "4.2", True, "1 < 2"), Claim("a & b", "4.3", False, "by 3 mm")]
+    entries = [
+        Entry(Item("first", "table", "A table", dict, dict),
+              Section("embedded (synthetic) Human3.6M", "A table of *x*:\n\n| a | b |\n|---|---|\n| 1 | 2 |",
+                      {}, [good, bad], claims, "Because of this."), ["python train.py data=h36m"]),
+        Entry(Item("second", "figure", "A figure", dict, dict),
+              Section("Human3.6M from /data", "Look:\n\n![curve](curve.svg)", {"curve": figure()}), []),
+    ]  # fmt: skip
+    return Page(entries, {"data": "embedded (synthetic)", "seeds": "2 (0, 1)"}, "seed: 0\nonly: null\n")
+
+
+class Tags(HTMLParser):
+    """What a page refers to, which ids it has, and its text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.references, self.ids, self.text, self.tags = [], [], "", []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        for name, value in attributes:
+            if name in ("src", "href"):
+                self.references.append(value)
+            if name == "id":
+                self.ids.append(value)
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def test_the_page_needs_no_other_file(page, tmp_path):
+    write_page(page, tmp_path)
+    tags = Tags((tmp_path / "report.html").read_text())
+    assert not [r for r in tags.references if not r.startswith(("#", "data:image/svg+xml;base64,"))]
+    assert sum(reference.startswith("data:") for reference in tags.references) == 1
+    assert {r[1:] for r in tags.references if r.startswith("#")} <= set(tags.ids)
+    assert "script" not in tags.tags
+    assert "most <b>" in tags.text
+    assert "a & b" in tags.text
+
+
+def test_every_entry_says_its_data_its_claims_and_its_command(page, tmp_path):
+    write_page(page, tmp_path)
+    for text in ((tmp_path / "report.md").read_text(), Tags((tmp_path / "report.html").read_text()).text):
+        assert "tab:first: A table · embedded (synthetic) Human3.6M" in text
+        assert "fig:second: A figure · Human3.6M from /data" in text
+        assert "python reproduce.py only=[first]" in text
+        assert "python train.py data=h36m" in text
+        assert "1 of 2 claims hold" in text
+        assert "Because of this." in text
+        assert "seed: 0" in text
+        assert re.search(r"26\.5 ± 0\.7", text)
+        assert "+32.5 % (miss)" in text
+
+
+def test_explanations_of_embedded_numbers_are_not_given_for_real_ones(page, tmp_path):
+    entry = page.entries[0]
+    real = Section("Human3.6M from /data", *list(vars(entry.section).values())[1:])
+    assert "Because of this." in entry.text()
+    assert "Because of this." not in Entry(entry.item, real, entry.commands).text()
+
+
+def test_figures_are_vectors_and_the_same_bytes_twice(page, tmp_path):
+    for name in ("a", "b"):
+        write_page(page, tmp_path / name)
+    for kind in ("svg", "pdf"):
+        a, b = ((tmp_path / name / "figures" / f"curve.{kind}").read_bytes() for name in ("a", "b"))
+        assert a == b
+        assert b"image/png" not in a
+    assert (tmp_path / "a" / "report.html").read_bytes() == (tmp_path / "b" / "report.html").read_bytes()
+    markdown = (tmp_path / "a" / "report.md").read_text()
+    assert "![curve](figures/curve.svg)" in markdown
+
+
+def test_numbers_and_claims_for_programs(page, tmp_path):
+    write_page(page, tmp_path)
+    items = json.loads((tmp_path / "report.json").read_text())["items"]
+    assert items["first"]["numbers"][0] == {"what": "weight", "paper": 29.1, "ours": [26.0, 27.0], "miss": False}
+    assert [claim["holds"] for claim in items["first"]["claims"]] == [True, False]
+    assert items["second"] == {"data": "Human3.6M from /data", "numbers": [], "claims": []}
