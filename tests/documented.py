@@ -64,9 +64,10 @@ def blocks(page: Path) -> list[Block]:
 
 
 def commands_of(block: Block) -> Iterator[Command]:
-    """The commands of a bash block, a line each or more."""
+    """The commands of a bash block, a line each or more, or of a console block, after its prompts."""
     for number, line in enumerate(block.text.splitlines()):
-        yield from _split(block.page, block.line + number, line)
+        if block.language != "console" or line.startswith("$ "):
+            yield from _split(block.page, block.line + number, line.removeprefix("$ "))
 
 
 def inline_commands(page: Path) -> Iterator[Command]:

@@ -17,8 +17,8 @@ import documented
 import ghpt.test as testing
 from documented import PAGES, ROOT, Block, Command
 from ghpt import calibrate, doctor, predict, train
-from ghpt.app import check_overrides
 from ghpt.data import embedded
+from ghpt.overrides import check_overrides
 
 MAINS = {
     "train.py": ((train.train, train.summary), {"last.ckpt", "best.ckpt"}),
@@ -180,9 +180,14 @@ def check_arguments(command: Command, monkeypatch: Any) -> None:
             runpy.run_path(str(path), run_name="__main__")
 
 
+def settings_of(command: Command, first: int = 2) -> list[str]:
+    """The words of a command, from ``first`` on, that are no options."""
+    return [word for word in command.words[first:] if not word.startswith("-")]
+
+
 def composed(name: str, command: Command, first: int = 2) -> None:
-    """A script whose words, from ``first`` on, are settings of a configuration."""
-    check_overrides(ROOT / "conf", name, command.words[first:])
+    """A script whose words are settings of a configuration."""
+    check_overrides(ROOT / "conf", name, settings_of(command, first))
 
 
 SCRIPTS = {
@@ -237,6 +242,9 @@ def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, 
         elif block.language == "bash":
             for command in documented.commands_of(block):
                 attempt(runner, command, page, models)
+        elif block.language == "console":  # of a cluster or several processes; other tests run their like
+            for command in documented.commands_of(block):
+                check_overrides(runner.conf, Path(command.script).stem, settings_of(command))
     for command in documented.inline_commands(page):
         attempt(runner, command, page, models)
     assert Path.cwd() == tmp_path
@@ -265,5 +273,5 @@ REPRODUCE = [command for page in PAGES for command in commands(page) if command.
 def test_the_settings_of_reproduce_exist(command):
     if not (ROOT / "conf" / "reproduce.yaml").is_file():
         pytest.skip("conf/reproduce.yaml does not exist yet")
-    words = [word for word in command.words[2:] if not word.startswith("-")]
+    words = settings_of(command)
     assert len(check_overrides(ROOT / "conf", "reproduce", words)) == len(words)
