@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Results, Spread
@@ -23,16 +23,21 @@ def trained(setup: Setup, data: str, *overrides: str, name: str, seconds: float 
 
 
 def evaluated(
-    setup: Setup, model: Cell, settings: Sequence[tuple[float | None, ...]] = ((None, None),), seconds: float = 6.0
+    setup: Setup,
+    model: Cell,
+    settings: Sequence[tuple[int | None, float | None]] = ((None, None),),
+    splits: Iterable[str] = SETS,
+    seconds: float = 5.0,
 ) -> Cell:
-    """A model on Human3.6M's validation and test subjects, with other (hypotheses, temperature) where not None."""
+    """A model on splits of Human3.6M, with other (hypotheses, temperature) where not None."""
     strides, sets = setup.sizes["ablation"]["stride"], {}
-    for split in SETS:
-        whole = setup.composed("test", BASE, f"data.evaluate={split}", f"data.stride={strides[split]}")
+    for split in splits:
+        own = (f"data.evaluate={split}", f"data.stride={strides[split]}")
+        whole = setup.composed("test", BASE, *setup.overrides["test"], *own)
         sets[split] = whole["data"]
     config = {"sets": sets, "settings": [list(pair) for pair in settings], "seed": setup.seed}
     config |= {"files": whole["files"]} if "files" in whole else {}
-    needs = {"model": model} | {split: setup.prepared(BASE, split) for split in SETS}
+    needs = {"model": model} | {split: setup.prepared(BASE, split) for split in splits}
     name = model.name.replace("train-pose", "ablation")
     return Cell(name, "ghpt.reproduction.ablation_work.evaluate", config, needs, seconds=seconds)
 

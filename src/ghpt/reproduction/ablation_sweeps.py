@@ -8,13 +8,15 @@ from typing import Any
 from ghpt.report.tables import NONE, markdown
 from ghpt.reproduction.ablation_cells import BASE, DEFAULT, SETS, evaluated, number, trained
 from ghpt.reproduction.cells import Cell
-from ghpt.reproduction.item import Claim, Results, Section, Spread
+from ghpt.reproduction.item import Claim, Results, Section, Spread, signed
 from ghpt.reproduction.robustness_figure import LABELS, Panel, curves
 from ghpt.reproduction.setup import Setup
 
+Place = float | int
+"""A number of hypotheses, say."""
 Row = tuple[str, str, int]
 """Cell, selection, number of the setting."""
-Lines = Mapping[str, Mapping[float, Row]]
+Lines = Mapping[str, Mapping[Place, Row]]
 """Style -> place -> what stands there."""
 
 
@@ -26,7 +28,7 @@ def default(setup: Setup, *keys: str) -> Any:
     return value
 
 
-def levels(setup: Setup, name: str, *keys: str) -> list[float]:
+def levels(setup: Setup, name: str, *keys: str) -> list[Place]:
     """Of ``sizes.ablation``, and the default, which ``keys`` lead to."""
     return sorted({*setup.sizes["ablation"][name], default(setup, *keys)})
 
@@ -62,7 +64,7 @@ def temperature(results: Results) -> Section:
 
 def hypotheses_cells(setup: Setup) -> dict[str, Cell]:
     values, usual = levels(setup, "hypotheses", "model", "hypotheses"), default(setup, "model", "hypotheses")
-    cells = {DEFAULT: evaluated(setup, setup.trained(BASE), [(value, None) for value in values], 20)}
+    cells = {DEFAULT: evaluated(setup, setup.trained(BASE), [(value, None) for value in values], seconds=22)}
     for value in setup.sizes["ablation"]["hypotheses_trained"]:
         if value != usual:
             seconds = 4 + 16 * value / usual
@@ -74,7 +76,7 @@ def hypotheses_cells(setup: Setup) -> dict[str, Cell]:
 def hypotheses(results: Results) -> Section:
     setup = results.setup
     values, usual = (f(setup, *x, "model", "hypotheses") for f, x in ((levels, ("hypotheses",)), (default, ())))
-    lines: dict[str, Mapping[float, Row]] = {
+    lines: dict[str, Mapping[Place, Row]] = {
         name: {v: (DEFAULT, name, i) for i, v in enumerate(values)} for name in ("weight", "average", "best")
     }
     taught = sorted({*setup.sizes["ablation"]["hypotheses_trained"], usual})
@@ -118,13 +120,13 @@ def samples(results: Results) -> Section:
     return _section(results, "samples", "training samples", lines, LABELS, text, usual, claims)
 
 
-def _enough(results: Results, cells: Mapping[float, str], usual: float) -> Claim:
+def _enough(results: Results, cells: Mapping[Place, str], usual: Place) -> Claim:
     """Appendix C on the number of samples."""
     errors = {n: number(results, cell, "test").mean for n, cell in cells.items()}
     best = min(errors, key=lambda n: errors[n])
     by = (
         f"{errors[usual]:.1f} mm of {usual:g}; the best of {', '.join(f'{n:g}' for n in cells)} is {best:g} with "
-        f"{errors[best]:.1f} mm ({100 * (errors[best] / errors[usual] - 1):+.1f} %)"
+        f"{errors[best]:.1f} mm ({signed(100 * (errors[best] / errors[usual] - 1))} %)"
     )
     return Claim("best results with only 500 samples (held if within 1 % of the best)", "C",
                  errors[usual] <= 1.01 * errors[best], by)  # fmt: skip
@@ -137,7 +139,7 @@ def _minutes(results: Results) -> Claim:
 
 
 def _section(
-    results: Results, name: str, head: str, lines: Lines, labels: Mapping[str, str], text: str, usual: float,
+    results: Results, name: str, head: str, lines: Lines, labels: Mapping[str, str], text: str, usual: Place,
     claims: Sequence[Claim] = (),
 ) -> Section:  # fmt: skip
     """A table with a row for each place, and a panel for each set."""
@@ -167,7 +169,7 @@ def _section(
     return Section(data, "\n\n".join(body), {f"ablation_{name}": figure}, claims=claims)
 
 
-def _chosen(validation: Mapping[float, Spread], test: Mapping[float, Spread], usual: float) -> str:
+def _chosen(validation: Mapping[Place, Spread], test: Mapping[Place, Spread], usual: Place) -> str:
     """What the validation subject would choose, and what that is worth on the test."""
     best = min(validation, key=lambda x: validation[x].mean)
     if best == usual:
@@ -175,7 +177,7 @@ def _chosen(validation: Mapping[float, Spread], test: Mapping[float, Spread], us
     gain, worth = (100 * (errors[best].mean / errors[usual].mean - 1) for errors in (validation, test))
     return (
         f"Validation would choose {best:g} ({validation[best].mean:.2f} mm against {validation[usual].mean:.2f} of the "
-        f"default, {gain:+.1f} %); on the test subjects that is {worth:+.1f} %."
+        f"default, {signed(gain)} %); on the test subjects that is {signed(worth)} %."
     )
 
 

@@ -9,7 +9,7 @@ from ghpt.report.tables import NAMES, markdown
 from ghpt.reproduction import ablation_sweeps as sweeps
 from ghpt.reproduction.ablation_cells import BASE, SETS, evaluated, number, trained
 from ghpt.reproduction.cells import Cell
-from ghpt.reproduction.item import Item, Results, Section, Spread
+from ghpt.reproduction.item import Item, Results, Section, Spread, signed
 from ghpt.reproduction.setup import Setup
 
 NOVEL = "cmu3"
@@ -32,8 +32,8 @@ def _cells(setup: Setup, variants: Variants) -> dict[str, Cell]:
         return trained(setup, data, f"experiment={experiment}", name=experiment)
 
     return {
-        f"{data}: {name}": evaluated(setup, model(data, experiment))
-        for data in (BASE, NOVEL)
+        f"{data}: {name}": evaluated(setup, model(data, experiment), splits=splits)
+        for data, splits in ((BASE, tuple(SETS)), (NOVEL, ("test",)))
         for name, experiment in variants.items()
     }
 
@@ -63,7 +63,7 @@ def _chosen(numbers: Mapping[str, Sequence[Spread]]) -> str:
     for name, spreads in numbers.items():
         if name != usual:
             changes = (100 * (a.mean / b.mean - 1) for a, b in zip(spreads, numbers[usual], strict=True))
-            parts.append(f"Against the default, {name}: {', '.join(f'{change:+.1f} %' for change in changes)}.")
+            parts.append(f"Against the default, {name}: {', '.join(f'{signed(change)} %' for change in changes)}.")
     return " ".join(parts)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -16,6 +17,8 @@ from ghpt.reproduction.robustness_work import LEARNED
 from ghpt.reproduction.setup import Setup
 
 PERTURBATIONS = "ghpt.reproduction.perturbation"
+TIE = 5e-4
+"""Errors that differ by a smaller share are equal in print."""
 CLEAN = "clean"
 """The cell of a data set as it is, shared by the curves."""
 
@@ -25,12 +28,14 @@ class Curve:
     """One quantity that gets worse."""
 
     name: str
-    """Of its cell, and of its levels in ``sizes.robustness``."""
+    """Of its cell, and of its levels in ``sizes.robustness``; 0 means the data as they are."""
     perturbation: str
     setting: str
     """The perturbation's argument that the levels are of."""
     x: str
+    """The axis and the head of the table, with the unit."""
     unit: str = ""
+    """In a sentence."""
     times: float = 1.0
     """From the setting to what is shown."""
     data: str = "h36m"
@@ -38,12 +43,8 @@ class Curve:
     more: tuple[str, ...] = field(default=())
     """Further arguments, also in ``sizes.robustness``."""
 
-    def levels(self, setup: Setup) -> list[float]:
-        """0 means the data as they are."""
+    def levels(self, setup: Setup) -> list[float | int]:
         return setup.sizes["robustness"][self.name]
-
-    def shown(self, level: float) -> str:
-        return f"{self.times * level:g}{self.unit}"
 
     def cell(self, setup: Setup) -> Cell:
         sizes = setup.sizes["robustness"]
@@ -56,7 +57,7 @@ class Curve:
 def measured(setup: Setup, name: str, data: str, perturbations: Sequence[dict[str, Any] | None]) -> Cell:
     """Everybody under each of the perturbations."""
     sizes = setup.sizes["robustness"]
-    whole = setup.composed("test", data, f"data.stride={sizes['stride'][data]}")
+    whole = setup.composed("test", data, *setup.overrides["test"], f"data.stride={sizes['stride'][data]}")
     config = {key: whole[key] for key in ("data", "baselines", "seed", "files") if key in whole}
     config |= {"perturbations": list(perturbations), "code of perturbations": code_digest(PERTURBATIONS)}
     needs = {"model": setup.trained(sizes["trained_on"]), "data": setup.prepared(data, "test")}
@@ -91,7 +92,12 @@ class Found:
         return self.errors[kind][name][level].mean
 
     def best_classical(self, level: int) -> str:
-        return min(self.classical, key=lambda name: self.mean(name, level))
+        return min(self.classical, key=lambda name: nan_to_last(self.mean(name, level)))
+
+
+def nan_to_last(error: float) -> float:
+    """For an order in which what has no number comes last."""
+    return math.inf if math.isnan(error) else error
 
 
 def found(results: Results, curve: Curve) -> Found:
@@ -111,7 +117,7 @@ def found(results: Results, curve: Curve) -> Found:
               for kind in ("relative", "absolute")}  # fmt: skip
     shares = [[own[i][name]["coverage"]["relative"] for own in seeds for name in names] for i in range(len(levels))]
     return Found(
-        [curve.shown(level) for level in levels], [curve.times * level for level in levels], errors,
+        [f"{curve.times * level:g}" for level in levels], [curve.times * level for level in levels], errors,
         [(min(s), max(s)) for s in shares],
     )  # fmt: skip
 
@@ -122,8 +128,8 @@ def table(curve: Curve, of: Found, kind: str) -> str:
     partial_coverage = min(low for low, _ in of.coverage) < 0.99995
     rows = []
     for i, level in enumerate(of.levels):
-        least = min(spreads[i].mean for name, spreads in of.errors[kind].items() if name != "best")
-        texts = [s[i].text() if s[i].mean == s[i].mean else NONE for s in of.errors[kind].values()]
+        least = min(nan_to_last(spreads[i].mean) for name, spreads in of.errors[kind].items() if name != "best")
+        texts = [NONE if math.isnan(s[i].mean) else s[i].text() for s in of.errors[kind].values()]
         bold = [f"**{t}**" if s[i].mean == least else t for t, s in zip(texts, of.errors[kind].values(), strict=True)]
         rows.append([level, *bold, *([_share(*of.coverage[i])] if partial_coverage else [])])
     return markdown([*head, *(["joints counted"] if partial_coverage else [])], rows)
@@ -134,27 +140,42 @@ def _share(low: float, high: float) -> str:
     return f"{100 * low:.1f} %" if same else f"{100 * low:.1f} to {100 * high:.1f} %"
 
 
-def verdict(of: Found) -> str:
-    """Where the learned selection stands against the best classical estimator and its own pool."""
-    parts = [_against(of, 0), _against(of, len(of.levels) - 1)]
-    wins = [i for i in range(len(of.levels)) if of.mean("weight", i) < of.mean(of.best_classical(i), i)]
-    ahead = "no level" if not wins else "every level" if len(wins) == len(of.levels) else ", ".join(
-        of.levels[i] for i in wins)  # fmt: skip
-    parts.append(f"It is ahead of all of them at {ahead}.")
+def verdict(curve: Curve, of: Found) -> str:
+    """Where the learned selection stands against the best classical estimator, LO-RANSAC and its own pool."""
     last = len(of.levels) - 1
-    parts.append(f"The best hypothesis of its pool, which looks at the truth, has {of.mean('best', 0):.1f} and "
-                 f"{of.mean('best', last):.1f} mm.")  # fmt: skip
+    parts = [_against(curve, of, 0), _against(curve, of, last)]
+    ahead = [f"of all classical estimators at {_where(curve, of, of.classical)}"]
+    if "lo_ransac" in of.classical:
+        ahead.append(f"of LO-RANSAC at {_where(curve, of, ['lo_ransac'])}")
+    parts.append(f"It is ahead {', '.join(ahead)}.")
+    best = " and ".join(f"{of.mean('best', i):.1f}" for i in (0, last))
+    parts.append(f"The best hypothesis of its pool, which looks at the truth, has {best} mm there.")
     return " ".join(parts)
 
 
-def _against(of: Found, level: int) -> str:
-    ours, name, average = of.mean("weight", level), of.best_classical(level), of.mean("average", level)
-    best = of.mean(name, level)
-    does = "beats" if ours < best else "loses to"
+def _where(curve: Curve, of: Found, others: Sequence[str]) -> str:
+    """The levels at which the learned selection is ahead of all these."""
+    wins = [
+        level for i, level in enumerate(of.levels)
+        if of.mean("weight", i) < (1 - TIE) * min(nan_to_last(of.mean(name, i)) for name in others)
+    ]  # fmt: skip
+    return "no level" if not wins else "every level" if len(wins) == len(of.levels) else ", ".join(wins) + curve.unit
+
+
+def _lead(of: Found, level: int) -> float:
+    """By what share the learned selection's error is below that of the best classical estimator."""
+    return 1 - of.mean("weight", level) / of.mean(of.best_classical(level), level)
+
+
+def _against(curve: Curve, of: Found, level: int) -> str:
+    ours, average, name = of.mean("weight", level), of.mean("average", level), of.best_classical(level)
+    lead, gain = _lead(of, level), 1 - ours / average
+    does = "is level with" if abs(lead) <= TIE else "beats" if lead > 0 else "loses to"
+    by = "" if abs(lead) <= TIE else f" by {100 * abs(lead):.1f} %"
+    pool = "equals" if abs(gain) <= TIE else f"is {100 * abs(gain):.1f} % {'below' if gain > 0 else 'above'}"
     return (
-        f"At {of.levels[level]} the learned selection ({ours:.1f} mm) {does} the best classical estimator, "
-        f"{LABELS.get(name, name)} ({best:.1f} mm), by {100 * abs(ours / best - 1):.1f} %, and is "
-        f"{100 * abs(1 - ours / average):.1f} % {'below' if ours < average else 'above'} the average of its pool."
+        f"At {of.levels[level]}{curve.unit} the learned selection ({ours:.1f} mm) {does} the best classical estimator, "
+        f"{LABELS.get(name, name)} ({of.mean(name, level):.1f} mm){by}, and {pool} the average of its pool."
     )
 
 
@@ -176,7 +197,7 @@ def _section(results: Results, of: Sequence[Curve], about: str, absolute: bool, 
         for kind in kinds:
             said = "Pelvis-relative" if kind == "relative" else "Absolute"
             body.append(f"{said} MPJPE, mm; the learned selection {trained}:\n\n{table(curve, one, kind)}")
-        body.append(verdict(one))
+        body.append(verdict(curve, one))
     return Section(data, "\n\n".join(body), figures, claims=claims(all_found[0]))
 
 
@@ -193,8 +214,8 @@ def _outlier_claims(of: Found) -> list[Claim]:
     best = of.best_classical(last)
     ours, linear = ([of.mean(name, i) for i in (0, last)] for name in ("weight", "linear"))
     by = (
-        f"from {of.levels[0]} to {of.levels[-1]} outliers {ours[0]:.1f} to {ours[1]:.1f} mm, linear {linear[0]:.1f} to "
-        f"{linear[1]:.1f}; {LABELS.get(best, best)} {of.mean(best, 0):.1f} to {of.mean(best, last):.1f}"
+        f"from {of.levels[0]} to {of.levels[-1]} % outliers {ours[0]:.1f} to {ours[1]:.1f} mm, linear {linear[0]:.1f} "
+        f"to {linear[1]:.1f}; {LABELS.get(best, best)} {of.mean(best, 0):.1f} to {of.mean(best, last):.1f}"
     )
     holds = ours[1] - ours[0] < of.mean(best, last) - of.mean(best, 0)
     return [Claim("the model is robust to erroneous detections: its error grows less than any classical one's", "2",
@@ -208,12 +229,12 @@ def _item(label: str, title: str, about: str, *of: Curve, absolute: bool = False
 
 _SAME = "All estimators get the same key points; none is trained or tuned again, and confidences stay as they were. "
 
-OUTLIERS = Curve("outliers", "Outliers", "rate", "outliers, % of the detections", " %", 100,
+OUTLIERS = Curve("outliers", "Outliers", "rate", "outliers, % of the detections", " %", 100.0,
                  more=("shortest", "longest"))  # fmt: skip
-NOISE = Curve("noise", "Noise", "deviation", "added noise, % of the person's size in the image", " %", 100)
+NOISE = Curve("noise", "Noise", "deviation", "added noise, % of the person's size in the image", " %", 100.0)
 VIEWS = Curve("views", "FewerCameras", "count", "cameras", " cameras", data="panoptic", logarithmic=True)
-DETECTIONS = Curve("missing_detections", "MissingDetections", "rate", "missing detections, %", " %", 100)
-MISSING_VIEWS = Curve("missing_views", "MissingViews", "count", "missing views of four", " missing views")
+DETECTIONS = Curve("missing_detections", "MissingDetections", "rate", "missing detections, %", " %", 100.0)
+MISSING_VIEWS = Curve("missing_views", "MissingViews", "count", "missing views of four", " missing view(s)")
 ROTATION = Curve("rotation", "RotatedCameras", "degrees", "rotation of each camera, degrees", "°")
 SHIFT = Curve("shift", "ShiftedCameras", "millimetres", "shift of each camera, mm", " mm")
 
@@ -223,7 +244,8 @@ ITEMS = (
         "More outliers",
         _SAME + "A random share of the detections is moved in a random direction, by a random length within a range of "
         "fractions of the person's size in the image (the diagonal of the box around the joints), on top of the "
-        "detector's own errors.",
+        "detector's own errors. Hypotheses are whole poses: the more outliers, the fewer that are free of them in "
+        "every joint, while the robust estimators decide joint by joint.",
         OUTLIERS,
         claims=_outlier_claims,
     ),
@@ -236,7 +258,8 @@ ITEMS = (
     _item(
         "robustness-views",
         "Two to 31 cameras",
-        "Of the 31 HD cameras each frame has its own random choice; a larger choice contains the smaller ones.",
+        "Of the 31 HD cameras each frame has its own random choice; a larger choice contains the smaller ones. Where "
+        "not all joints are seen in two views, the errors of different rows are of different joints.",
         VIEWS,
     ),
     _item(
@@ -244,7 +267,7 @@ ITEMS = (
         "Missing detections and missing views",
         _SAME + "On the left a random share of the detections is taken away, on the right whole random views of each "
         "frame. A joint with fewer than two views left is estimated by nobody and not counted, nor is any joint of a "
-        "frame without a pelvis.",
+        "frame without a pelvis: errors of different rows are of different joints.",
         DETECTIONS,
         MISSING_VIEWS,
     ),

@@ -1,5 +1,6 @@
 """The work of the robustness curves: estimators on one data set under each of several perturbations."""
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -71,4 +72,4 @@ def _numbers(metrics: dict[str, MPJPE]) -> dict[str, Any]:
 
 def _finite(value: float) -> float | None:
     """None where nothing was counted."""
-    return value if value == value else None
+    return value if math.isfinite(value) else None

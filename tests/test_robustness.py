@@ -1,0 +1,171 @@
+"""The robustness curves: who suffers from what, on a toy; what the report says of them, on made-up numbers."""
+
+from collections.abc import Callable, Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ghpt.reproduction.cells import read_json, write_json
+from ghpt.reproduction.item import Results, Section
+from ghpt.reproduction.robustness import ITEMS
+from ghpt.reproduction.robustness_work import curve
+from ghpt.reproduction.setup import Setup
+from ghpt.train import train
+from toys import DATA, TRAIN
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+BY_LABEL = {item.label: item for item in ITEMS}
+SIZES = {
+    "trained_on": "cmu2", "stride": {"h36m": 512, "panoptic": 512}, "outliers": [0, 0.1, 0.4],
+    "outliers_shortest": 0.1, "outliers_longest": 0.5, "noise": [0, 0.01], "views": [2, 8], "rotation": [0, 1.0],
+    "missing_detections": [0, 0.5], "missing_views": [0, 2], "shift": [0, 20.0],
+}  # fmt: skip
+BASELINES = {
+    "linear": {"_target_": "ghpt.models.baselines.Linear"},
+    "m_estimator": {"_target_": "ghpt.models.baselines.MEstimator", "loss": "geman_mcclure", "scale": 0.02,
+                    "iterations": 10, "tolerance": 1.0},
+    "lo_ransac": {"_target_": "ghpt.models.baselines.LoRansac", "threshold": 0.02, "seed": 0},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dict[str, Any]]]:
+    """``measured(perturbation, setting, levels)``: the toy's estimators at each level, with six views."""
+    folder = tmp_path_factory.mktemp("toy")
+    data = DATA | {"cache": str(folder / "cache"), "views": 6, "missing": 0.03}
+    train(TRAIN | {"data": data, "trainer": TRAIN["trainer"] | {"max_epochs": 1}}, folder / "model")
+
+    def measure(name: str, **levels: list[float]) -> list[dict[str, Any]]:
+        ((setting, values),) = levels.items()
+        more = {"shortest": 0.1, "longest": 0.5} if name == "Outliers" else {}
+        target = f"ghpt.reproduction.perturbation.{name}"
+        perturbations = [{"_target_": target, setting: v, **more} if v else None for v in values]
+        config = {"data": data, "baselines": BASELINES, "perturbations": perturbations, "seed": 0}
+        out = folder / name
+        out.mkdir(exist_ok=True)
+        curve(config, {"model": folder / "model"}, out)
+        return read_json(out / "result.json")["levels"]
+
+    return measure
+
+
+def test_outliers_hurt_linear_and_averages_and_lo_ransac_far_less(measured):
+    clean, some, many = measured("Outliers", rate=[0, 0.05, 0.15])
+    for name in ("linear", "average", "weight"):
+        assert 1.5 * clean[name]["relative"] < some[name]["relative"] < many[name]["relative"]
+    for level in (some, many):
+        assert level["lo_ransac"]["relative"] < 0.5 * level["linear"]["relative"]
+        assert level["m_estimator"]["relative"] < level["linear"]["relative"]
+    for level in (clean, some, many):
+        assert level["linear"]["coverage"]["relative"] == pytest.approx(1, abs=1e-3)
+
+
+def test_two_cameras_leave_nothing_to_choose_and_more_are_better(measured):
+    two, six = measured("FewerCameras", count=[2, 6])
+    errors = {name: numbers["relative"] for name, numbers in two.items() if name != "m_estimator"}
+    assert max(errors.values()) == pytest.approx(min(errors.values()), rel=1e-3)
+    assert two["linear"]["coverage"]["relative"] < six["linear"]["coverage"]["relative"] == pytest.approx(1)
+    assert six["linear"]["relative"] < 0.8 * two["linear"]["relative"]
+
+
+def test_wrong_cameras_move_the_whole_person(measured):
+    levels = measured("RotatedCameras", degrees=[0, 0.5, 2.0])
+    for one, next_one in pairwise(levels):
+        for name in one:
+            assert next_one[name]["absolute"] > 1.2 * one[name]["absolute"]
+
+
+def test_a_level_at_which_nothing_can_be_counted_has_no_number(measured):
+    (nothing,) = measured("MissingDetections", rate=[1.0])
+    assert all(numbers["relative"] is None for numbers in nothing.values())
+    assert all(numbers["coverage"] == {"relative": 0, "absolute": 0} for numbers in nothing.values())
+
+
+def setup(seed: int = 0) -> Setup:
+    return Setup(CONF, {"human36m": None, "panoptic": None}, {"train": (), "test": ()}, {"robustness": SIZES}, seed)
+
+
+def section(
+    label: str, errors: Callable[[int, str, int], Mapping[str, float]], folder: Path, seeds: int = 1
+) -> Section:
+    """Of cells in which an estimator has ``errors(seed, cell, level)[name]``; the levels of a cell are counted."""
+    setups = [setup(seed) for seed in range(seeds)]
+    cells = [BY_LABEL[label].cells(one) for one in setups]
+    for one, by_name in zip(setups, cells, strict=True):
+        for name, cell in by_name.items():
+            levels = [
+                {n: {"relative": e, "absolute": e, "coverage": {"relative": 0.9 if i else 1.0}}
+                 for n, e in errors(one.seed, name, i).items()}
+                for i in range(len(cell.config["perturbations"]))
+            ]  # fmt: skip
+            cell.folder(folder).mkdir(parents=True, exist_ok=True)
+            write_json(cell.folder(folder) / "result.json", {"frames": 5, "levels": levels})
+    return BY_LABEL[label].section(Results(setups, cells, folder))
+
+
+def equal(seed: int, cell: str, level: int) -> dict[str, float]:
+    return {"weight": 30.0, "average": 32.0, "best": 20.0, "linear": 30.0, "lo_ransac": 31.0}
+
+
+def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
+    def errors(seed: int, cell: str, level: int) -> dict[str, float]:
+        clean = {"weight": 20.0 + seed, "average": 40.0, "best": 15.0, "linear": 42.0, "lo_ransac": 25.0}
+        return clean if cell == "clean" else {n: 2 * e if n == "lo_ransac" else 5 * e for n, e in clean.items()}
+
+    found = section("robustness-outliers", errors, tmp_path, seeds=2)
+    assert (
+        "At 0 % the learned selection (20.5 mm) beats the best classical estimator, LO-RANSAC (25.0 mm) by 18.0 %"
+        in (found.body)
+    )
+    assert "At 40 % the learned selection (102.5 mm) loses to the best classical estimator, LO-RANSAC (50.0 mm) by" in (
+        found.body
+    )
+    assert "It is ahead of all classical estimators at 0 %, of LO-RANSAC at 0 %." in found.body
+    assert "20.5 ± 0.7" in found.body
+    assert "**25.0 ± 0.0**" not in found.body
+    (claim,) = found.claims
+    assert not claim.holds
+    assert "20.5 to 102.5 mm" in claim.by
+
+
+def test_equal_errors_are_called_equal_and_coverage_is_told(tmp_path: Path):
+    found = section("robustness-views", equal, tmp_path)
+    assert "is level with the best classical estimator, linear (30.0 mm), and" in found.body
+    assert "It is ahead of all classical estimators at no level, of LO-RANSAC at every level." in found.body
+    assert "90.0 %" in found.body
+    assert found.data == "embedded (synthetic) Panoptic"
+
+
+@pytest.mark.parametrize("label", BY_LABEL)
+def test_every_figure_has_every_estimator_and_says_which_data(label: str, tmp_path: Path):
+    found = section(label, equal, tmp_path)
+    ((name, figure),) = found.figures.items()
+    assert f"]({name}.svg)" in found.body
+    assert "embedded (synthetic)" in figure.get_suptitle()
+    for axes in figure.axes:
+        assert {line.get_label() for line in axes.containers} == {
+            "learned selection", "average of its pool", "linear", "LO-RANSAC"
+        }  # fmt: skip
+        assert axes.get_xlabel()
+    assert ("Absolute MPJPE" in found.body) == (label == "robustness-calibration")
+
+
+def test_what_is_unperturbed_is_measured_once(tmp_path: Path):
+    cells = {label: item.cells(setup()) for label, item in BY_LABEL.items()}
+    clean = {by_name["clean"].key for by_name in cells.values() if "clean" in by_name}
+    assert len(clean) == 1
+    assert "clean" not in cells["robustness-views"]
+    for by_name in cells.values():
+        models = {cell.needs["model"].key for cell in by_name.values()}
+        assert models == {setup().trained("cmu2").key}
+
+
+def test_an_estimator_without_a_number_has_a_dash(tmp_path: Path):
+    def errors(seed: int, cell: str, level: int) -> dict[str, Any]:
+        return equal(seed, cell, level) | ({"lo_ransac": None} if cell == "noise" else {})
+
+    found = section("robustness-noise", errors, tmp_path)
+    row = next(line for line in found.body.splitlines() if line.startswith("| 1 "))
+    assert row.split("|")[-2].strip() == "–"
