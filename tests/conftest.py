@@ -40,13 +40,13 @@ def typed(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) ->
     handlers, level = list(logging.root.handlers), logging.root.level
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
 
-    def call(conf: Path, name: str, words: Any, task: Any, summary: Any) -> tuple[int, str, str]:
+    def call(conf: Path, name: str, words: Any, task: Any, summary: Any, *after: Any) -> tuple[int, str, str]:
         os.environ["HYDRA_FULL_ERROR"] = "0"
         monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
         status = 0
         capfd.readouterr()
         try:
-            run(conf, name, task, summary)
+            run(conf, name, task, summary, *after)
         except SystemExit as stop:
             status = stop.code
             if isinstance(status, str):  # what Python itself would do with it
