@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -81,10 +83,11 @@ def estimate_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: 
     draw.
     """
     source, draws = config["source"], config["draws"]
-    pairs = Pairs(_recordings(config), PairSettings(config["frames"], draws, 1), config["seed"])
+    data = build(config["data"], "data")
+    pairs = Pairs(data.recordings(data.evaluate), PairSettings(config["frames"], draws, 1), config["seed"])
     pairs.pairs = [pair for pair in pairs.pairs if pair[0] == 0]
     if source == "weight":
-        changes = {"seed": config["seed"], "problem.frames": config["frames"]}
+        changes = {"seed": config["seed"], "hypotheses": config["hypotheses"], "problem.frames": config["frames"]}
         model = load_model(needs["model"] / CHECKPOINT, **changes)[0].eval()
     else:
         estimator, scale = build(config["estimator"], "estimator"), build(config["scale"], "scale")
@@ -107,22 +110,29 @@ def poses_from_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder
     """Test the pose model of ``needs["model"]`` with a part of the extrinsics from ``needs["extrinsics"]``, or where
     there are none with the true ones.
 
-    result.json: part of `PARTS` (or ``known``) -> kind -> MPJPE (mm) of ``weight`` in each draw.
+    result.json: part of `PARTS` (or ``known``) -> kind -> MPJPE (mm) of ``weight``.
     """
-    model = load_model(needs["model"] / CHECKPOINT, seed=config["seed"])[0].eval()
+    changes = {"seed": config["seed"], "hypotheses": config["hypotheses"]}
+    model = load_model(needs["model"] / CHECKPOINT, **changes)[0].eval()
     data = build(config["data"], "data")
     data.setup("test")
-    frames = data.frames["test"]
-    errors: dict[str, list[dict[str, float]]] = {}
-    if "extrinsics" not in needs:
-        errors["known"] = [pose_errors(model, frames, data.batch_size)]
-    else:
+    frames = {"known": data.frames["test"]}
+    if "extrinsics" in needs:
         rigs = read_json(needs["extrinsics"] / "result.json")
-        for part, use in PARTS.items():
-            draws = range(len(rigs[0]["draws"]))
-            errors[part] = [pose_errors(model, _seen_by(frames, rigs, d, *use), data.batch_size) for d in draws]
-    result = {part: {kind: [e[kind] for e in each] for kind in KINDS} for part, each in errors.items()}
-    write_json(folder / "result.json", result)
+        frames = {part: seen_by(data.frames["test"], rigs, *use) for part, use in PARTS.items()}
+    write_json(folder / "result.json", {part: pose_errors(model, f, data.batch_size) for part, f in frames.items()})
+
+
+def seen_by(frames: Frames, rigs: Sequence[Mapping[str, Any]], use_R: bool, use_t: bool) -> Frames:
+    """The frames, each through the cameras of one draw; the draws take turns, so that all of them cost one test."""
+    draws, recordings = len(rigs[0]["draws"]), []
+    for draw in range(draws):
+        estimates = {index: rig["draws"][draw] for rig in rigs for index in rig["recordings"]}
+        for index, recording in enumerate(frames.recordings):
+            R, t = (torch.tensor(x, dtype=torch.float64) for x in estimates[index])
+            recordings.append(replace(recording, cameras=replaced(recording.cameras, (R, t), use_R, use_t)))
+    turn = np.arange(len(frames)) % draws
+    return Frames(recordings, frames.frames + turn * frames.start[-1])
 
 
 @torch.no_grad()
@@ -135,19 +145,3 @@ def pose_errors(model: StochasticEstimator, frames: Frames, batch_size: int) -> 
         for metric in metrics.values():
             metric.update(estimate, batch.truth, batch.truth_seen, torch.zeros_like(batch.sample))
     return {kind: metric.compute().mean.item() for kind, metric in metrics.items()}
-
-
-def _recordings(config: dict[str, Any]) -> list[Any]:
-    data = build(config["data"], "data")
-    return data.recordings(data.evaluate)
-
-
-def _seen_by(frames: Frames, rigs: list[dict[str, Any]], draw: int, use_R: bool, use_t: bool) -> Frames:
-    """The frames with estimated cameras in place of their recordings' own."""
-    recordings = list(frames.recordings)
-    for rig in rigs:
-        estimate = tuple(torch.tensor(x, dtype=torch.float64) for x in rig["draws"][draw])
-        for index in rig["recordings"]:
-            recording = recordings[index]
-            recordings[index] = replace(recording, cameras=replaced(recording.cameras, estimate, use_R, use_t))
-    return Frames(recordings, frames.frames)

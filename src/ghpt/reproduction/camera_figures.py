@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from ghpt.report.pair_tables import NAMES
 from ghpt.report.sweep import Sweep, frames_sweep, pairs_table, statistics_of, sweep_table, wins
@@ -19,13 +20,18 @@ MEAN, DEVIATION, MEDIAN = range(3)
 
 def camera_model(setup: Setup) -> Cell:
     """The paper's: trained on Human3.6M."""
-    return setup.trained("h36m", model="camera", seconds=100)
+    return setup.trained("h36m", model="camera", seconds=100.0)
+
+
+def of_test(composed: Mapping[str, Any]) -> dict[str, Any]:
+    """What every test depends on, out of test.py's whole configuration."""
+    return {key: composed[key] for key in ("data", "seed", "hypotheses", "files") if key in composed}
 
 
 def _cells(setup: Setup) -> dict[str, Cell]:
     size = setup.sizes["frames_sweep"]
-    whole = setup.composed("test", "h36m")
-    config = {key: whole[key] for key in ("data", "seed", "files") if key in whole}
+    whole = setup.composed("test", "h36m", *setup.overrides["test"])
+    config = of_test(whole)
     config |= {
         "camera_baselines": {name: whole["camera_baselines"][name] for name in BASELINES},
         "draws": size["draws"],
@@ -35,7 +41,7 @@ def _cells(setup: Setup) -> dict[str, Cell]:
     work = "ghpt.reproduction.camera_sweep.errors_of_draws"
     return {
         str(frames): Cell(
-            f"frames-sweep-{frames}-seed{setup.seed}", work, config | {"frames": frames}, needs, seconds=6
+            f"frames-sweep-{frames}-seed{setup.seed}", work, config | {"frames": frames}, needs, seconds=6.0
         )
         for frames in size["frames"]
     }

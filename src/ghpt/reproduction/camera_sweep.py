@@ -23,7 +23,8 @@ def errors_of_draws(config: dict[str, Any], needs: dict[str, Path], folder: Path
     ``pairs``: of views, counted from 1; None: all. result.json: pair -> selection or baseline -> E_3D (mm, null where
     a draw was not estimated) of each draw; beside it predictions.npz.
     """
-    changes = {"seed": config["seed"], "problem.frames": config["frames"], "problem.draws": config["draws"]}
+    changes = {"problem.frames": config["frames"], "problem.draws": config["draws"]}
+    changes |= {"seed": config["seed"], "hypotheses": config["hypotheses"]}
     model = load_model(needs["model"] / CHECKPOINT, **changes)[0].eval()
     data = build(config["data"], "data")
     data.serve(model.problem)
