@@ -39,6 +39,23 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
 
     Writes predictions.npz, metrics.json, report.md and TensorBoard events into ``output`` and prints the table.
     """
+    measured = measure(config, output)
+    if measured is None:
+        return {}
+    report, predictions, metrics = measured
+    report.write_report(output / "report.md", metrics)
+    report.write_events(output, predictions, metrics)
+    report.print_table(metrics)
+    _log.info("Report: %s, beside it metrics.json and predictions.npz.", shown(output / "report.md"))
+    _log.info("Figures: tensorboard --logdir %s", shown(output))
+    return metrics
+
+
+def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str, Any]] | None:
+    """The part of `test` that computes: writes predictions.npz and metrics.json into ``output``.
+
+    Returns the problem's report, the opened predictions and the metrics; None on all processes but the first.
+    """
     check_type(config, Settings, "")
     if not config["ckpt"]:
         raise GhptCheckpointError("ckpt", "is missing", "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m")
@@ -68,16 +85,11 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
     with shell_status():
         trainer.test(model, datamodule=data, verbose=False)
     if not trainer.is_global_zero:
-        return {}
+        return None
     predictions = report.open(output / "predictions.npz")
     metrics = report.evaluate(predictions)
     write_metrics(output / "metrics.json", metrics)
-    report.write_report(output / "report.md", metrics)
-    report.write_events(output, predictions, metrics)
-    report.print_table(metrics)
-    _log.info("Report: %s, beside it metrics.json and predictions.npz.", shown(output / "report.md"))
-    _log.info("Figures: tensorboard --logdir %s", shown(output))
-    return metrics
+    return report, predictions, metrics
 
 
 def summary(metrics: dict[str, Any]) -> str:

@@ -1,13 +1,11 @@
 """The work of the commonest cells: prepare a split, train, test."""
 
-import contextlib
-import io
 from pathlib import Path
 from typing import Any
 
 from ghpt.config import build
 from ghpt.reproduction.cells import write_json
-from ghpt.test import test
+from ghpt.test import measure
 from ghpt.train import train
 
 QUIET = {"progress_bar": False}
@@ -28,9 +26,8 @@ def train_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) ->
 
 
 def test_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """What test.py does with the model of ``needs["model"]``: metrics.json, predictions.npz."""
-    with contextlib.redirect_stdout(io.StringIO()):  # its table is for a terminal
-        test(config | QUIET | {"ckpt": str(needs["model"] / CHECKPOINT)}, folder)
+    """What test.py computes with the model of ``needs["model"]``: metrics.json, predictions.npz."""
+    measure(config | QUIET | {"ckpt": str(needs["model"] / CHECKPOINT)}, folder)
 
 
 test_model.__test__ = False  # not one for pytest
