@@ -107,8 +107,8 @@ def estimate_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: 
 
 
 def poses_from_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Test the pose model of ``needs["model"]`` with a part of the extrinsics from ``needs["extrinsics"]``, or where
-    there are none with the true ones.
+    """Test the pose model of ``needs["model"]`` with some ``parts`` of the extrinsics from ``needs["extrinsics"]``, or
+    where there are none with the true ones.
 
     result.json: part of `PARTS` (or ``known``) -> kind -> MPJPE (mm) of ``weight``.
     """
@@ -119,7 +119,7 @@ def poses_from_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder
     frames = {"known": data.frames["test"]}
     if "extrinsics" in needs:
         rigs = read_json(needs["extrinsics"] / "result.json")
-        frames = {part: seen_by(data.frames["test"], rigs, *use) for part, use in PARTS.items()}
+        frames = {part: seen_by(data.frames["test"], rigs, *PARTS[part]) for part in config["parts"]}
     write_json(folder / "result.json", {part: pose_errors(model, f, data.batch_size) for part, f in frames.items()})
 
 

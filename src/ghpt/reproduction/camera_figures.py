@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ghpt.report.pair_tables import NAMES
-from ghpt.report.sweep import Sweep, frames_sweep, pairs_table, statistics_of, sweep_table, wins
+from ghpt.report.sweep import CLIP, Sweep, frames_sweep, pairs_table, statistics_of, sweep_table, wins
 from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Claim, Item, Results, Section
 from ghpt.reproduction.setup import Setup
@@ -54,7 +54,10 @@ def _section(results: Results) -> Section:
     draws = len(paper["weight"][frames[0]])
     words = results.words("h36m")
     heading = f"Cameras {name} of {words}, {draws} draws of M frames"
-    caption = f"E_3D against the number of frames M: mean and standard deviation of {draws} draws, cut at 80 mm"
+    caption = (
+        f"E_3D against the number of frames M: mean and standard deviation of {draws} draws, cut at {CLIP:.0f} mm; "
+        "the bands of RANSAC and PoseLib are the fainter ones"
+    )
     body = [f"![{caption}](comparison-to-8-point.svg)",
             f"E_3D of pair {name} in mm, mean ± deviation (median) of {draws} draws.", sweep_table(paper)]  # fmt: skip
     if len(sweeps) > 1:
