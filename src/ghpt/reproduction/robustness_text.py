@@ -1,0 +1,70 @@
+"""What a robustness curve shows: a table, and where the learned selection stands, in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from ghpt.report.tables import NONE, markdown
+from ghpt.reproduction.robustness_curve import Curve, Found, nan_to_last
+from ghpt.reproduction.robustness_figure import LABELS
+
+TIE = 5e-4
+"""Errors that differ by a smaller share are equal in print."""
+
+
+def table(curve: Curve, of: Found, kind: str) -> str:
+    """Levels x estimators; the coverage where it is not whole. The least error of a level is bold."""
+    head = [curve.x, *(LABELS.get(name, name) for name in of.errors[kind])]
+    partial_coverage = min(low for low, _ in of.coverage) < 0.99995
+    rows = []
+    for i, level in enumerate(of.levels):
+        least = min(nan_to_last(spreads[i].mean) for name, spreads in of.errors[kind].items() if name != "best")
+        texts = [NONE if math.isnan(s[i].mean) else s[i].text() for s in of.errors[kind].values()]
+        bold = [f"**{t}**" if s[i].mean == least else t for t, s in zip(texts, of.errors[kind].values(), strict=True)]
+        rows.append([level, *bold, *([_share(*of.coverage[i])] if partial_coverage else [])])
+    return markdown([*head, *(["joints counted"] if partial_coverage else [])], rows)
+
+
+def _share(low: float, high: float) -> str:
+    same = f"{100 * low:.1f}" == f"{100 * high:.1f}"
+    return f"{100 * low:.1f} %" if same else f"{100 * low:.1f} to {100 * high:.1f} %"
+
+
+def verdict(curve: Curve, of: Found) -> str:
+    """Where the learned selection stands against the best classical estimator, LO-RANSAC and its own pool."""
+    last = len(of.levels) - 1
+    parts = [_against(curve, of, 0), _against(curve, of, last)]
+    ahead = [f"of all classical estimators at {_where(curve, of, of.classical)}"]
+    if "lo_ransac" in of.classical:
+        ahead.append(f"of LO-RANSAC at {_where(curve, of, ['lo_ransac'])}")
+    parts.append(f"It is ahead {', '.join(ahead)}.")
+    best = " and ".join(f"{of.mean('best', i):.1f}" for i in (0, last))
+    parts.append(f"The best hypothesis of its pool, which looks at the truth, has {best} mm there.")
+    return " ".join(parts)
+
+
+def _where(curve: Curve, of: Found, others: Sequence[str]) -> str:
+    """The levels at which the learned selection is ahead of all these."""
+    wins = [
+        level for i, level in enumerate(of.levels)
+        if of.mean("weight", i) < (1 - TIE) * min(nan_to_last(of.mean(name, i)) for name in others)
+    ]  # fmt: skip
+    return "no level" if not wins else "every level" if len(wins) == len(of.levels) else ", ".join(wins) + curve.unit
+
+
+def _lead(of: Found, level: int) -> float:
+    """By what share the learned selection's error is below that of the best classical estimator."""
+    return 1 - of.mean("weight", level) / of.mean(of.best_classical(level), level)
+
+
+def _against(curve: Curve, of: Found, level: int) -> str:
+    ours, average, name = of.mean("weight", level), of.mean("average", level), of.best_classical(level)
+    lead, gain = _lead(of, level), 1 - ours / average
+    does = "is level with" if abs(lead) <= TIE else "beats" if lead > 0 else "loses to"
+    by = "" if abs(lead) <= TIE else f" by {100 * abs(lead):.1f} %"
+    pool = "equals" if abs(gain) <= TIE else f"is {100 * abs(gain):.1f} % {'below' if gain > 0 else 'above'}"
+    return (
+        f"At {of.levels[level]}{curve.unit} the learned selection ({ours:.1f} mm) {does} the best classical estimator, "
+        f"{LABELS.get(name, name)} ({of.mean(name, level):.1f} mm){by}, and {pool} the average of its pool."
+    )
