@@ -191,10 +191,9 @@ def composed(name: str, command: Command, first: int = 2) -> None:
 
 
 SCRIPTS = {
-    "scripts/generalization.py": lambda command: composed("train", command),
     "scripts/real_recordings.py": lambda command: composed("predict", command, 3),
     "tests/test_memory.py": lambda command: None,  # run by test_memory.py itself, with a folder and a number
-    "reproduce.py": lambda command: None,  # below
+    "reproduce.py": lambda command: None,  # below; tests/test_reproduce.py runs it
 }
 """Scripts without a parser of their own."""
 
@@ -271,7 +270,5 @@ REPRODUCE = [command for page in PAGES for command in commands(page) if command.
 
 @pytest.mark.parametrize("command", REPRODUCE, ids=lambda command: command.where)
 def test_the_settings_of_reproduce_exist(command):
-    if not (ROOT / "conf" / "reproduce.yaml").is_file():
-        pytest.skip("conf/reproduce.yaml does not exist yet")
     words = settings_of(command)
     assert len(check_overrides(ROOT / "conf", "reproduce", words)) == len(words)

@@ -6,7 +6,7 @@ from rich.console import Console
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.report import paper
 from ghpt.report.evaluate import NAMES
-from ghpt.report.tables import COLUMNS, generalization_table, main_rows, max_difference, print_table, report, words
+from ghpt.report.tables import COLUMNS, main_rows, max_difference, print_table, report, words
 
 MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 
@@ -98,21 +98,3 @@ def test_terminal_table_fits_80_columns():
     assert not any("…" in line for line in lines)
     for name in ("weight", "worst", "LO-RANSAC"):
         assert any(name in line for line in lines)
-
-
-def test_generalization_table_has_test_sets_as_rows():
-    results = {pair: value + 1 for pair, value in paper.GENERALIZATION.items() if pair != ("cmu2", "cmu4")}
-    lines = generalization_table(results).splitlines()
-    assert max(map(len, lines)) <= 100
-    h36m = [cell.strip() for cell in lines[-1].strip("|").split("|")]
-    assert h36m == [
-        "H36M",
-        "34.5 (33.5)",
-        "34.4 (33.4)",
-        "32.0 (31.0)",
-        "33.5 (32.5)",
-        "30.1 (29.1)",
-        "14.6 (15.1)",
-    ]
-    assert "– (25.6)" in lines[-2]
-    assert "– (2.0)" in lines[-2]

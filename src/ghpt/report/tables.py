@@ -1,4 +1,4 @@
-"""Tables of a test run: report.md, the one in the terminal, and the 5 x 5 of the generalization experiment."""
+"""Tables of a test run: report.md and the one in the terminal."""
 
 from __future__ import annotations
 
@@ -12,14 +12,7 @@ from rich.table import Table
 from ghpt.files import atomic_write
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.selection import SELECTIONS
-from ghpt.report.paper import (
-    ARRANGEMENTS,
-    GENERALIZATION,
-    GENERALIZATION_MAX_DIFFERENCE,
-    QUANTITATIVE,
-    QUANTITATIVE_MEAN,
-    paper_value,
-)
+from ghpt.report.paper import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 
 NAMES = {
     "h36m": "Human3.6M", "panoptic": "Panoptic",
@@ -139,21 +132,6 @@ def prior_table(metrics: Mapping[str, Any], subject: str) -> tuple[list[str], Ro
         values = [numbers["pose_prior"][subject][part] for numbers in selections.values()]
         rows.append([part.replace("_", " "), *(NONE if v is None else f"{1000 * v:.3g}" for v in values)])
     return ["part", *selections], rows
-
-
-def generalization_table(results: Mapping[tuple[str, str], float]) -> str:
-    """tab:generalization-evaluation in Markdown, from (train, test) -> relative MPJPE of ``weight``, mm.
-
-    A row is a test set and a column a training set; the paper's value is in brackets, a missing run is a dash.
-    The last column is `max_difference`.
-    """
-    rows = []
-    for test in ARRANGEMENTS:
-        values = [results.get((train, test)) for train in ARRANGEMENTS]
-        cells = [f"{_mm(v)} ({GENERALIZATION[train, test]})" for train, v in zip(ARRANGEMENTS, values, strict=True)]
-        difference = _mm(None if None in values else max_difference(values))
-        rows.append([test.upper(), *cells, f"{difference} ({GENERALIZATION_MAX_DIFFERENCE[test]})"])
-    return markdown(["test\\train", *(name.upper() for name in ARRANGEMENTS), "max. diff., %"], rows)
 
 
 def max_difference(values: Iterable[float]) -> float:
