@@ -200,4 +200,4 @@ def test_claims_on_unknown_extrinsics(tmp_path, base, inter, held):
     assert len(section.compared) == 8
     assert section.compared[3].ours.values == (base["both"]["relative"],) * 2
     share = 100 * (base["both"]["relative"] / 20 - 1)
-    assert f"| {base['both']['relative']:.1f} (+{share:.1f} %) |" in section.body
+    assert f" {base['both']['relative']:.1f} ± 0.0 (+{share:.1f} %) " in section.body

@@ -63,9 +63,10 @@ def _fundamental(results: Results) -> Section:
         rows += _three_rows(pair, numbers, shapes[pair])
         compared += numbers
     head = ["pair", *(head for head, *_ in ERRORS.values()), "baseline, m", "angle, degrees"]
+    draws = results.read("test", "metrics.json")[0]["draws"]
     text = (
-        f"Medians over {_draws(results)} draws of {FUNDAMENTAL_FRAMES} frames, weighted hypothesis. {ORDER} The angle "
-        "is the one between the two cameras as seen from the middle of the room that people use."
+        f"Medians over {draws} draws of {FUNDAMENTAL_FRAMES} frames, weighted hypothesis. {ORDER} The angle is the one "
+        "between the two cameras as seen from the middle of the room that people use."
     )
     body = [text, markdown(head, rows), "### Classical estimators on the same correspondences", "Median E_3D, mm.",
             _baselines(results)]  # fmt: skip
@@ -196,10 +197,6 @@ def _shapes(results: Results) -> dict[str, tuple[str, str]]:
         angle = torch.rad2deg(torch.arccos(torch.cosine_similarity(one, other, dim=-1))).mean()
         shapes[f"{a}-{b}"] = (f"{(one - other).norm(dim=-1).mean() / 1000:.1f}", f"{angle:.0f}")
     return shapes
-
-
-def _draws(results: Results) -> int:
-    return sum(int(metrics["draws"]) for metrics in results.read("test", "metrics.json"))
 
 
 def _times(spread: Spread, factor: float) -> Spread | None:
