@@ -1,14 +1,17 @@
 """The algebra of estimated extrinsics in place of the true ones."""
 
+import numpy as np
 import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+import toys
+from ghpt.data.frames import Frames
 from ghpt.data.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import PairBatch, RelativePoseEstimate
-from ghpt.reproduction.camera_extrinsics import PARTS, from_pairs, relative, replaced, with_true_scale
+from ghpt.reproduction.camera_extrinsics import PARTS, from_pairs, relative, replaced, seen_by, with_true_scale
 
 TRUTH = human36m_rig("S9").cameras
 
@@ -67,3 +70,18 @@ def test_pairs_with_the_first_camera_are_taken_in_its_order():
     missing = RelativePoseEstimate(R, t, torch.arange(len(pair)) != 1)
     with pytest.raises(GhptDataError, match="a pair has no estimate"):
         from_pairs(missing, batch, "truth")
+
+
+def test_draws_take_turns_over_the_frames_of_their_rigs():
+    rng = np.random.default_rng(0)
+    recordings = [toys.recording(f"S{i}", f"S{i}", 6, 4, 0.0, rng) for i in range(2)]
+    frames = Frames(recordings, np.array([0, 2, 4, 7, 9, 11]))
+    R, t = relative(recordings[0].cameras)
+    shifts = [[0, 10, 20], [30, 40, 50]]  # of a rig's cameras in its draws, mm
+    rigs = [{"recordings": [i], "draws": [(R.tolist(), (t + shift).tolist()) for shift in shifts[i]]} for i in range(2)]
+    batch, true = seen_by(frames, rigs, False, True)[range(6)], frames[range(6)]
+    torch.testing.assert_close(batch.key_points, true.key_points, rtol=0, atol=0)
+    moved = (batch.cameras.t - true.cameras.t)[:, 1:]
+    expected = torch.tensor([0.0, 10, 20, 30, 40, 50])[:, None, None].expand(6, 3, 3).double()
+    torch.testing.assert_close(moved, expected, rtol=0, atol=1e-9)
+    torch.testing.assert_close(batch.cameras.R, true.cameras.R, rtol=0, atol=1e-12)
