@@ -122,11 +122,13 @@ def test_a_table_says_what_validation_chooses_and_what_that_is_worth(tmp_path: P
         return (20.0 if better else 25.0) + seed
 
     found = section("ablation-gumbel", error, tmp_path, seeds=2)
-    assert "Validation chooses: without." in found.body
+    assert "Validation would choose: without." in found.body
     assert "without: -19.6 %, +24.4 %, +24.4 %." in found.body
     assert "20.5 ± 0.7" in found.body
     assert "| average of the same pool " in found.body
     assert found.data == "embedded (synthetic) Human3.6M"
+    equal = section("ablation-gumbel", lambda seed, cell, split, i: 20.0 + 0.1 * ("default" in cell), tmp_path)
+    assert "Validation keeps the default." in equal.body
 
 
 def test_five_hundred_samples_are_enough_only_where_no_other_number_is_better(tmp_path: Path):

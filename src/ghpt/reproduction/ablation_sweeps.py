@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from ghpt.report.tables import NONE, markdown
-from ghpt.reproduction.ablation_cells import BASE, DEFAULT, SETS, evaluated, number, trained
+from ghpt.reproduction.ablation_cells import BASE, CHANCE, DEFAULT, NOTE, SETS, evaluated, number, trained
 from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Claim, Results, Section, Spread, signed
 from ghpt.reproduction.robustness_figure import LABELS, Panel, curves
@@ -172,13 +172,11 @@ def _section(
 def _chosen(validation: Mapping[Place, Spread], test: Mapping[Place, Spread], usual: Place) -> str:
     """What the validation subject would choose, and what that is worth on the test."""
     best = min(validation, key=lambda x: validation[x].mean)
-    if best == usual:
-        return f"Validation chooses the default, {usual:g}."
-    gain, worth = (100 * (errors[best].mean / errors[usual].mean - 1) for errors in (validation, test))
-    return (
-        f"Validation would choose {best:g} ({validation[best].mean:.2f} mm against {validation[usual].mean:.2f} of the "
-        f"default, {signed(gain)} %); on the test subjects that is {signed(worth)} %."
-    )
+    gain, worth = (signed(100 * (errors[best].mean / errors[usual].mean - 1)) for errors in (validation, test))
+    if validation[best].mean > (1 - CHANCE) * validation[usual].mean:
+        least = "" if best == usual else f" (the least error is at {best:g}, {gain} %)"
+        return f"Validation keeps the default, {usual:g}{least}. {NOTE}"
+    return f"Validation would choose {best:g} ({gain} % against the default); on the test subjects that is {worth} %."
 
 
 def _text(spread: Spread | None) -> str:

@@ -7,7 +7,7 @@ from functools import partial
 
 from ghpt.report.tables import NAMES, markdown
 from ghpt.reproduction import ablation_sweeps as sweeps
-from ghpt.reproduction.ablation_cells import BASE, SETS, evaluated, number, trained
+from ghpt.reproduction.ablation_cells import BASE, CHANCE, NOTE, SETS, evaluated, number, trained
 from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Item, Results, Section, Spread, signed
 from ghpt.reproduction.setup import Setup
@@ -59,12 +59,13 @@ def _chosen(numbers: Mapping[str, Sequence[Spread]]) -> str:
     """What the validation subject would choose, and what each other setting changes."""
     usual = next(iter(numbers))
     best = min(numbers, key=lambda name: numbers[name][0].mean)
-    parts = [f"Validation chooses: {best}."]
+    tied = numbers[best][0].mean > (1 - CHANCE) * numbers[usual][0].mean
+    parts = ["Validation keeps the default." if tied else f"Validation would choose: {best}."]
     for name, spreads in numbers.items():
         if name != usual:
             changes = (100 * (a.mean / b.mean - 1) for a, b in zip(spreads, numbers[usual], strict=True))
             parts.append(f"Against the default, {name}: {', '.join(f'{signed(change)} %' for change in changes)}.")
-    return " ".join(parts)
+    return " ".join([*parts, NOTE])
 
 
 def _training(label: str, title: str, variants: Variants, about: str) -> Item:

@@ -10,6 +10,9 @@ from ghpt.reproduction.robustness_curve import Curve, Found, cells_of, found
 from ghpt.reproduction.robustness_figure import LABELS, Panel, curves
 from ghpt.reproduction.robustness_text import table, verdict
 
+_TABLE_ALONE = ("most", "best")
+"""Not in the figures."""
+
 
 def _section(results: Results, of: Sequence[Curve], about: str, absolute: bool, claims: Claims) -> Section:
     sizes = results.setup.sizes["robustness"]
@@ -19,7 +22,7 @@ def _section(results: Results, of: Sequence[Curve], about: str, absolute: bool, 
     kinds = ("relative", "absolute") if absolute else ("relative",)
     figures, body = {}, [about]
     panels = [
-        Panel(c.x, {n: (f.places, s) for n, s in f.errors["relative"].items() if n != "best"}, c.logarithmic)
+        Panel(c.x, {n: (f.places, s) for n, s in f.errors["relative"].items() if n not in _TABLE_ALONE}, c.logarithmic)
         for c, f in zip(of, all_found, strict=True)
     ]
     name = f"robustness_{of[0].name}"
@@ -77,8 +80,8 @@ ITEMS = (
         "More outliers",
         _SAME + "A random share of the detections is moved in a random direction, by a random length within a range of "
         "fractions of the person's size in the image (the diagonal of the box around the joints), on top of the "
-        "detector's own errors. Hypotheses are whole poses: the more outliers, the fewer that are free of them in "
-        "every joint, while the robust estimators decide joint by joint.",
+        "detector's own errors. The learned selection's weights are soft, so hypotheses with an outlier keep a share "
+        "of its average; the best-scored hypothesis alone stands beside it.",
         OUTLIERS,
         claims=_outlier_claims,
     ),

@@ -22,7 +22,8 @@ STYLES = {
     "best": ("#999999", ":", "*"), "trained": ("#E69F00", "-.", "D"), "tested": ("#D55E00", "--", "s"),
 }  # fmt: skip
 LABELS = NAMES | {
-    "weight": "learned selection", "average": "average of its pool", "best": "best of its pool (looks at the truth)",
+    "weight": "learned selection", "average": "average of its pool",
+    "most": "best-scored of its pool", "best": "best of its pool (looks at the truth)",
 }  # fmt: skip
 WIDTHS = {"weight": 2.2, "linear": 2.6, "ransac": 3.2}
 """Of those that others often lie upon, or that matter most; 1.4 of the rest."""

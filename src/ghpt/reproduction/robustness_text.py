@@ -39,8 +39,10 @@ def verdict(curve: Curve, of: Found) -> str:
     if "lo_ransac" in of.classical:
         ahead.append(f"of LO-RANSAC at {_where(curve, of, ['lo_ransac'])}")
     parts.append(f"It is ahead {', '.join(ahead)}.")
-    best = " and ".join(f"{of.mean('best', i):.1f}" for i in (0, last))
-    parts.append(f"The best hypothesis of its pool, which looks at the truth, has {best} mm there.")
+    most, best = (" and ".join(f"{of.mean(name, i):.1f}" for i in (0, last)) for name in ("most", "best"))
+    parts.append(
+        f"There the best-scored hypothesis of its pool has {most} mm, and the best, known by the truth, {best}."
+    )
     return " ".join(parts)
 
 

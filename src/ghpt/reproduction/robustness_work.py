@@ -18,7 +18,7 @@ from ghpt.reproduction.work import CHECKPOINT
 from ghpt.skeleton import JOINTS
 
 KINDS = ("relative", "absolute")
-LEARNED = ("weight", "average", "best")
+LEARNED = ("weight", "average", "most", "best")
 """Selections of the model's pool; the best one looks at the truth."""
 
 Estimators = Callable[[KeyPointBatch], dict[str, PoseEstimate]]
