@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 from ghpt.report.pair_tables import NAMES
 from ghpt.report.sweep import CLIP, Sweep, frames_sweep, pairs_table, statistics_of, sweep_table, wins
+from ghpt.reproduction.camera_cells import camera_model, of_test
 from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Claim, Item, Results, Section
 from ghpt.reproduction.setup import Setup
@@ -16,16 +16,6 @@ BASELINES = ("eight_point", "ransac", "poselib")
 PAPER_PAIR = (2, 3)
 MEAN, DEVIATION, MEDIAN = range(3)
 """Places in `statistics_of`."""
-
-
-def camera_model(setup: Setup) -> Cell:
-    """The paper's: trained on Human3.6M."""
-    return setup.trained("h36m", model="camera", seconds=100.0)
-
-
-def of_test(composed: Mapping[str, Any]) -> dict[str, Any]:
-    """What every test depends on, out of test.py's whole configuration."""
-    return {key: composed[key] for key in ("data", "seed", "hypotheses", "files") if key in composed}
 
 
 def _cells(setup: Setup) -> dict[str, Cell]:

@@ -1,23 +1,21 @@
-"""The tables of relative camera poses (paper, section 4.4 and appendix A)."""
+"""tab:fundamental-evaluation (paper, section 4.4), and all items of the camera problem."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
 
-from ghpt.report.pair_evaluate import ALONE
 from ghpt.report.pair_predictions import open_pairs
 from ghpt.report.pair_tables import NAMES
-from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
+from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_FRAMES
 from ghpt.report.tables import markdown
-from ghpt.reproduction.camera_figures import SWEEP, camera_model
+from ghpt.reproduction.camera_cells import measured, of_pair, tested_pairs, three_rows
+from ghpt.reproduction.camera_dissection import DISSECTION
+from ghpt.reproduction.camera_figures import SWEEP
 from ghpt.reproduction.camera_unknown import UNKNOWN
-from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Claim, Compared, Item, Results, Section, Spread
-from ghpt.reproduction.setup import Setup
 
 ERRORS = {
     "E_R": ("E_R, 10⁻³", 1000.0, 1),
@@ -36,31 +34,16 @@ ORDER = (
 )
 
 
-def tested_pairs(setup: Setup) -> dict[str, Cell]:
-    """The camera model on Human3.6M with all classical estimators."""
-    return {"test": setup.tested(camera_model(setup), "h36m", f"frames={FUNDAMENTAL_FRAMES}", seconds=75.0)}
-
-
-def of_pair(results: Results, method: str, pair: str, *keys: str) -> Spread:
-    """A number of metrics.json over the seeds; inf where it could not be measured."""
-    values = []
-    for content in results.read("test", "metrics.json"):
-        for key in ("selections", method, "pairs", pair, *keys):
-            content = content[key]
-        values.append(math.inf if content is None else float(content))
-    return Spread(tuple(values))
-
-
 def _fundamental(results: Results) -> Section:
     rows, compared, shapes = [], [], _shapes(results)
     for ab, printed in FUNDAMENTAL.items():
         pair = f"{ab[0]}-{ab[1]}"
         numbers = [
-            Compared(f"{pair} {error}", times * printed[error], _times(of_pair(results, "weight", pair, error), times),
+            Compared(f"{pair} {error}", times * printed[error], measured(of_pair(results, "weight", pair, error), times),
                      digits=digits)
             for error, (_, times, digits) in ERRORS.items()
         ]  # fmt: skip
-        rows += _three_rows(pair, numbers, shapes[pair])
+        rows += three_rows(pair, numbers, shapes[pair])
         compared += numbers
     head = ["pair", *(head for head, *_ in ERRORS.values()), "baseline, m", "angle, degrees"]
     draws = results.read("test", "metrics.json")[0]["draws"]
@@ -125,67 +108,6 @@ def _explained(results: Results, shapes: Mapping[str, Sequence[str]]) -> str:
     )
 
 
-def _dissection(results: Results) -> Section:
-    rows, compared = [], []
-    for ab, printed in FUNDAMENTAL_DISSECTION.items():
-        pair = f"{ab[0]}-{ab[1]}"
-        numbers = [
-            Compared(f"{pair} {error}, {part.replace('_', ' ')}", printed[part][error],
-                     of_pair(results, "weight", pair, part, error))
-            for part in ALONE
-            for error in ("E_2D", "E_3D")
-        ]  # fmt: skip
-        rows += _three_rows(pair, numbers, [of_pair(results, "weight", pair, "E_3D").text()])
-        compared += numbers
-    head = ["pair", "R: E_2D, px", "R: E_3D, mm", "t: E_2D, px", "t: E_3D, mm", "both: E_3D, mm"]
-    text = (
-        "Errors of the weighted hypothesis when one part of the pose is estimated and the other one is true; medians."
-    )
-    alone = {
-        f"{a}-{b}": [of_pair(results, "weight", f"{a}-{b}", part, "E_3D").mean for part in ALONE]
-        for a, b in FUNDAMENTAL
-    }
-    pixels = [[of_pair(results, "weight", pair, part, "E_2D").mean for part in ALONE] for pair in alone]
-    higher = [pair for pair, (R, t) in alone.items() if t > R]
-    both_higher = len(higher) + sum(t > R for R, t in pixels)
-    claim = Claim(
-        "errors of estimated translations are always higher than those of estimated rotations", "appendix A",
-        both_higher == 2 * len(alone),
-        f"in {len(higher)} of {len(alone)} pairs in E_3D, in {both_higher - len(higher)} in E_2D "
-        f"(largest opposite: {_largest_opposite(alone)})",
-    )  # fmt: skip
-    return Section(
-        results.words("h36m"), f"{text}\n\n{markdown(head, rows)}", {}, compared, [claim], _compensation(results, alone)
-    )
-
-
-def _largest_opposite(alone: Mapping[str, Sequence[float]]) -> str:
-    pair = max(alone, key=lambda pair: alone[pair][0] - alone[pair][1])
-    R, t = alone[pair]
-    return f"{pair}, R {R:.1f} mm, t {t:.1f} mm" if t <= R else "none"
-
-
-def _compensation(results: Results, alone: Mapping[str, Sequence[float]]) -> str:
-    """The errors of R and t of one estimate are not independent."""
-    both = {pair: of_pair(results, "weight", pair, "E_3D").mean for pair in alone}
-    smaller = [pair for pair in alone if both[pair] < min(alone[pair])]
-    if not smaller:
-        return "With both parts estimated E_3D is larger than with one of them, as in the paper's tables."
-    with_both = np.mean([both[pair] for pair in smaller])
-    R, t = np.mean([alone[pair] for pair in smaller], axis=0)
-    return (
-        f"An estimate's rotation and translation err together and make up for one another: on {', '.join(smaller)} "
-        f"E_3D is smaller with both of them (mean {with_both:.1f} mm) than with R ({R:.1f} mm) or t ({t:.1f} mm) "
-        "alone, and to take one part from the truth undoes that. In the paper's tables the errors of the parts are the "
-        "smaller ones on all pairs."
-    )
-
-
-def _three_rows(pair: str, numbers: Sequence[Compared], more: Sequence[str]) -> list[list[str]]:
-    kinds = zip(("paper", "ours", "difference"), zip(*(n.cells() for n in numbers), strict=True), strict=True)
-    return [[f"{pair} {kind}", *cells, *(more if kind == "ours" else [""] * len(more))] for kind, cells in kinds]
-
-
 def _shapes(results: Results) -> dict[str, tuple[str, str]]:
     """Pair -> distance of its cameras (m) and the angle (degrees) between them as seen from the middle of the points
     X*, the mean of the rigs."""
@@ -199,11 +121,6 @@ def _shapes(results: Results) -> dict[str, tuple[str, str]]:
     return shapes
 
 
-def _times(spread: Spread, factor: float) -> Spread | None:
-    """None where it could not be measured."""
-    return Spread(tuple(factor * v for v in spread.values)) if math.isfinite(spread.mean) else None
-
-
 def _mean(spreads: Sequence[Spread]) -> float:
     return float(np.mean([spread.mean for spread in spreads]))
 
@@ -212,5 +129,5 @@ ITEMS = (
     Item("fundamental-evaluation", "table", "Relative camera poses on Human3.6M", tested_pairs, _fundamental),
     SWEEP,
     UNKNOWN,
-    Item("fundamental-dissection", "table", "Relative camera poses, one part estimated", tested_pairs, _dissection),
+    DISSECTION,
 )

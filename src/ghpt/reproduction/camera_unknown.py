@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from ghpt.report.paper import UNKNOWN_EXTRINSICS
 from ghpt.report.tables import NONE, markdown
+from ghpt.reproduction.camera_cells import camera_model, of_test
 from ghpt.reproduction.camera_extrinsics import KINDS, PARTS
-from ghpt.reproduction.camera_figures import camera_model, of_test
 from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Claim, Compared, Item, Results, Section, Spread, over_seeds, signed
 from ghpt.reproduction.setup import Setup
