@@ -38,11 +38,11 @@ def _fundamental(results: Results) -> Section:
     rows, compared, shapes = [], [], _shapes(results)
     for ab, printed in FUNDAMENTAL.items():
         pair = f"{ab[0]}-{ab[1]}"
+        ours = {error: of_pair(results, "weight", pair, error) for error in ERRORS}
         numbers = [
-            Compared(f"{pair} {error}", times * printed[error], measured(of_pair(results, "weight", pair, error), times),
-                     digits=digits)
+            Compared(f"{pair} {error}", times * printed[error], measured(ours[error], times), digits=digits)
             for error, (_, times, digits) in ERRORS.items()
-        ]  # fmt: skip
+        ]
         rows += three_rows(pair, numbers, shapes[pair])
         compared += numbers
     head = ["pair", *(head for head, *_ in ERRORS.values()), "baseline, m", "angle, degrees"]
