@@ -26,6 +26,8 @@ SELECTION_COLOURS = dict(
         strict=True,
     )
 )
+SELECTION_HATCHES = dict(zip(SELECTIONS, ("", "//", "...", "\\\\", "xx", "--", "", "oo"), strict=True))
+"""The same in print without colours."""
 _SIDES = tuple("left" if "left" in a + b else "right" if "right" in a + b else "middle"
                for a, b in ((JOINTS[i], JOINTS[j]) for i, j in BONES))  # fmt: skip
 _STYLES = {"left": (LEFT, "solid"), "right": (RIGHT, (0, (3, 1))), "middle": (MIDDLE, "solid")}
@@ -81,7 +83,8 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
         prior = metrics["selections"][name]["pose_prior"][subject]
         heights = [np.nan if prior[part] is None else prior[part] for part in PARTS]
         place = np.arange(len(PARTS)) + (i - (len(selections) - 1) / 2) * width
-        axes.bar(place, heights, width, color=SELECTION_COLOURS[name], edgecolor="black", linewidth=0.4, label=name)
+        colour, hatch = SELECTION_COLOURS[name], SELECTION_HATCHES[name]
+        axes.bar(place, heights, width, color=colour, hatch=hatch, edgecolor="black", linewidth=0.4, label=name)
     axes.set_yscale("log")
     axes.set_xticks(range(len(PARTS)), [part.replace("_", " ") for part in PARTS])
     axes.set_ylabel("S²: variance of left / right length")
