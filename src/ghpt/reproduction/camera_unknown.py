@@ -12,7 +12,7 @@ from ghpt.reproduction.setup import Setup
 
 SOURCES = {"weight": "pairs, learned", "poselib": "pairs, PoseLib", "rig": "whole rig"}
 MODELS = {"h36m": "base dataset", "cmu3": "CMU3 → H36M"}
-COLUMNS = {"known": "known [R\\|t]", "R": "estimated R", "t": "estimated t", "both": "estimated [R\\|t]"}
+COLUMNS = {"known": "known R and t", "R": "estimated R", "t": "estimated t", "both": "estimated R and t"}
 GOAL = 0.05
 """Of this project: what estimated cameras may cost."""
 
@@ -125,14 +125,15 @@ def _claims(results: Results) -> list[Claim]:
     better = ", ".join(f"{base:.1f} {'<' if base < inter else '≥'} {inter:.1f}" for base, inter in pairs)
     more = all(increase[trained, "t"] > increase[trained, "R"] for trained in MODELS)
     why = "" if more else "; R and t of a pair err together, see fundamental-dissection"
+    rig = {trained: signed(100 * _increase(results, trained, "rig", "both").mean) for trained in MODELS}
     return [
         Claim("unknown translations cost more than unknown rotations", "appendix A", more, f"{drop}{why}"),
         Claim("the base dataset is better than inter-dataset", "appendix A",
               all(base < inter for base, inter in pairs), f"{better} mm"),
         *(
-            Claim(f"estimated [R|t] cost at most {100 * GOAL:.0f} % on {name} (the goal of ghpt)", "appendix A",
+            Claim(f"estimated R and t cost at most {100 * GOAL:.0f} % on {name} (the goal of ghpt)", "appendix A",
                   increase[trained, "both"] <= 100 * GOAL,
-                  f"{increase[trained, 'both']:+.1f} % ({paper[trained, 'both']:+.0f} %)")
+                  f"pairs {increase[trained, 'both']:+.1f} % ({paper[trained, 'both']:+.0f} %), whole rig {rig[trained]} %")
             for trained, name in MODELS.items()
         ),
     ]  # fmt: skip
