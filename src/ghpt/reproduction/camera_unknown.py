@@ -133,7 +133,7 @@ def _claims(results: Results) -> list[Claim]:
         *(
             Claim(f"estimated R and t cost at most {100 * GOAL:.0f} % on {name} (the goal of ghpt)", "appendix A",
                   increase[trained, "both"] <= 100 * GOAL,
-                  f"pairs {increase[trained, 'both']:+.1f} % ({paper[trained, 'both']:+.0f} %), whole rig {rig[trained]} %")
+                  f"pairs {increase[trained, 'both']:+.1f} % ({paper[trained, 'both']:+.0f} %), rig {rig[trained]} %")
             for trained, name in MODELS.items()
         ),
     ]  # fmt: skip
