@@ -21,8 +21,8 @@ from toys import DATA, TRAIN
 CONF = Path(__file__).resolve().parents[1] / "conf"
 BY_LABEL = {item.label: item for item in ITEMS}
 SIZES = {
-    "stride": {"validation": 512, "test": 512}, "temperature": [0.5, 5.0], "hypotheses": [10, 1000],
-    "hypotheses_trained": [20], "samples": [50, 5000],
+    "stride": {"validation": 512, "test": 512}, "also_trained_on": ["cmu3"], "temperature": [0.5, 5.0],
+    "hypotheses": [10, 1000], "hypotheses_trained": [20], "samples": [50, 5000],
 }  # fmt: skip
 
 
@@ -111,7 +111,7 @@ def test_each_setting_is_trained_twice_and_the_default_is_the_reports_own_model(
 )
 def test_each_quantity_is_what_the_models_are_trained_with(label: str, keys: tuple[str, str], trained: set[float]):
     cells = BY_LABEL[f"ablation-{label}"].cells(setup())
-    models = [cell.needs["model"].config for cell in cells.values() if "sets" in cell.config]
+    models = [cell.needs["model"].config for name, cell in cells.items() if name not in ("model", "cmu3")]
     assert {config[keys[0]][keys[1]] for config in models} == trained
     assert len(models) == len(trained)
 
@@ -129,6 +129,12 @@ def test_a_table_says_what_validation_chooses_and_what_that_is_worth(tmp_path: P
     assert found.data == "embedded (synthetic) Human3.6M"
     equal = section("ablation-gumbel", lambda seed, cell, split, i: 20.0 + 0.1 * ("default" in cell), tmp_path)
     assert "Validation keeps the default." in equal.body
+
+
+def test_a_table_without_another_training_set_has_none(tmp_path: Path):
+    cells = BY_LABEL["ablation-features"].cells(setup(also_trained_on=[]))
+    assert len(cells) == 3
+    assert all(name.startswith("h36m") for name in cells)
 
 
 def test_five_hundred_samples_are_enough_only_where_no_other_number_is_better(tmp_path: Path):

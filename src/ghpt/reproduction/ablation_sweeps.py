@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ghpt.report.tables import NONE, markdown
+from ghpt.report.tables import NAMES, NONE, markdown
 from ghpt.reproduction.ablation_cells import BASE, CHANCE, DEFAULT, NOTE, SETS, evaluated, number, trained
 from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Claim, Results, Section, Spread, signed
@@ -35,7 +35,10 @@ def levels(setup: Setup, name: str, *keys: str) -> list[Place]:
 
 def temperature_cells(setup: Setup) -> dict[str, Cell]:
     values = levels(setup, "temperature", "model", "temperature")
-    cells = {DEFAULT: evaluated(setup, setup.trained(BASE), [(None, value) for value in values])}
+    cells = {
+        name: evaluated(setup, setup.trained(data), [(None, value) for value in values])
+        for name, data in {DEFAULT: BASE, **{novel: novel for novel in _novel(setup)}}.items()
+    }
     for value in values:
         if value != default(setup, "model", "temperature"):
             model = trained(setup, BASE, f"model.temperature={value}", name=f"temperature{value:g}")
@@ -43,18 +46,23 @@ def temperature_cells(setup: Setup) -> dict[str, Cell]:
     return cells
 
 
+def _novel(setup: Setup) -> list[str]:
+    """The first other training set, if there is one: what a temperature is worth depends on it."""
+    return setup.sizes["ablation"]["also_trained_on"][:1]
+
+
 def temperature(results: Results) -> Section:
     setup = results.setup
     values, usual = (f(setup, *x, "model", "temperature") for f, x in ((levels, ("temperature",)), (default, ())))
-    lines: Lines = {
+    lines: dict[str, Mapping[Place, Row]] = {
         "weight": {v: (DEFAULT, "weight", i) if v == usual else (f"{v:g}", "weight", 0) for i, v in enumerate(values)},
         "tested": {v: (DEFAULT, "weight", i) for i, v in enumerate(values)},
         "average": {v: (DEFAULT, "average", i) for i, v in enumerate(values)},
     }
-    labels = {
-        "weight": "trained and tested with it", "tested": f"trained with {usual:g}, tested with it",
-        "average": LABELS["average"],
-    }  # fmt: skip
+    labels = LABELS | {"weight": "trained and tested with it", "tested": f"trained with {usual:g}, tested with it"}
+    for novel in _novel(setup):
+        lines["trained"] = {v: (novel, "weight", i) for i, v in enumerate(values)}
+        labels["trained"] = f"the same, trained on {NAMES[novel]}"
     text = (
         "The temperature divides the logits before the softmax. Low, the weights gather on the best-scored hypotheses; "
         "high, they become the average."
@@ -154,19 +162,30 @@ def _section(
         for split, rows in numbers.items()
     ]  # fmt: skip
     data = results.words(BASE)
-    figure = curves(panels, f"{data}, trained on its training subjects", "pelvis-relative MPJPE, mm", labels, False)
-    rows = []
-    for place in sorted({x for row in lines.values() for x in row}):
-        cells = [_text(numbers[split][style].get(place)) for split in SETS for style in lines]
-        rows.append([f"{place:g}{' (default)' * (place == usual)}", *cells])
-    columns = [f"{SETS[split]}: {labels.get(style, style)}" for split in SETS for style in lines]
+    figure = curves(
+        panels, f"{data}, trained on its training subjects unless said", "pelvis-relative MPJPE, mm", labels, False
+    )
     body = [
-        f"{text} Trained and tested on Human3.6M.",
+        f"{text} Trained and tested on Human3.6M unless said.",
         f"![Pelvis-relative MPJPE against {head}, {data}](ablation_{name}.svg)",
-        f"Pelvis-relative MPJPE, mm:\n\n{markdown([head, *columns], rows)}",
+        *(
+            f"Pelvis-relative MPJPE, mm, {SETS[split]}:\n\n{_table(head, numbers[split], labels, usual)}"
+            for split in SETS
+        ),
         _chosen(numbers["validation"]["weight"], numbers["test"]["weight"], usual),
     ]
     return Section(data, "\n\n".join(body), {f"ablation_{name}": figure}, claims=claims)
+
+
+def _table(
+    head: str, lines: Mapping[str, Mapping[Place, Spread]], labels: Mapping[str, str], usual: Place
+) -> str:  # fmt: skip
+    """A row for each place, a column for each line."""
+    places = sorted({x for row in lines.values() for x in row})
+    return markdown(
+        [head, *(labels.get(name, name) for name in lines)],
+        [[f"{x:g}{' (default)' * (x == usual)}", *(_text(row.get(x)) for row in lines.values())] for x in places],
+    )
 
 
 def _chosen(validation: Mapping[Place, Spread], test: Mapping[Place, Spread], usual: Place) -> str:

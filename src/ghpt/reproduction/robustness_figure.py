@@ -65,7 +65,8 @@ def curves(
         axes[0].yaxis.set_minor_locator(NullLocator())
         axes[0].yaxis.set_major_formatter(ScalarFormatter())
     handles = {h.get_label(): h for each in axes for h in each.get_legend_handles_labels()[0]}
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=4, frameon=False, fontsize=9)
+    columns = 4 if max(map(len, handles)) <= 25 else 2
+    figure.legend(handles.values(), handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
     figure.suptitle(wrapped(heading, 70 if len(panels) == 1 else 95), fontsize=10)
     return figure
 

@@ -41,7 +41,7 @@ def verdict(curve: Curve, of: Found) -> str:
     parts.append(f"It is ahead {', '.join(ahead)}.")
     most, best = (" and ".join(f"{of.mean(name, i):.1f}" for i in (0, last)) for name in ("most", "best"))
     parts.append(
-        f"There the best-scored hypothesis of its pool has {most} mm, and the best, known by the truth, {best}."
+        f"At these two ends the best-scored hypothesis of its pool has {most} mm, the best of its pool {best}."
     )
     return " ".join(parts)
 
