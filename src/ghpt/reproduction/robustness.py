@@ -94,8 +94,9 @@ ITEMS = (
     _item(
         "robustness-views",
         "Two to 31 cameras",
-        "Of the 31 HD cameras each frame has its own random choice; a larger choice contains the smaller ones. Where "
-        "not all joints are seen in two views, the errors of different rows are of different joints.",
+        "Of the 31 HD cameras each frame has its own random choice; a larger choice contains the smaller ones. The "
+        "people are those of the training, later in the same sequences. Where not all joints are "
+        "seen in two views, the errors of different rows are of different joints.",
         VIEWS,
     ),
     _item(

@@ -50,7 +50,7 @@ def curves(
 ) -> Figure:
     """The panels side by side, on one vertical axis where they ``share`` it; bars are a standard deviation over the
     seeds."""
-    figure = Figure(figsize=(6.4 if len(panels) == 1 else 8.4, 4.6), layout="constrained")
+    figure = Figure(figsize=(6.4 if len(panels) == 1 else 7.2, 4.6), layout="constrained")
     axes = figure.subplots(1, len(panels), sharey=share, squeeze=False)[0]
     for each, panel in zip(axes, panels, strict=True):
         _draw(each, panel, labels)
@@ -67,7 +67,7 @@ def curves(
     handles = {h.get_label(): h for each in axes for h in each.get_legend_handles_labels()[0]}
     columns = 4 if max(map(len, handles)) <= 25 else 2
     figure.legend(handles.values(), handles, loc="outside lower center", ncols=columns, frameon=False, fontsize=9)
-    figure.suptitle(wrapped(heading, 70 if len(panels) == 1 else 95), fontsize=10)
+    figure.suptitle(wrapped(heading, 70 if len(panels) == 1 else 80), fontsize=10)
     return figure
 
 
