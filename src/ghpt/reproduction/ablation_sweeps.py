@@ -102,27 +102,33 @@ def hypotheses(results: Results) -> Section:
 
 
 def samples_cells(setup: Setup) -> dict[str, Cell]:
-    usual = default(setup, "data", "train_samples")
-    cells = {DEFAULT: evaluated(setup, setup.trained(BASE)), "model": setup.trained(BASE)}
+    usual, hypotheses = default(setup, "data", "train_samples"), default(setup, "model", "hypotheses")
+    pool = setup.sizes["ablation"]["samples_hypotheses"]
+    cells = {"model": setup.trained(BASE)}
     for value in levels(setup, "samples", "data", "train_samples"):
+        changes, seconds = [f"model.hypotheses={pool}"], 4 + 25 * value / usual * pool / hypotheses
+        name = f"hypotheses{pool}"
         if value != usual:
-            seconds = 4 + 16 * value / usual
-            model = trained(setup, BASE, f"data.train_samples={value}", name=f"samples{value}", seconds=seconds)
-            cells[f"{value}"] = evaluated(setup, model)
+            changes, name = [*changes, f"data.train_samples={value}"], f"samples{value}-{name}"
+        model = trained(setup, BASE, *changes, name=name, seconds=seconds)
+        cells[f"{value}"] = evaluated(setup, model, [(hypotheses, None)])
     return cells
 
 
 def samples(results: Results) -> Section:
     setup = results.setup
     values, usual = (f(setup, *x, "data", "train_samples") for f, x in ((levels, ("samples",)), (default, ())))
-    name = {v: DEFAULT if v == usual else f"{v}" for v in values}
+    name = {v: f"{v}" for v in values}
+    pool, tested = setup.sizes["ablation"]["samples_hypotheses"], default(setup, "model", "hypotheses")
     lines: Lines = {
         "weight": {v: (name[v], "weight", 0) for v in values},
         "average": {v: (name[v], "average", 0) for v in values},
     }
     text = (
         "Training samples, each seen once, in batches of 16: a model trained on 50 has had four steps. More samples "
-        "mean more steps too, as in appendix C, where an iteration is a sample."
+        f"mean more steps too, as in appendix C, where an iteration is a sample. All models of this sweep are trained "
+        f"with {pool} hypotheses, for the sake of time, and tested with {tested}; what that costs is in "
+        "ablation-hypotheses."
     )
     claims = [_enough(results, name, usual), _minutes(results)]
     return _section(results, "samples", "training samples", lines, LABELS, text, usual, claims)

@@ -35,7 +35,7 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
     cells.mkdir(parents=True, exist_ok=True)
     sweep_temporaries(cells)
     missing = {key: cell for key, cell in with_needs(wanted).items() if not cell.done(cells)}
-    number = len(missing)
+    number, chain = len(missing), _chains(missing)
     with (
         _terminable(),
         _progress(list(missing.values()), show) as finished,
@@ -44,7 +44,7 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
         waiting, running = dict(missing), {}
         while waiting or running:
             ready = [c for c in waiting.values() if not any(b.key in missing for b in c.needs.values())]
-            for cell in sorted(ready, key=lambda c: -c.seconds)[: jobs - len(running)]:
+            for cell in sorted(ready, key=lambda c: -chain[c.key])[: jobs - len(running)]:
                 running[submit(cell, cells)] = waiting.pop(cell.key)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 cell = running.pop(future)
@@ -55,6 +55,16 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
                     raise
                 del missing[cell.key]
     return number
+
+
+def _chains(cells: dict[str, Cell]) -> dict[str, float]:
+    """Seconds of the longest chain of cells that begins with each: what is first in a long one is done first."""
+    chain = {key: cell.seconds for key, cell in cells.items()}
+    for key, cell in reversed(cells.items()):  # needs come before those who need them
+        for before in cell.needs.values():
+            if before.key in chain:
+                chain[before.key] = max(chain[before.key], before.seconds + chain[key])
+    return chain
 
 
 @contextlib.contextmanager

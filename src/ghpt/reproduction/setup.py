@@ -16,9 +16,6 @@ from ghpt.config import build, plain
 from ghpt.reproduction.cells import Cell
 from ghpt.train import typed
 
-OVERHEAD = 3.0
-"""Seconds of any cell beyond its arithmetic."""
-
 
 @functools.cache
 def compose(conf: Path, name: str, overrides: tuple[str, ...]) -> dict[str, Any]:
@@ -67,7 +64,7 @@ class Setup:
         files = {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
         return Cell(f"prepare-{data}-{split}", "ghpt.reproduction.work.prepare_split", config | files, seconds=8.0)
 
-    def trained(self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 18.0) -> Cell:
+    def trained(self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 30.0) -> Cell:
         """A model trained on a data set; ``overrides`` are those of train.py, ``name`` tells them apart."""
         words = (f"model={model}", *self.overrides["train"], *overrides)
         config = {k: v for k, v in self.composed("train", data, *words).items() if k not in ("save_every", "resume")}
@@ -77,7 +74,7 @@ class Setup:
         return Cell(name, "ghpt.reproduction.work.train_model", config, needs, command, seconds)
 
     def tested(
-        self, model: Cell, data: str, *overrides: str, name: str = "", baselines: bool = True, seconds: float = 7.0
+        self, model: Cell, data: str, *overrides: str, name: str = "", baselines: bool = True, seconds: float = 12.0
     ) -> Cell:
         """The model of a `trained` cell on a data set; ``baselines`` False leaves the classical estimators out."""
         overrides = (*self.overrides["test"], *overrides)
