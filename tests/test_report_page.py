@@ -21,7 +21,11 @@ def figure():
 def page():
     good = Compared("weight", 29.1, Spread((26.0, 27.0)))
     bad = Compared("most <b>", 20.0, Spread((26.0, 27.0)))
-    claims = [Claim("most < least", "4.2", True, "1 < 2"), Claim("a & b", "4.3", False, "by 3 mm")]
+    claims = [
+        Claim("most < least", "4.2", True, "1 < 2"),
+        Claim("a & b", "4.3", False, "by 3 mm"),
+        Claim("of others", "4.1", None, "25 against 30"),
+    ]
     entries = [
         Entry(Item("first", "table", "A table", dict, dict),
               Section("embedded (synthetic) Human3.6M", "A table of *x*:\n\n| a | b |\n|---|---|\n| 1 | 2 |",
@@ -100,5 +104,5 @@ def test_numbers_and_claims_for_programs(page, tmp_path):
     write_page(page, tmp_path)
     items = json.loads((tmp_path / "report.json").read_text())["items"]
     assert items["first"]["numbers"][0] == {"what": "weight", "paper": 29.1, "ours": [26.0, 27.0], "miss": False}
-    assert [claim["holds"] for claim in items["first"]["claims"]] == [True, False]
+    assert [claim["holds"] for claim in items["first"]["claims"]] == [True, False, None]
     assert items["second"] == {"data": "Human3.6M from /data", "numbers": [], "claims": []}

@@ -22,9 +22,10 @@ PAPER = ("generalization-evaluation", "iskakov-comparison", "remelli-comparison"
 def command(typed, tmp_path):
     def call(*words):
         flags = [word for word in words if word == "-m"]  # Hydra wants them first
-        folders = (f"output={tmp_path / 'report'}", f"cells={tmp_path / 'cells'}")
-        return typed(CONF, "reproduce", [*spread([*flags, *SMALL, *(word for word in words if word not in flags)]), *folders], partial(reproduce, conf=CONF), summary,
-                     partial(gather, conf=CONF))  # fmt: skip
+        settings = [*SMALL, *(word for word in words if word not in flags)]
+        folders = [f"output={tmp_path / 'report'}", f"cells={tmp_path / 'cells'}"]
+        task, after = (partial(function, conf=CONF) for function in (reproduce, gather))
+        return typed(CONF, "reproduce", [*spread([*flags, *settings]), *folders], task, summary, after)
 
     return call
 

@@ -52,11 +52,11 @@ def _quantitative(results: Results) -> Section:
     )
     mean = ours[-1].mean
     beaten = [name for name, values in QUANTITATIVE_OTHERS.items() if mean < values[-1]]
-    claims = [
-        Claim("2.2 mm behind epipolar transformers, and ahead of most other methods without additional data", "4.2",
-              len(beaten) >= 4, f"{mean:.1f} mm: ahead of {len(beaten)} of 5 (29.1 mm: 4 of 5)"),
-    ]  # fmt: skip
-    return Section(results.words("h36m"), f"{text}\n\n{markdown(header, rows)}", {}, compared, claims, _ACTIONS)
+    claim = Claim(
+        "2.2 mm behind epipolar transformers, and ahead of most other methods without additional data", "4.2",
+        results.on_real("h36m", len(beaten) >= 4), f"{mean:.1f} mm: ahead of {len(beaten)} of 5 (29.1 mm: 4 of 5)",
+    )  # fmt: skip
+    return Section(results.words("h36m"), f"{text}\n\n{markdown(header, rows)}", {}, compared, [claim], _ACTIONS)
 
 
 _ACTIONS = (
@@ -116,7 +116,7 @@ def _hypotheses_claims(name: str, ours: dict[str, float], paper: dict[str, float
         claims.append(order("RANSAC < weight (the paper's one loss)", "ransac", "weight"))
     else:
         claims += [
-            order("weight < RANSAC, a significant improvement", "weight", "ransac"),
+            order("weight < RANSAC", "weight", "ransac"),
             order("most < average", "most", "average"),
             order("random < stochastic", "random", "stochastic"),
         ]

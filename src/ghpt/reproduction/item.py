@@ -91,12 +91,14 @@ class Claim:
     statement: str
     where: str
     """Section of the paper."""
-    holds: bool
+    holds: bool | None
+    """None where the data cannot tell: what others published of real images is no measure for embedded data."""
     by: str
     """By how much, with the paper's own numbers where it has them."""
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "holds", bool(self.holds))  # numpy's own is no plain data
+        if self.holds is not None:  # numpy's own is no plain data
+            object.__setattr__(self, "holds", bool(self.holds))
 
 
 @dataclass(frozen=True)
@@ -156,6 +158,10 @@ class Results:
 
     def words(self, data: str) -> str:
         return words(data, self.setup.source(data))
+
+    def on_real(self, data: str, holds: bool) -> bool | None:
+        """A claim about what others published: only real data can tell."""
+        return None if self.setup.root(data) is None else holds
 
 
 @dataclass(frozen=True)

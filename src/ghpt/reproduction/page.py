@@ -74,7 +74,8 @@ class Page:
 
     @property
     def claims(self) -> list[Claim]:
-        return [claim for entry in self.entries for claim in entry.section.claims]
+        """Those that the data can tell."""
+        return [claim for entry in self.entries for claim in told(entry)]
 
     def front(self) -> str:
         """What comes before the entries, Markdown."""
@@ -88,11 +89,12 @@ class Page:
             "what the paper prints, of real data; *ours* is of the data that the heading names, the mean ± the "
             f"standard deviation over the seeds. A *miss* is more than {100 * TOLERANCE:.0f} % worse than the paper.",
             "## Summary",
-            f"{held} of {len(self.claims)} claims hold; {compared - len(misses)} of {compared} numbers are not a miss.",
+            f"{held} of {len(self.claims)} claims hold; {compared - len(misses)} of {compared} numbers are not a miss. "
+            f"A claim with – is about what others published of real images, which {EMBEDDED} data cannot tell.",
             markdown(["table or figure", "numbers", "median difference", "misses", "claims that hold"],
                      [_summary_row(entry) for entry in self.entries]),
         ]  # fmt: skip
-        failed = [(entry, claim) for entry in self.entries for claim in entry.section.claims if not claim.holds]
+        failed = [(entry, claim) for entry in self.entries for claim in entry.section.claims if claim.holds is False]
         if failed:
             rows = [[entry.item.label, claim.statement, claim.where, claim.by] for entry, claim in failed]
             parts += [
@@ -105,13 +107,20 @@ class Page:
         return "\n\n".join(parts)
 
 
+HOLDS = {True: "yes", False: "**no**", None: "–"}
+
+
 def claims_table(claims: Sequence[Claim]) -> str:
-    rows = [[claim.statement, claim.where, "yes" if claim.holds else "**no**", claim.by] for claim in claims]
+    rows = [[claim.statement, claim.where, HOLDS[claim.holds], claim.by] for claim in claims]
     return markdown(["claim", "section", "holds", "by (the paper's in brackets)"], rows, range(4))
 
 
+def told(entry: Entry) -> list[Claim]:
+    return [claim for claim in entry.section.claims if claim.holds is not None]
+
+
 def _summary_row(entry: Entry) -> list[str]:
-    claims, numbers = entry.section.claims, entry.section.compared
+    claims, numbers = told(entry), entry.section.compared
     return [
         f"[{entry.item.label}](#{entry.item.label})",
         str(len(numbers) or "–"),
@@ -162,6 +171,8 @@ def as_markdown(page: Page) -> str:
 def as_html(page: Page, pictures: Mapping[str, bytes]) -> str:
     """One file that needs no other: pictures are in it, and nothing is fetched."""
     renderer = MarkdownIt("commonmark", {"html": False}).enable("table")
+    renderer.add_render_rule("table_open", lambda *_: '<div class="table"><table>')
+    renderer.add_render_rule("table_close", lambda *_: "</table></div>")
     renderer.add_render_rule("image", lambda _, tokens, index, *__: _picture(tokens[index], pictures))
     entries = "\n".join(
         f'<section id="{entry.item.label}">\n<h2>{escape(entry.heading)}</h2>\n{renderer.render(entry.text())}'
