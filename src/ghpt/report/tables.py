@@ -130,8 +130,12 @@ def prior_table(metrics: Mapping[str, Any], subject: str) -> tuple[list[str], Ro
     rows = []
     for part in PARTS:
         values = [numbers["pose_prior"][subject][part] for numbers in selections.values()]
-        rows.append([part.replace("_", " "), *(NONE if v is None else f"{1000 * v:.3g}" for v in values)])
+        rows.append([part.replace("_", " "), *(NONE if v is None else _three_digits(1000 * v) for v in values)])
     return ["part", *selections], rows
+
+
+def _three_digits(value: float) -> str:
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
 
 
 def max_difference(values: Iterable[float]) -> float:
