@@ -114,7 +114,7 @@ class Section:
     """Every number that the paper prints, for the summary and the list of misses."""
     claims: Sequence[Claim] = ()
     explained: str = ""
-    """What explains the misses of embedded data; shown where there are any."""
+    """What explains the misses of embedded data, and the claims that do not hold; shown where there are any."""
 
 
 class Results:

@@ -53,7 +53,8 @@ class Entry:
         parts = [self.section.body]
         if self.section.claims:
             parts.append(claims_table(self.section.claims))
-        if self.misses and self.section.explained and EMBEDDED in self.section.data:
+        short = self.misses or [claim for claim in self.section.claims if claim.holds is False]
+        if short and self.section.explained and EMBEDDED in self.section.data:
             parts.append(f"**What explains the misses.** {self.section.explained}")
         return "\n\n".join(parts)
 
