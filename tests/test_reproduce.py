@@ -94,6 +94,8 @@ def test_every_table_and_figure_of_the_paper_is_an_item():
         "sota-comparison",
         "pose-prior",
     ]
+    assert chosen("pose-prior") == chosen(["pose-prior"])
+    assert {item.kind for item in chosen(["ablation", "figure"])} == {"ablation", "figure"}
     with pytest.raises(GhptConfigError, match="there is no 'nothing'"):
         chosen(["nothing"])
 

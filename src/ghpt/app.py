@@ -62,6 +62,9 @@ def run(
                 print("\n".join(["", "Jobs of the sweep:", *(f"  {job.name}: {job.said}" for job in ended)]))
         if sweep and ended and after is not None:
             after(ended)
+    except BrokenPipeError:  # whoever read what is printed has had enough, as `head` does
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
     except (*USERS_ERRORS, ValueError) as error:
         cause = error if isinstance(error, OSError) else error.__cause__
         if trace or not (isinstance(error, USERS_ERRORS) or isinstance(cause, OSError)):

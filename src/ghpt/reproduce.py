@@ -52,7 +52,7 @@ class Overrides(TypedDict):
 class Settings(TypedDict):
     """What `reproduce` needs of the configuration."""
 
-    only: list[str] | None
+    only: list[str] | str | None
     seed: int
     seeds: int
     jobs: int | None
@@ -85,7 +85,7 @@ def gather(jobs: Sequence[Job], conf: Path) -> None:
         return
     seeds = sorted({seed for config in configs for seed in seeds_of(config)})
     everything = any(config["only"] is None for config in configs)
-    only = None if everything else [label for config in configs for label in config["only"]]
+    only = None if everything else [item.label for config in configs for item in chosen(config["only"])]
     with_all = {"only": only, "seed": seeds[0], "seeds": len(seeds)}
     _reproduce(configs[0] | with_all, seeds, Path(configs[0]["output"]), conf)
 
@@ -141,15 +141,16 @@ def summary(told: dict[str, Any]) -> str:
     return f"{told['held']} of {told['claims']} claims hold, {told['misses']} of {told['numbers']} numbers miss"
 
 
-def chosen(only: Sequence[str] | None) -> list[Item]:
-    """The items of these labels, with or without ``tab:`` or ``fig:``, in the report's order; None: all."""
+def chosen(only: Sequence[str] | str | None) -> list[Item]:
+    """The items of these labels, with or without ``tab:`` or ``fig:``, or kinds, in the report's order; None: all."""
     if only is None:
         return list(ITEMS.values())
-    labels = [label.removeprefix("tab:").removeprefix("fig:") for label in only]
-    for label in labels:
-        if label not in ITEMS:
-            raise GhptConfigError("only", f"there is no {label!r}", suggest(label, ITEMS))
-    return [item for label, item in ITEMS.items() if label in labels]
+    wanted = [word.removeprefix("tab:").removeprefix("fig:") for word in ([only] if isinstance(only, str) else only)]
+    existing = {*ITEMS, *(item.kind for item in ITEMS.values())}
+    for word in wanted:
+        if word not in existing:
+            raise GhptConfigError("only", f"there is no {word!r}", suggest(word, existing))
+    return [item for item in ITEMS.values() if {item.label, item.kind} & set(wanted)]
 
 
 def processors() -> int:

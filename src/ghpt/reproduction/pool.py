@@ -140,10 +140,12 @@ def _quietly(cell: Cell, cells: Path) -> float:
 
 @contextlib.contextmanager
 def _progress(cells: Sequence[Cell], show: bool) -> Iterator[Callable[[Cell, float], None]]:
-    """A bar over all cells, as long as their expected seconds; without it a line in the log for each."""
+    """A bar over all cells, as long as their expected seconds; without it, or a terminal, a line for each."""
     columns = (TextColumn("{task.fields[count]}"), BarColumn(None), TaskProgressColumn(), TimeElapsedColumn(),
                TextColumn("{task.description}"))  # fmt: skip
-    bar = Progress(*columns, console=Console(stderr=True), disable=not show)
+    console = Console(stderr=True)
+    show = show and console.is_terminal and len(cells) > 0
+    bar = Progress(*columns, console=console, disable=not show)
     done: list[Cell] = []
 
     def count() -> str:
