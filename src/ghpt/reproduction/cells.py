@@ -53,8 +53,8 @@ class Cell:
         return self.folder(cells).is_dir()
 
 
-def perform(cell: Cell, cells: Path) -> float:
-    """Do the work of a cell whose needs are done; returns the seconds it took. The folder appears when all is done."""
+def perform(cell: Cell, cells: Path) -> None:
+    """Do the work of a cell whose needs are done. The folder appears when all is done."""
     start = time.perf_counter()
     if not cell.done(cells):
         module, _, function = cell.work.rpartition(".")
@@ -66,7 +66,6 @@ def perform(cell: Cell, cells: Path) -> float:
                      "seconds": round(time.perf_counter() - start, 2),
                      "provenance": provenance(cell.config.get("seed", 0))}  # fmt: skip
             write_json(folder / "cell.json", about)
-    return time.perf_counter() - start
 
 
 def with_needs(cells: Iterable[Cell]) -> dict[str, Cell]:

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ghpt.errors import GhptError
 from ghpt.files import sweep_temporaries
@@ -38,7 +38,7 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
     number, chain = len(missing), _chains(missing)
     with (
         _terminable(),
-        _progress(list(missing.values()), show) as finished,
+        _progress(list(missing.values()), show) as tell,
         _executor(min(jobs, len(missing))) as submit,
     ):
         waiting, running = dict(missing), {}
@@ -46,14 +46,16 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
             ready = [c for c in waiting.values() if not any(b.key in missing for b in c.needs.values())]
             for cell in sorted(ready, key=lambda c: -chain[c.key])[: jobs - len(running)]:
                 running[submit(cell, cells)] = waiting.pop(cell.key)
+                tell(running.values(), None)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 cell = running.pop(future)
                 try:
-                    finished(cell, future.result())
+                    future.result()
                 except GhptError as error:
                     error.args = (f"{cell.name}: {error}",)
                     raise
                 del missing[cell.key]
+                tell(running.values(), cell)
     return number
 
 
@@ -68,7 +70,7 @@ def _chains(cells: dict[str, Cell]) -> dict[str, float]:
 
 
 @contextlib.contextmanager
-def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[float]]]:
+def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[None]]]:
     """Submit cells to ``jobs`` processes, or with one to this process; on the way out nothing is left running."""
     if jobs <= 1:
         yield _here
@@ -101,10 +103,11 @@ def _terminable() -> Iterator[None]:
             signal.signal(signal.SIGTERM, previous)
 
 
-def _here(cell: Cell, cells: Path) -> Future[float]:
-    future: Future[float] = Future()
+def _here(cell: Cell, cells: Path) -> Future[None]:
+    future: Future[None] = Future()
     try:
-        future.set_result(_quietly(cell, cells))
+        _quietly(cell, cells)
+        future.set_result(None)
     except Exception as error:
         future.set_exception(error)
     return future
@@ -123,7 +126,7 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _quietly(cell: Cell, cells: Path) -> float:
+def _quietly(cell: Cell, cells: Path) -> None:
     """`perform` without what the commands would say on the way."""
     loggers = [logging.getLogger(name) for name in ("ghpt", "lightning.pytorch", "lightning.fabric")]
     levels = [logger.level for logger in loggers]
@@ -132,17 +135,20 @@ def _quietly(cell: Cell, cells: Path) -> float:
             logger.setLevel(logging.ERROR)
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            return perform(cell, cells)
+            perform(cell, cells)
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
 
 
 @contextlib.contextmanager
-def _progress(cells: Sequence[Cell], show: bool) -> Iterator[Callable[[Cell, float], None]]:
-    """A bar over all cells, as long as their expected seconds; without it, or a terminal, a line for each."""
+def _progress(cells: Sequence[Cell], show: bool) -> Iterator[Callable[[Iterable[Cell], Cell | None], None]]:
+    """A bar over all cells, as long as their expected seconds; without it, or a terminal, a line for each.
+
+    What it yields is told which cells are being made, and which one has been finished.
+    """
     columns = (TextColumn("{task.fields[count]}"), BarColumn(None), TaskProgressColumn(), TimeElapsedColumn(),
-               TextColumn("{task.description}"))  # fmt: skip
+               TimeRemainingColumn(), TextColumn("{task.description}"))  # fmt: skip
     console = Console(stderr=True)
     show = show and console.is_terminal and len(cells) > 0
     bar = Progress(*columns, console=console, disable=not show)
@@ -154,9 +160,11 @@ def _progress(cells: Sequence[Cell], show: bool) -> Iterator[Callable[[Cell, flo
     with bar:
         task = bar.add_task("", total=sum(cell.seconds for cell in cells), count=count())
 
-        def finished(cell: Cell, seconds: float) -> None:
-            done.append(cell)
-            bar.update(task, advance=cell.seconds, count=count(), description=cell.name)
-            (_log.debug if show else _log.info)("%s: %s, %.0f s", count(), cell.name, seconds)
+        def tell(running: Iterable[Cell], finished: Cell | None) -> None:
+            if finished is not None:
+                done.append(finished)
+                bar.advance(task, finished.seconds)
+                (_log.debug if show else _log.info)("%s: %s", count(), finished.name)
+            bar.update(task, count=count(), description=", ".join(cell.name for cell in running))
 
-        yield finished
+        yield tell
