@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 from ghpt.config import build
+from ghpt.models.checkpoint import AtomicCheckpointIO, read_checkpoint
 from ghpt.reproduction.cells import write_json
 from ghpt.test import measure
 from ghpt.train import train
@@ -19,9 +20,14 @@ def prepare_split(config: dict[str, Any], needs: dict[str, Path], folder: Path) 
 
 
 def train_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """What train.py does. result.json: the validation errors (mm)."""
+    """What train.py does; the checkpoint is kept without the optimiser, two thirds of it, for nobody goes on from here.
+
+    result.json: the validation errors (mm).
+    """
     errors = train(config | QUIET | {"save_every": 1_000_000, "resume": False}, folder)
     (folder / "best.ckpt").unlink(missing_ok=True)
+    checkpoint = read_checkpoint(folder / CHECKPOINT)
+    AtomicCheckpointIO().save_checkpoint(checkpoint | {"optimizer_states": []}, folder / CHECKPOINT)
     write_json(folder / "result.json", errors)
 
 
