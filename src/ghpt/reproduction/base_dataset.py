@@ -42,7 +42,8 @@ def _quantitative(results: Results) -> Section:
     compared = [Compared(a, p, o) for a, p, o in zip([*QUANTITATIVE, "mean"], paper, ours, strict=True)]
     columns = list(zip(*(number.cells() for number in compared), strict=True))
     rows = [[f"{name} (as published)", *map("{:.1f}".format, values)] for name, values in QUANTITATIVE_OTHERS.items()]
-    rows += [[f"ours, {kind}", *cells] for kind, cells in zip(("paper", "ours", "difference"), columns, strict=True)]
+    kinds = ("weight, the paper's", "weight, ours", "difference")
+    rows += [[kind, *cells] for kind, cells in zip(kinds, columns, strict=True)]
     rows += [[f"{NAMES.get(name, name)} on our detections", *(s.text() for s in actions(SELF["h36m"], name))]
              for name in BASELINES]  # fmt: skip
     header = ["MPJPE, mm", *(QUANTITATIVE_COLUMNS[action] for action in QUANTITATIVE), "Avg"]

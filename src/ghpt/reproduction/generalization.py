@@ -195,7 +195,7 @@ def _sota(results: Results) -> Section:
     ]  # fmt: skip
     explained = (
         "The paper's RANSAC on Panoptic, 39.5 mm, is worse than the worst hypothesis of its own pools (31.0 mm), so it "
-        f"was not run on these detections; on the embedded ones it has {ransac:.1f} mm."
+        f"can hardly be of the same detections; on the embedded ones it has {ransac:.1f} mm."
     )
     data = results.words("cmu1").replace(" CMU1", " CMU1 to CMU4")
     body = f"{text}\n\n{markdown(['method', 'paper, mm', 'ours, mm', 'difference'], rows)}"
