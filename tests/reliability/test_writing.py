@@ -25,15 +25,15 @@ from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO
 for line in sys.stdin:  # one fork for each kill: torch is imported once
     child = os.fork()
     if child:
-        print("pid", child, flush=True)
         os.waitpid(child, 0)
-        print("killed", flush=True)
+        os.write(1, b"killed\\n")
         continue
+    os.write(1, f"pid {os.getpid()}\\n".encode())  # whole lines, whatever the buffering: a kill must not cut one
     for number in range(int(line), 10**9):
         state = {"x": torch.full((6_000_000,), float(number)), "y": torch.tensor(number)}
         checkpoint = {"state_dict": state, FIELD: {"format_version": FORMAT_VERSION}}
         AtomicCheckpointIO().save_checkpoint(checkpoint, sys.argv[1])
-        print("saved", number, flush=True)
+        os.write(1, f"saved {number}\\n".encode())
 """
 
 
