@@ -67,8 +67,13 @@ def _generalization(results: Results) -> Section:
         f"{min(averages):.1f} to {max(averages):.1f}, nearly all of it a difference in the definition of the joints "
         f"that no selection can remove; our learned numbers are {min(weights):.1f} to {max(weights):.1f} mm."
     )
-    data = f"{results.words('cmu1').replace(' CMU1', ' CMU1 to CMU4')} and {results.words('h36m')}"
+    data = f"{_four(results)} and {results.words('h36m')}"
     return Section(data, f"{text}\n\n{markdown(header, rows)}", {}, compared, claims, explained)
+
+
+def _four(results: Results) -> str:
+    """Panoptic's arrangements in words."""
+    return results.words("cmu1").replace(" CMU1", " CMU1 to CMU4")
 
 
 def _difference(results: Results, test: str) -> Spread:
@@ -142,7 +147,7 @@ def _remelli(results: Results) -> Section:
         Claim("intra-dataset drop below Remelli et al.'s 22.6 %", "4.1", intra < best, f"{intra:.1f} % (3.6 %)"),
         Claim("inter-dataset drop below it too", "4.1", inter.mean < best, f"{inter.text()} % (15.1 %)"),
     ]
-    data = f"{results.words('cmu1').replace(' CMU1', ' CMU1 to CMU4')} and {results.words('h36m')}"
+    data = f"{_four(results)} and {results.words('h36m')}"
     return Section(data, f"{text}\n\n{markdown(header, rows)}", {}, compared, claims, _EXPLAINED_LEVEL)
 
 
@@ -197,7 +202,7 @@ def _sota(results: Results) -> Section:
         "The paper's RANSAC on Panoptic, 39.5 mm, is worse than the worst hypothesis of its own pools (31.0 mm), so it "
         f"can hardly be of the same detections; on the embedded ones it has {ransac:.1f} mm."
     )
-    data = results.words("cmu1").replace(" CMU1", " CMU1 to CMU4")
+    data = _four(results)
     body = f"{text}\n\n{markdown(['method', 'paper, mm', 'ours, mm', 'difference'], rows)}"
     return Section(data, body, {}, [ours], claims, explained)
 
