@@ -56,9 +56,10 @@ def test_only_what_changed_is_done_again(diary, tmp_path):
 
 @pytest.mark.parametrize("jobs", [1, 2])
 def test_an_error_names_the_cell_and_keeps_what_is_finished(diary, tmp_path, jobs):
-    good, bad = cell(diary, 1), cell(diary, -1)
+    good = cell(diary, 1)
+    bad = cell(diary, -1, good)  # after it: an error ends at once what is made beside it
     with pytest.raises(GhptDataError, match=r"^add--1: .*is negative. Give a positive one") as caught:
-        perform_all([cell(diary, 2, good, bad)], tmp_path / "cells", jobs, show=False)
+        perform_all([cell(diary, 2, bad)], tmp_path / "cells", jobs, show=False)
     assert caught.value.field == "number"
     assert good.done(tmp_path / "cells")
     assert not bad.done(tmp_path / "cells")
