@@ -26,7 +26,8 @@ from ghpt.config import build
 from ghpt.data.frames import Frames
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.baselines import person_size, pycolmap_cameras
+from ghpt.models.baselines import person_size
+from ghpt.models.lo_ransac import pycolmap_cameras
 from ghpt.recording import KeyPointBatch
 
 HYPOTHESES = 200

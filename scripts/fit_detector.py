@@ -33,7 +33,7 @@ from ghpt.files import atomic_write
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.baselines import Ransac
+from ghpt.models.ransac import Ransac
 from ghpt.randomness import key
 from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import PELVIS

@@ -76,7 +76,7 @@ def test_every_test_configuration_builds(data):
     config = compose("test", f"data={data}")
     assert build(config["data"], "data").name == data
     assert sorted(build(config["baselines"], "baselines")) == [
-        "linear", "lo_ransac", "m_estimator", "ransac", "weighted_linear",
+        "adaptive_ransac", "linear", "lo_ransac", "m_estimator", "ransac", "weighted_linear",
     ]  # fmt: skip
     assert sorted(build(config["camera_baselines"], "camera_baselines")) == [
         "eight_point", "poselib", "ransac", "rig", "usac_accurate", "usac_magsac",

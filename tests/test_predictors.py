@@ -9,12 +9,14 @@ import yaml
 from ghpt.config import build
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.baselines import Linear, LoRansac, MEstimator, Ransac, WeightedLinear
+from ghpt.models.baselines import Linear, MEstimator, WeightedLinear
+from ghpt.models.lo_ransac import LoRansac
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose import PoseTriangulation
 from ghpt.models.predictors import Classical, Learned
 from ghpt.models.quality import Quality
+from ghpt.models.ransac import Ransac
 from ghpt.models.scorer import Scorer
 from ghpt.reconstruction import Reconstruction, State
 from scenes import random_scene

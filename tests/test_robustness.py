@@ -26,7 +26,7 @@ BASELINES = {
     "linear": {"_target_": "ghpt.models.baselines.Linear"},
     "m_estimator": {"_target_": "ghpt.models.baselines.MEstimator", "loss": "geman_mcclure", "scale": 0.02,
                     "iterations": 10, "tolerance": 1.0},
-    "lo_ransac": {"_target_": "ghpt.models.baselines.LoRansac", "threshold": 0.02, "seed": 0},
+    "lo_ransac": {"_target_": "ghpt.models.lo_ransac.LoRansac", "threshold": 0.02, "seed": 0},
 }  # fmt: skip
 
 

@@ -118,6 +118,8 @@ def check_type(value: Any, wanted: Any, key: str) -> None:
     if is_typeddict(wanted) and isinstance(value, Mapping):
         for name, inner in get_type_hints(wanted).items():
             if name not in value:
+                if name in wanted.__optional_keys__:
+                    continue
                 raise GhptConfigError(f"{key}.{name}".lstrip("."), "is missing", "Set it in the yaml.")
             check_type(value[name], inner, f"{key}.{name}".lstrip("."))
     elif not _fits(value, wanted):

@@ -70,6 +70,11 @@ class KeyPointBatch:
         """Move to a device."""
         return KeyPointBatch(**{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})
 
+    def rows(self, index: Int[Tensor, " b"]) -> KeyPointBatch:
+        """The frames at these places."""
+        parts = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "cameras"}
+        return KeyPointBatch(cameras=self.cameras.index(index), **parts)
+
     def pin_memory(self) -> KeyPointBatch:
         return KeyPointBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
 

@@ -72,12 +72,12 @@ def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str
         "data": data.name, "source": data.source, "split": data.evaluate, "seed": config["seed"],
         "hypotheses": model.hypotheses, "provenance": origin,
     }  # fmt: skip
-    baselines = build(config[report.baselines], report.baselines)
+    estimators = report.estimators(config, model)
     trainer = make_trainer(
         config["trainer"],
         default_root_dir=output,
         logger=False,
-        callbacks=[report.collect(output, baselines, meta), *progress(config)],
+        callbacks=[report.collect(output, estimators, meta), *progress(config)],
         enable_progress_bar=config["progress_bar"],
     )
     sweep_temporaries(output)

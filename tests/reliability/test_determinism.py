@@ -19,7 +19,7 @@ from ghpt.train import train
 SCRIPT = Path(__file__).with_name("run_toy.py")
 BASELINES = {
     "linear": {"_target_": "ghpt.models.baselines.Linear"},
-    "ransac": {"_target_": "ghpt.models.baselines.Ransac", "threshold": 0.02, "pairs": 4, "seed": 0},
+    "ransac": {"_target_": "ghpt.models.ransac.Ransac", "threshold": 0.02, "pairs": 4, "seed": 0},
 }
 
 

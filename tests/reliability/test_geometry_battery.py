@@ -13,7 +13,9 @@ from ghpt.data.lens import distort, undistort
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import Status, triangulate, triangulate_subsets
-from ghpt.models.baselines import Linear, LoRansac, MEstimator, Ransac, WeightedLinear
+from ghpt.models.baselines import Linear, MEstimator, WeightedLinear
+from ghpt.models.lo_ransac import LoRansac
+from ghpt.models.ransac import Ransac
 from ghpt.randomness import key
 from scenes import Scene, random_scene
 

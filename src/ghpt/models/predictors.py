@@ -10,10 +10,9 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from ghpt.errors import check
-from ghpt.geometry.cameras import reprojection_error
 from ghpt.geometry.normal_equations import usable_views
 from ghpt.geometry.triangulation import Status, triangulate
-from ghpt.models.baselines import Baseline, person_size
+from ghpt.models.baselines import Baseline
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.quality import JointQuality, Quality
 from ghpt.models.selection import limit_spread, softmax_weights
@@ -56,7 +55,7 @@ class Classical:
         clean, _, _ = _prepared(batch, self.swaps)
         result = self.estimator.triangulate(clean)
         placed = result.ok | (result.status == Status.NOT_CONVERGED)
-        views, _ = self._views(clean, result.points, placed)
+        views, _ = self.estimator.agreeing(clean, result.points, placed)
         quality = self.quality.fitted(clean, result.points, views)
         return Classical(self.estimator, quality, self.swaps, self.reject)
 
@@ -65,25 +64,13 @@ class Classical:
         clean, spoilt, swapped = _prepared(batch, self.swaps)
         result = self.estimator.triangulate(clean)
         state = _states(result.status, spoilt)
-        views, agreed = self._views(clean, result.points, state == State.OBSERVED)
+        views, agreed = self.estimator.agreeing(clean, result.points, state == State.OBSERVED)
         if self.reject:
             state = torch.where((state == State.OBSERVED) & ~agreed, int(State.REJECTED), state).to(torch.int8)
             views &= (state == State.OBSERVED)[:, None]
         found = self.quality(clean, result.points, views)
         score = torch.zeros(len(batch), dtype=torch.float32)
         return _reconstruction(batch, result.points, state, views, found, score, swapped)
-
-    def _views(
-        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
-    ) -> tuple[Bool[Tensor, "B V J"], Bool[Tensor, "B J"]]:
-        """The views that made each joint, and whether two of them agree."""
-        given = batch.seen & placed[:, None]
-        if self.estimator.reach is None:
-            return given, placed
-        limit = self.estimator.reach * person_size(batch.key_points, batch.seen)
-        near = given & (reprojection_error(batch.cameras, batch.key_points, points) <= limit[..., None])
-        agreed = near.sum(1) >= 2
-        return torch.where(agreed[:, None], near, given), agreed
 
 
 class Learned:

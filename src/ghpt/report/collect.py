@@ -1,4 +1,4 @@
-"""From test steps to predictions.npz: the callbacks that run the baselines and write every item's estimates."""
+"""From test steps to predictions.npz: the callbacks that run the other estimators and write every item's estimates."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -19,11 +19,11 @@ from ghpt.report.predictions import PredictionWriter
 class Collect(Callback):
     """Writes ``<folder>/predictions.npz``, streaming: memory does not grow with the number of items.
 
-    ``baselines``: name -> estimator that takes a batch; they get the same detections as the selections.
+    ``estimators``: name -> what takes a batch; they get the same detections as the selections.
     """
 
-    def __init__(self, folder: Path, baselines: Mapping[str, Callable[[Any], Any]], meta: dict[str, Any]) -> None:
-        self.path, self.baselines, self.meta = folder / "predictions.npz", baselines, meta
+    def __init__(self, folder: Path, estimators: Mapping[str, Callable[[Any], Any]], meta: dict[str, Any]) -> None:
+        self.path, self.estimators, self.meta = folder / "predictions.npz", estimators, meta
         self.rows = folder / ".predictions"
 
     @abstractmethod
@@ -40,7 +40,7 @@ class Collect(Callback):
 
     def on_test_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self.data = trainer.datamodule.frames["test"]
-        self.open([*SELECTIONS, *self.baselines])
+        self.open([*SELECTIONS, *self.estimators])
 
     @torch.no_grad()
     def on_test_batch_end(
@@ -64,7 +64,7 @@ class CollectPoses(Collect):
     def write(
         self, module: Any, batch: KeyPointBatch, estimates: dict[str, PoseEstimate], weights: dict[str, torch.Tensor]
     ) -> None:
-        estimates = estimates | {name: estimator(batch) for name, estimator in self.baselines.items()}
+        estimates = estimates | {name: estimator(batch) for name, estimator in self.estimators.items()}
         frame = torch.from_numpy(self.data.frame_numbers(batch.sample.tolist()))
         self.writer.write(batch.sample, estimates, batch.truth, batch.truth_seen, batch.recording, frame, weights)
 
@@ -73,7 +73,7 @@ class CollectPoses(Collect):
 
 
 class CollectPairs(Collect):
-    """Of the camera problem. The baselines' translations, of length 1, get their length where the learned ones do."""
+    """Of the camera problem. The estimators' translations, of length 1, get their length where the learned ones do."""
 
     def open(self, names: list[str]) -> None:
         self.writer = PairWriter(self.rows, len(self.data), names)
@@ -85,7 +85,7 @@ class CollectPairs(Collect):
         estimates: dict[str, RelativePoseEstimate],
         weights: dict[str, torch.Tensor],
     ) -> None:
-        for name, estimator in self.baselines.items():
+        for name, estimator in self.estimators.items():
             estimate = estimator(batch)
             length = module.problem.scale(estimate, batch)
             estimates[name] = replace(estimate, t=estimate.t * length[..., None])

@@ -20,9 +20,9 @@ from ghpt.skeleton import JOINTS
 FORMAT_VERSION = 1
 NAMES = (
     "weight", "average", "most", "least", "stochastic", "random", "best", "worst",
-    "linear", "weighted_linear", "ransac", "m_estimator", "lo_ransac",
+    "view_weights", "linear", "weighted_linear", "ransac", "adaptive_ransac", "m_estimator", "lo_ransac",
 )  # fmt: skip
-"""The order of every table: the selections, then the baselines."""
+"""The order of every table: the selections, the learned view weights, then the baselines."""
 
 _CHUNK = 2048
 

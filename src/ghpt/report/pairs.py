@@ -1,7 +1,11 @@
 """The report of the camera problem."""
 
+from collections.abc import Callable, Mapping
 from typing import Any, TypedDict
 
+from ghpt.config import build
+from ghpt.models.module import StochasticEstimator
+from ghpt.recording import PairBatch, RelativePoseEstimate
 from ghpt.report.collect import CollectPairs
 from ghpt.report.pair_evaluate import evaluate_pairs
 from ghpt.report.pair_predictions import open_pairs
@@ -16,9 +20,16 @@ class Settings(TypedDict):
     camera_baselines: dict[str, Any]
 
 
+def estimators(
+    config: Mapping[str, Any], model: StochasticEstimator
+) -> dict[str, Callable[[PairBatch], RelativePoseEstimate]]:
+    """The classical estimators."""
+    return build(config["camera_baselines"], "camera_baselines")
+
+
 PAIRS = Report(
     Settings,
-    "camera_baselines",
+    estimators,
     CollectPairs,
     open_pairs,
     evaluate_pairs,

@@ -1,7 +1,11 @@
 """The report of the pose problem."""
 
-from typing import Any, TypedDict
+from collections.abc import Callable, Mapping
+from typing import Any, NotRequired, TypedDict
 
+from ghpt.config import build
+from ghpt.models.module import StochasticEstimator
+from ghpt.recording import KeyPointBatch, PoseEstimate
 from ghpt.report.collect import CollectPoses
 from ghpt.report.evaluate import evaluate
 from ghpt.report.predictions import open_predictions
@@ -13,12 +17,22 @@ from ghpt.report.tensorboard import write_events
 class Settings(TypedDict):
     """See ``Report.settings``."""
 
+    view_weights: NotRequired[dict[str, Any]]
     baselines: dict[str, Any]
+
+
+def estimators(
+    config: Mapping[str, Any], model: StochasticEstimator
+) -> dict[str, Callable[[KeyPointBatch], PoseEstimate]]:
+    """The model's view weights, where there are settings for them, and the classical estimators."""
+    settings = config.get("view_weights")
+    learned = {"view_weights": build(settings, "view_weights")(model)} if settings else {}
+    return learned | build(config["baselines"], "baselines")
 
 
 POSES = Report(
     Settings,
-    "baselines",
+    estimators,
     CollectPoses,
     open_predictions,
     evaluate,

@@ -14,8 +14,8 @@ class Report:
 
     settings: type
     """The settings that test.py needs for this problem alone, a TypedDict."""
-    baselines: str
-    """The one of them that names the classical estimators."""
+    estimators: Callable[[Mapping[str, Any], Any], dict[str, Callable[[Any], Any]]]
+    """Configuration and model -> what is tested beside the selections, by name: each takes a batch."""
     collect: type[Collect]
     """Writes predictions.npz."""
     open: Callable[[Path], Any]

@@ -17,7 +17,8 @@ from ghpt.report.paper import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 NAMES = {
     "h36m": "Human3.6M", "panoptic": "Panoptic",
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
-    "weighted_linear": "weighted linear", "ransac": "RANSAC", "m_estimator": "M-estimator", "lo_ransac": "LO-RANSAC",
+    "view_weights": "view weights", "weighted_linear": "weighted linear", "ransac": "RANSAC",
+    "adaptive_ransac": "adaptive RANSAC", "m_estimator": "M-estimator", "lo_ransac": "LO-RANSAC",
 }  # fmt: skip
 """What people call a data set or a row, where it is not its name in metrics.json."""
 
@@ -27,7 +28,7 @@ _TERMINAL = dict(zip(COLUMNS, ("selection", "abs", "rel", "PA", "6 j", "cov %", 
 _CAPTION = """abs: in the world; rel: relative to the pelvis; PA: Procrustes-aligned
 6 j: rel, elbows wrists knees; cov: joints estimated; diff: rel to paper"""
 _MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
-_PER_ACTION = ("weight", "average", "best", "linear", "ransac")
+_PER_ACTION = ("weight", "average", "best", "view_weights", "linear", "ransac")
 
 Rows = list[list[str]]
 
@@ -72,7 +73,9 @@ def print_table(metrics: Mapping[str, Any], console: Console | None = None) -> N
         table.add_column(short, justify="left" if column == COLUMNS[0] else "right", no_wrap=True)
     for name, row in zip(metrics["selections"], main_rows(metrics), strict=True):
         cells = [cell.removesuffix(" %") for cell in row]
-        table.add_row(*cells, end_section=name == SELECTIONS[-1], style="bold" if name == "weight" else None)
+        table.add_row(
+            *cells, end_section=name == SELECTIONS[-1], style="bold" if name in ("weight", "view_weights") else None
+        )
     (console or Console()).print(table)
 
 

@@ -35,7 +35,7 @@ def errors_of_draws(config: dict[str, Any], needs: dict[str, Path], folder: Path
     meta = {"data": data.name, "source": data.source, "split": data.evaluate, "seed": config["seed"]}
     collect = CollectPairs(folder, build(config["camera_baselines"], "camera_baselines"), meta)
     collect.data = pairs
-    collect.open([*SELECTIONS, *collect.baselines])
+    collect.open([*SELECTIONS, *collect.estimators])
     with torch.no_grad():
         for first in range(0, len(pairs), data.batch_size):
             batch = pairs[range(first, min(first + data.batch_size, len(pairs)))]

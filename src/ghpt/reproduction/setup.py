@@ -76,13 +76,14 @@ class Setup:
     def tested(
         self, model: Cell, data: str, *overrides: str, name: str = "", baselines: bool = True, seconds: float = 12.0
     ) -> Cell:
-        """The model of a `trained` cell on a data set; ``baselines`` False leaves the classical estimators out."""
+        """The model of a `trained` cell on a data set; ``baselines`` False leaves all but the selections out."""
         overrides = (*self.overrides["test"], *overrides)
         config = self.composed("test", data, *overrides)
-        unused = "baselines" if model.config["model"]["problem"].get("frames") else "camera_baselines"
-        config = {key: value for key, value in config.items() if key not in (unused, "ckpt")}
+        pairs = model.config["model"]["problem"].get("frames")
+        unused = ("ckpt", *(("baselines", "view_weights") if pairs else ("camera_baselines",)))
+        config = {key: value for key, value in config.items() if key not in unused}
         if not baselines:
-            config |= {key: {} for key in ("baselines", "camera_baselines") if key in config}
+            config |= {key: {} for key in ("baselines", "camera_baselines", "view_weights") if key in config}
         needs = {"model": model, "data": self.prepared(data, config["data"]["evaluate"])}
         trained = model.name.removeprefix("train-").removesuffix(f"-seed{self.seed}")
         name = "-".join(filter(None, ["test", trained, "on", data, name, f"seed{self.seed}"]))
