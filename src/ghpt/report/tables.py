@@ -73,9 +73,8 @@ def print_table(metrics: Mapping[str, Any], console: Console | None = None) -> N
         table.add_column(short, justify="left" if column == COLUMNS[0] else "right", no_wrap=True)
     for name, row in zip(metrics["selections"], main_rows(metrics), strict=True):
         cells = [cell.removesuffix(" %") for cell in row]
-        table.add_row(
-            *cells, end_section=name == SELECTIONS[-1], style="bold" if name in ("weight", "view_weights") else None
-        )
+        style = "bold" if name in ("weight", "view_weights") else None
+        table.add_row(*cells, end_section=name == SELECTIONS[-1], style=style)
     (console or Console()).print(table)
 
 
