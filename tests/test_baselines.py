@@ -8,13 +8,14 @@ from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import Status
 from ghpt.models.baselines import Linear, MEstimator, WeightedLinear, person_size
 from ghpt.models.lo_ransac import LoRansac
-from ghpt.models.ransac import Ransac
+from ghpt.models.ransac import AdaptiveRansac, Ransac
 from ghpt.recording import KeyPointBatch
 from scenes import random_scene
 
 ROBUST = {
     "ransac": Ransac(threshold=0.02, pairs=100, seed=0),
     "ransac_random": Ransac(threshold=0.02, pairs=9, seed=0),
+    "adaptive_ransac": AdaptiveRansac(threshold=0.02, pairs=100, seed=0, adapt=5.0, rounds=4),
     "huber": MEstimator(loss="huber", scale=0.002, iterations=40, tolerance=1e-3),
     "cauchy": MEstimator(loss="cauchy", scale=0.002, iterations=40, tolerance=1e-3),
     "geman_mcclure": MEstimator(loss="geman_mcclure", scale=0.01, iterations=40, tolerance=1e-3),

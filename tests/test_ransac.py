@@ -1,0 +1,64 @@
+"""The threshold that follows a frame's noise."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from ghpt.errors import GhptConfigError
+from ghpt.models.baselines import Linear, person_size
+from ghpt.models.ransac import AdaptiveRansac, Ransac
+from scenes import random_scene
+
+FIXED = Ransac(threshold=0.005, pairs=64, seed=0)
+ADAPTIVE = AdaptiveRansac(threshold=0.005, pairs=64, seed=0, adapt=5.0, rounds=4)
+
+
+def error(estimator, scene, batch):
+    return (estimator(batch).points - scene.points).norm(dim=-1).mean()
+
+
+def test_little_noise_leaves_the_threshold_alone():
+    scene = random_scene(0, frames=4, views=5).noisy(0.2, 0)
+    assert torch.equal(ADAPTIVE(scene.batch()).points, FIXED(scene.batch()).points)
+
+
+def test_much_noise_widens_it_in_the_frames_that_have_it():
+    quiet, loud = random_scene(0, frames=6, views=5).noisy(0.2, 0), random_scene(0, frames=6, views=5).noisy(15, 0)
+    mixed = replace(loud, key_points=torch.cat([loud.key_points[:3], quiet.key_points[3:]]))
+    batch = mixed.batch()
+    found = ADAPTIVE.triangulate(batch)
+    reach = ADAPTIVE.reach(batch, found.points)
+    assert (reach[:3] > 0.01).all()
+    assert (reach[3:] == 0.005).all()
+    assert torch.equal(found.points[3:], FIXED(batch).points[3:])
+    linear = error(Linear(), loud, loud.batch())
+    assert error(ADAPTIVE, loud, loud.batch()) < 1.1 * linear < error(FIXED, loud, loud.batch())
+
+
+def test_outliers_do_not_widen_it():
+    scene = random_scene(1, frames=5, views=6).noisy(0.2, 1)
+    wrong = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.2
+    size = person_size(scene.key_points, torch.ones_like(wrong))[..., None, None]
+    far = replace(scene, key_points=scene.key_points + 0.3 * size * wrong[..., None])
+    batch = far.batch()
+    found = ADAPTIVE.triangulate(batch)
+    assert (ADAPTIVE.reach(batch, found.points) == 0.005).all()
+    views, agreed = ADAPTIVE.agreeing(batch, found.points, found.ok)
+    assert not (views & wrong)[agreed[:, None].expand_as(wrong)].any()
+
+
+def test_a_frame_in_which_nothing_is_seen_keeps_the_threshold():
+    scene = random_scene(2, frames=3, views=4).noisy(15, 0)
+    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    seen[1] = False
+    batch = scene.batch(seen)
+    found = ADAPTIVE.triangulate(batch)
+    assert not found.ok[1].any()
+    assert ADAPTIVE.reach(batch, found.points)[1] == 0.005
+
+
+@pytest.mark.parametrize("settings", [{"adapt": 0.0}, {"rounds": 0}, {"threshold": -1.0}])
+def test_impossible_settings_are_refused(settings):
+    with pytest.raises(GhptConfigError):
+        AdaptiveRansac(**{"threshold": 0.1, "pairs": 4, "seed": 0, "adapt": 5.0, "rounds": 4} | settings)
