@@ -46,7 +46,7 @@ def main(folder: Path, words: list[str]) -> None:
         found = {}
         with tempfile.TemporaryDirectory() as output:
             runs = {estimator: [f"triangulation={estimator}"] for estimator in ESTIMATORS}
-            runs |= {"weight": words} if words else {}
+            runs |= {"view_weights": words} if words else {}
             for estimator, more in runs.items():
                 found[estimator] = poses([*given, *more, "formats=[npz]", "evaluated_frames=1"], Path(output))
             numbers = run([*given, *words, f"compare=[{','.join(ESTIMATORS)}]"], Path(output))

@@ -7,18 +7,19 @@ import torch
 import yaml
 
 from ghpt.config import build
-from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.baselines import Linear, MEstimator, WeightedLinear
+from ghpt.models.baselines import Linear, MEstimator, WeightedLinear, person_size
 from ghpt.models.lo_ransac import LoRansac
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose import PoseTriangulation
 from ghpt.models.predictors import Classical, Learned
 from ghpt.models.quality import Quality
-from ghpt.models.ransac import Ransac
+from ghpt.models.ransac import AdaptiveRansac, Ransac
 from ghpt.models.scorer import Scorer
+from ghpt.models.view_weights import ViewWeights
 from ghpt.reconstruction import Reconstruction, State
+from ghpt.reproduction.perturbation import Outliers
 from scenes import random_scene
 
 QUALITY = Quality(noise=0.003, prior=4.0, shared=0.0)
@@ -36,7 +37,7 @@ def classical(estimator=M, reject=False):
     return Classical(estimator, QUALITY, None, reject)
 
 
-def learned(spread=0.3):
+def learned():
     config = yaml.safe_load((Path(__file__).parents[1] / "conf/model/pose.yaml").read_text())
     scorer = partial(Scorer, **{k: v for k, v in config["scorer"].items() if not k.startswith("_")})
     loss = StochasticLoss(alpha=1.0, beta=0.0, gamma=0.0, relative_errors=True)
@@ -44,7 +45,8 @@ def learned(spread=0.3):
         PoseTriangulation(True, True), scorer, loss, torch.optim.Adam, 50, 1.5, False, 1.5, "weight", 0
     )
     model.fit_statistics(iter([random_scene(0, frames=20).batch()]))
-    return Learned(model, QUALITY, None, spread)
+    consensus = AdaptiveRansac(threshold=0.02, pairs=64, seed=0, adapt=5.0, rounds=4)
+    return Learned(ViewWeights(model, consensus, power=1.5), QUALITY, None)
 
 
 def single(batch):
@@ -86,10 +88,40 @@ def test_the_learned_model_gives_the_truth_of_exact_key_points_and_its_score():
     assert (result.score != 0).all()
 
 
-def test_hypotheses_that_disagree_widen_the_learned_covariance():
-    batch = random_scene(2, frames=3, views=5).noisy(8, 0).batch()
-    narrow, wide = (learned(spread)(batch).covariance for spread in (0.0, 1.0))
-    assert (wide[..., [0, 3, 5]] > narrow[..., [0, 3, 5]]).all()
+def test_the_learned_prediction_is_that_of_the_view_weights():
+    batch = random_scene(2, frames=3, views=5).noisy(4, 0).batch()
+    predictor = learned()
+    weighed, result = predictor.view_weights.weigh(batch), predictor(batch)
+    assert torch.equal(result.points, weighed.triangulation.points.float())
+    assert torch.equal(result.views, weighed.views)
+    torch.testing.assert_close(result.score, (weighed.weights * weighed.logits).sum(-1), rtol=0, atol=1e-6)
+    found = QUALITY(batch, weighed.triangulation.points, weighed.views)
+    torch.testing.assert_close(result.covariance, found.covariance.float())
+
+
+def test_displaced_key_points_spoil_the_average_of_the_hypotheses_and_not_the_learned_prediction():
+    scene = random_scene(10, frames=40, views=5).noisy(2, 0)
+    batch = Outliers(0.05, 0.1, 0.5)(scene.batch(), 0)
+    predictor = learned()
+    model = predictor.view_weights.model
+    pool = model.problem.generate(batch, model.hypotheses, model.keys("average", batch))
+    result = sound(predictor(batch), batch)
+    ours, average = ((points - scene.points).norm(dim=-1).mean() for points in (result.points, pool.points.mean(1)))
+    assert result.placed.all()
+    assert ours < 0.3 * average
+    moved = (batch.key_points - scene.key_points).norm(dim=-1) > 0
+    assert result.views[moved].double().mean() < 0.2
+    assert result.views[~moved].double().mean() > 0.95
+
+
+def test_no_joint_is_lost_that_two_seen_views_determine():
+    scene = random_scene(11, frames=20, views=4).noisy(3, 0)
+    seen = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.6
+    batch = Outliers(0.3, 0.1, 0.5)(scene.batch(seen), 0)
+    result = sound(learned()(batch), batch)
+    placed = Linear()(batch).estimated
+    assert not placed.all()
+    assert result.placed[placed].all()
 
 
 @pytest.mark.parametrize("make", [classical, learned])
@@ -179,11 +211,16 @@ def test_no_frames_and_no_seen_joints_are_no_error(make):
     assert (result.state == State.FEW_VIEWS).all()
 
 
-def test_the_configuration_builds_both_and_refuses_what_cannot_be():
+def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
     config = yaml.safe_load((Path(__file__).parents[1] / "conf/estimator/default.yaml").read_text())
-    predictor = build(config["classical"], "estimator.classical")
-    batch = random_scene(9, frames=30).noisy(2, 0).batch()
-    assert predictor.fitted(batch).quality.noise > 0
-    assert build(config["learned"], "estimator.learned")(model=learned().model)(batch).placed.all()
-    with pytest.raises(GhptConfigError):
-        learned(spread=-1.0)
+    scene = random_scene(9, frames=30, views=5).noisy(2, 0)
+    off = scene.key_points.clone()
+    off[:, 2, ::2] += 200  # a view that agrees with no other is no noise
+    batch = replace(scene, key_points=off).batch()
+    size = person_size(scene.key_points, batch.seen).mean()
+    for made in (
+        build(config["classical"], "estimator.classical"),
+        build(config["learned"], "estimator.learned")(view_weights=learned().view_weights),
+    ):
+        assert made(batch).placed.all()
+        assert made.fitted(batch).quality.noise == pytest.approx(float(2 / size), rel=0.3)

@@ -64,6 +64,7 @@ class Settings(InputSettings):
     trainer: dict[str, Any]
     swaps: bool
     estimator: dict[str, Any]
+    view_weights: dict[str, Any]
     fitted_frames: int
     seed: int
 
@@ -163,9 +164,11 @@ def choose(config: dict[str, Any]) -> Chosen:
     text = (
         f"the learned model of {Path(config['ckpt']).name}, trained on {trained['provenance'].get('data', 'unknown')}"
     )
-    predictor = build(settings, "estimator.learned")(model=model)
-    identity = settings | {"ckpt_sha256": digest, "hypotheses": model.hypotheses, "seed": config["seed"]}
-    return Chosen("weight", text, predictor, predictor.swaps, model, identity)
+    view_weights = build(config["view_weights"], "view_weights")(model)
+    predictor = build(settings, "estimator.learned")(view_weights=view_weights)
+    identity = settings | {"view_weights": config["view_weights"], "ckpt_sha256": digest,
+                           "hypotheses": model.hypotheses, "seed": config["seed"]}  # fmt: skip
+    return Chosen("view_weights", text, predictor, predictor.swaps, model, identity)
 
 
 def _name(config: dict[str, Any]) -> str:

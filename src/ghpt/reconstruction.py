@@ -37,7 +37,7 @@ class About:
     source: str
     """``embedded`` or the path of the key points."""
     estimator: str
-    """``weight`` of a checkpoint, or a classical estimator's name."""
+    """``view_weights`` of a checkpoint, or a classical estimator's name."""
     joints: tuple[str, ...]
     camera_names: tuple[str, ...]
     rate_hz: float | None

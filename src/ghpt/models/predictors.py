@@ -9,14 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from ghpt.errors import check
 from ghpt.geometry.normal_equations import usable_views
-from ghpt.geometry.triangulation import Status, triangulate
+from ghpt.geometry.triangulation import Status
 from ghpt.models.baselines import Baseline
-from ghpt.models.module import StochasticEstimator
 from ghpt.models.quality import JointQuality, Quality
-from ghpt.models.selection import limit_spread, softmax_weights
 from ghpt.models.swaps import Swaps, undo_swaps
+from ghpt.models.view_weights import ViewWeights
 from ghpt.reconstruction import Reconstruction, State
 from ghpt.recording import KeyPointBatch
 
@@ -74,42 +72,32 @@ class Classical:
 
 
 class Learned:
-    """The learned model: the average of its hypotheses under its weights (the selection ``weight``).
+    """A trained model's view weights with what can be said of their joints.
 
-    All seen views made each joint. The covariance is that of ``quality`` with all seen views, and of the hypotheses
-    under their weights ``spread`` times: the first is what noise of this size does to any estimate, the second how far
-    these views contradict each other. The score is the mean logit under the weights, before
-    ``limit_spread``, which centres each frame's.
+    The views that made a joint are those on which the consensus of ``view_weights`` agrees, and error and covariance
+    are theirs. The score is the mean logit of the hypotheses under their weights, before ``limit_spread``, which
+    centres each frame's. ``swaps`` as in Classical.
     """
 
-    def __init__(self, model: StochasticEstimator, quality: Quality, swaps: Swaps | None, spread: float) -> None:
-        check(spread >= 0, "spread", f"is {spread}", "It must be >= 0.")
-        self.model, self.quality, self.swaps, self.spread = model.eval(), quality, swaps, spread
+    def __init__(self, view_weights: ViewWeights, quality: Quality, swaps: Swaps | None) -> None:
+        self.view_weights, self.quality, self.swaps = view_weights, quality, swaps
 
     def fitted(self, batch: KeyPointBatch) -> Learned:
         clean, _, _ = _prepared(batch, self.swaps)
-        linear = triangulate(clean.cameras, clean.key_points, clean.seen.double())
-        quality = self.quality.fitted(clean, linear.points, clean.seen & linear.ok[:, None])
-        return Learned(self.model, quality, self.swaps, self.spread)
+        weighed = self.view_weights.weigh(clean)
+        quality = self.quality.fitted(clean, weighed.triangulation.points, weighed.views)
+        return Learned(self.view_weights, quality, self.swaps)
 
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> Reconstruction:
         clean, spoilt, swapped = _prepared(batch, self.swaps)
-        status = triangulate(clean.cameras, clean.key_points, clean.seen.double()).status
-        state = _states(status, spoilt)
-        problem = self.model.problem
-        hypotheses = problem.generate(clean, self.model.hypotheses, self.model.keys("predict", clean))
-        logits = self.model.scorer(problem.describe(hypotheses))
-        weights = softmax_weights(limit_spread(logits, self.model.spread), self.model.temperature)
-        estimate = problem.combine(hypotheses, weights)
-        views = clean.seen & (state == State.OBSERVED)[:, None]
-        found = self.quality(clean, estimate.points, views)
-        offset = (hypotheses.points - estimate.points[:, None]).double()
-        i, j = torch.triu_indices(3, 3)
-        scatter = torch.einsum("bh,bhjk->bjk", weights.double(), offset[..., i] * offset[..., j])
-        found = replace(found, covariance=found.covariance + self.spread * scatter)
-        score = (weights * logits).sum(-1)
-        return _reconstruction(batch, estimate.points, state, views, found, score, swapped)
+        weighed = self.view_weights.weigh(clean)
+        points = weighed.triangulation.points
+        state = _states(weighed.triangulation.status, spoilt)
+        views = weighed.views & (state == State.OBSERVED)[:, None]
+        found = self.quality(clean, points, views)
+        score = (weighed.weights * weighed.logits).sum(-1)
+        return _reconstruction(batch, points, state, views, found, score, swapped)
 
 
 def _prepared(
