@@ -16,7 +16,16 @@ from ghpt.errors import GhptConfigError, check
 from ghpt.jobs import Job
 from ghpt.provenance import provenance
 from ghpt.report.tables import words
-from ghpt.reproduction import ablations, base_dataset, camera_tables, generalization, pose_figures, robustness
+from ghpt.reproduction import (
+    ablations,
+    base_dataset,
+    camera_tables,
+    generalization,
+    other_systems,
+    pose_figures,
+    robustness,
+    view_weights,
+)
 from ghpt.reproduction.cells import Cell
 from ghpt.reproduction.item import Item, Results
 from ghpt.reproduction.page import Entry, Page, write_page
@@ -24,11 +33,10 @@ from ghpt.reproduction.pool import perform_all
 from ghpt.reproduction.setup import Setup
 from ghpt.train import shown
 
-ITEMS: dict[str, Item] = {
-    item.label: item
-    for part in (generalization, base_dataset, pose_figures, camera_tables, ablations, robustness)
-    for item in part.ITEMS
-}
+_PARTS = (
+    generalization, other_systems, base_dataset, pose_figures, camera_tables, view_weights, ablations, robustness,
+)  # fmt: skip
+ITEMS: dict[str, Item] = {item.label: item for part in _PARTS for item in part.ITEMS}
 """Every item by its label, in the report's order."""
 MOST_JOBS = 8
 _log = logging.getLogger(__name__)

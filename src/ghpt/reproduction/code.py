@@ -14,8 +14,8 @@ import torch
 PACKAGE = Path(__file__).parents[1]
 DECIDES = (
     "data", "geometry", "models", "metrics", "calibration", "randomness.py", "recording.py", "skeleton.py", "train.py",
-    "test.py", "report/collect.py", "report/predictions.py", "report/evaluate.py", "report/pair_predictions.py",
-    "report/pair_evaluate.py",
+    "test.py", "report/poses.py", "report/pairs.py", "report/collect.py", "report/predictions.py", "report/evaluate.py",
+    "report/pair_predictions.py", "report/pair_evaluate.py",
 )  # fmt: skip
 """Every cell depends on these files and folders of ghpt, and on the module of its own work."""
 

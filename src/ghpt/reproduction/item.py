@@ -175,3 +175,5 @@ class Item:
     cells: Callable[[Setup], dict[str, Cell]]
     """By a name that ``section`` knows."""
     section: Callable[[Results], Section]
+    of_paper: bool = True
+    """False: a table or figure that the paper lacks; its heading has no ``tab:`` or ``fig:``."""

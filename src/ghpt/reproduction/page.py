@@ -42,7 +42,8 @@ class Entry:
     @property
     def heading(self) -> str:
         """Label, title and data: an embedded number can never be mistaken for a real one."""
-        return f"{PREFIX.get(self.item.kind, '')}{self.item.label}: {self.item.title} · {self.section.data}"
+        prefix = PREFIX.get(self.item.kind, "") if self.item.of_paper else ""
+        return f"{prefix}{self.item.label}: {self.item.title} · {self.section.data}"
 
     @property
     def misses(self) -> list[Compared]:

@@ -53,7 +53,7 @@ def measured(setup: Setup, name: str, data: str, perturbations: Sequence[dict[st
     """Everybody under each of the perturbations."""
     sizes = setup.sizes["robustness"]
     whole = setup.composed("test", data, *setup.overrides["test"], f"data.stride={sizes['stride'][data]}")
-    config = {key: whole[key] for key in ("data", "baselines", "seed", "files") if key in whole}
+    config = {key: whole[key] for key in ("data", "view_weights", "baselines", "seed", "files") if key in whole}
     config |= {"perturbations": list(perturbations), "code of perturbations": code_digest(PERTURBATIONS)}
     needs = {"model": setup.trained(sizes["trained_on"]), "data": setup.prepared(data, "test")}
     seconds = 2 + (4.0 if data == "h36m" else 6.0) * len(perturbations)
@@ -85,6 +85,10 @@ class Found:
 
     def mean(self, name: str, level: int, kind: str = "relative") -> float:
         return self.errors[kind][name][level].mean
+
+    def lead(self, name: str, level: int) -> float:
+        """By what share an estimator's error is below that of the best classical one."""
+        return 1 - self.mean(name, level) / self.mean(self.best_classical(level), level)
 
     def best_classical(self, level: int) -> str:
         return min(self.classical, key=lambda name: nan_to_last(self.mean(name, level)))

@@ -14,18 +14,19 @@ from ghpt.report.figures import wrapped
 from ghpt.report.tables import NAMES
 from ghpt.reproduction.item import Spread
 
-# Okabe and Ito's palette; told apart in grey print by dashes and markers.
+# Okabe and Ito's palette, and Tol's wine; told apart in grey print by dashes and markers.
 STYLES = {
     "weight": ("#0072B2", "-", "o"), "average": ("#56B4E9", (0, (4, 1)), "v"), "linear": ("#D55E00", "--", "s"),
     "weighted_linear": ("#E69F00", "-.", "D"), "ransac": ("#009E73", (0, (1, 1)), "^"),
-    "m_estimator": ("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"), "lo_ransac": ("#000000", (0, (6, 2)), "X"),
+    "m_estimator": ("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"), "lo_ransac": ("#666666", (0, (6, 2)), "X"),
+    "view_weights": ("#000000", "-", "*"), "adaptive_ransac": ("#882255", (0, (5, 1, 1, 1)), "<"),
     "best": ("#999999", ":", "*"), "trained": ("#E69F00", "-.", "D"), "tested": ("#D55E00", "--", "s"),
 }  # fmt: skip
 LABELS = NAMES | {
-    "weight": "learned selection", "average": "average of its pool",
+    "weight": "the paper's selection", "view_weights": "learned view weights", "average": "average of its pool",
     "most": "best-scored of its pool", "best": "best of its pool (looks at the truth)",
 }  # fmt: skip
-WIDTHS = {"weight": 2.2, "linear": 2.6, "ransac": 3.2}
+WIDTHS = {"weight": 2.2, "view_weights": 3.0, "linear": 2.6, "ransac": 3.2}
 """Of those that others often lie upon, or that matter most; 1.4 of the rest."""
 ACROSS = 6.0
 """Largest ratio of the errors in a panel on a linear axis."""
@@ -79,7 +80,7 @@ def _draw(axes: Axes, panel: Panel, labels: Mapping[str, str]) -> None:
             places, [s.mean for s in spreads], yerr=None if None in deviation else deviation, color=colour,
             linestyle=style, marker=marker, markersize=4 + 1.5 * WIDTHS.get(name, 1.4), markeredgecolor="white",
             markeredgewidth=0.5, linewidth=WIDTHS.get(name, 1.4), capsize=2, label=labels.get(name, name),
-            zorder=5 - WIDTHS.get(name, 1.4) / 4 + (name == "weight"),
+            zorder=5 - WIDTHS.get(name, 1.4) / 4 + (name in ("weight", "view_weights")),
         )  # fmt: skip
     if panel.logarithmic:
         axes.set_xscale("log")

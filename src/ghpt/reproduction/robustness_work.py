@@ -1,7 +1,7 @@
 """The work of the robustness curves: estimators on one data set under each of several perturbations."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +13,23 @@ from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.selection import selection_weights
 from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.report.poses import estimators
 from ghpt.reproduction.cells import write_json
 from ghpt.reproduction.work import CHECKPOINT
 from ghpt.skeleton import JOINTS
 
 KINDS = ("relative", "absolute")
-LEARNED = ("weight", "average", "most", "best")
+OF_POOL = ("weight", "average", "most", "best")
 """Selections of the model's pool; the best one looks at the truth."""
+LEARNED = (*OF_POOL, "view_weights")
 
-Estimators = Callable[[KeyPointBatch], dict[str, PoseEstimate]]
+Estimator = Callable[[KeyPointBatch], PoseEstimate]
 
 
 @torch.no_grad()
 def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
     """Estimate ``config["data"]`` under each of ``config["perturbations"]`` (None: as it is) with the model of
-    ``needs["model"]`` and ``config["baselines"]``.
+    ``needs["model"]``, ``config["view_weights"]`` and ``config["baselines"]``.
 
     result.json: for each perturbation, estimator -> MPJPE (mm) ``relative`` and ``absolute``, and the ``coverage`` of
     each: the share of the joints with a truth that were counted.
@@ -36,13 +38,13 @@ def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
     data.setup("test")
     frames = data.frames["test"]
     model, _ = load_model(needs["model"] / CHECKPOINT, seed=config["seed"])
-    estimators = everybody(model.eval(), build(config["baselines"], "baselines"))
+    everybody = together(model.eval(), estimators(config, model))
     perturbations = build(config["perturbations"], "perturbations")
     levels: list[dict[str, dict[str, MPJPE]]] = [{} for _ in perturbations]
     for first in range(0, len(frames), data.batch_size):
         batch = frames[range(first, min(first + data.batch_size, len(frames)))]
         for errors, perturbation in zip(levels, perturbations, strict=True):
-            found = estimators(batch if perturbation is None else perturbation(batch, config["seed"]))
+            found = everybody(batch if perturbation is None else perturbation(batch, config["seed"]))
             for name, estimate in found.items():
                 metrics = errors.setdefault(name, {kind: MPJPE(kind, 1, len(JOINTS)) for kind in KINDS})
                 for metric in metrics.values():
@@ -51,15 +53,17 @@ def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
     write_json(folder / "result.json", {"frames": len(frames), "levels": content})
 
 
-def everybody(model: StochasticEstimator, baselines: dict[str, Callable[[KeyPointBatch], PoseEstimate]]) -> Estimators:
-    """The model's selections and the baselines on a batch, by name."""
+def together(
+    model: StochasticEstimator, others: Mapping[str, Estimator]
+) -> Callable[[KeyPointBatch], dict[str, PoseEstimate]]:
+    """The model's selections and the other estimators on a batch, by name."""
 
     def estimate(batch: KeyPointBatch) -> dict[str, PoseEstimate]:
         keys = model.keys("test", batch)
         pool = model.pool(batch, keys)
-        weights = {n: selection_weights(n, pool.logits, pool.errors, model.temperature, keys) for n in LEARNED}
-        learned = {name: model.problem.combine(pool.hypotheses, w) for name, w in weights.items()}
-        return learned | {name: baseline(batch) for name, baseline in baselines.items()}
+        weights = {n: selection_weights(n, pool.logits, pool.errors, model.temperature, keys) for n in OF_POOL}
+        of_pool = {name: model.problem.combine(pool.hypotheses, w) for name, w in weights.items()}
+        return of_pool | {name: estimator(batch) for name, estimator in others.items()}
 
     return estimate
 
