@@ -1,0 +1,75 @@
+"""Choose ``adapt`` and ``power`` on validation data: ``python scripts/tune_view_weights.py runs/cmu2/last.ckpt``.
+
+Prints the pelvis-relative MPJPE of adaptive RANSAC and of the view weights on the embedded validation splits, as they
+are and perturbed, and the geometric mean over all, by which conf/view_weights and conf/baselines are chosen. Test data
+are never looked at.
+"""
+
+import argparse
+import itertools
+import math
+from pathlib import Path
+
+import hydra
+import torch
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from ghpt.config import build, plain
+from ghpt.metrics.pose_error import joint_errors
+from ghpt.models.checkpoint import load_model
+from ghpt.models.ransac import AdaptiveRansac
+from ghpt.models.view_weights import ViewWeights
+from ghpt.reproduction.perturbation import MissingDetections, Noise, Outliers, RotatedCameras, ShiftedCameras
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+STRIDES = {"h36m": 256, "cmu3": 512}
+ADAPT, POWER = (3.0, 4.0, 5.0, 6.0, 8.0), (None, 1.0, 1.5, 2.0, 3.0)
+CONDITIONS = {
+    "as is": lambda batch, seed: batch,
+    "5 % out": Outliers(0.05, 0.1, 0.5),
+    "20 % out": Outliers(0.2, 0.1, 0.5),
+    "noise": Noise(0.01),
+    "missing": MissingDetections(0.3),
+    "0.5 deg": RotatedCameras(0.5),
+    "20 mm": ShiftedCameras(20.0),
+}
+
+
+def validation_batches(name: str) -> list:
+    words = [f"data={name}", "data.evaluate=validation", f"data.stride={STRIDES[name]}", "output=none"]
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        config = plain(hydra.compose("train", words))
+    data = build(config["data"], "data")
+    data.setup("test")
+    return list(data.test_dataloader())
+
+
+def error(estimator, batches: list, condition) -> float:
+    total = count = 0.0
+    for batch in batches:
+        errors, counted = joint_errors(estimator(condition(batch, 0)), batch.truth, batch.truth_seen, "relative")
+        total, count = total + errors.sum().item(), count + counted.sum().item()
+    return total / count
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("checkpoint", type=Path)
+    model, _ = load_model(parser.parse_args().checkpoint, seed=0)
+    torch.set_num_threads(2)
+    batches = {name: validation_batches(name) for name in STRIDES}
+    table = Table("adapt", "power", *(f"{name} {c}" for name in STRIDES for c in CONDITIONS), "mean")
+    for adapt, power in track(list(itertools.product(ADAPT, POWER))):
+        robust = AdaptiveRansac(threshold=0.02, pairs=64, seed=0, adapt=adapt, rounds=4)
+        estimator = robust if power is None else ViewWeights(model, robust, power)
+        errors = [error(estimator, batches[name], c) for name in STRIDES for c in CONDITIONS.values()]
+        mean = math.exp(sum(map(math.log, errors)) / len(errors))
+        shown = "RANSAC" if power is None else f"{power:g}"
+        table.add_row(f"{adapt:g}", shown, *(f"{e:.2f}" for e in errors), f"{mean:.2f}")
+    Console(width=190).print(table)
+
+
+if __name__ == "__main__":
+    main()
