@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
@@ -79,6 +80,12 @@ def test_every_entry_says_its_data_its_claims_and_its_command(page, tmp_path):
         assert "seed: 0" in text
         assert re.search(r"26\.5 ± 0\.7", text)
         assert "+32.5 % (miss)" in text
+
+
+def test_a_table_that_the_paper_lacks_has_no_label_of_its(page):
+    entry = page.entries[0]
+    own = Entry(replace(entry.item, of_paper=False), entry.section, [])
+    assert own.heading == entry.heading.removeprefix("tab:") == "first: A table · embedded (synthetic) Human3.6M"
 
 
 def test_explanations_of_embedded_numbers_are_not_given_for_real_ones(page, tmp_path):

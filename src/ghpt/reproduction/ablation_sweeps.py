@@ -72,7 +72,7 @@ def temperature(results: Results) -> Section:
 
 def hypotheses_cells(setup: Setup) -> dict[str, Cell]:
     values, usual = levels(setup, "hypotheses", "model", "hypotheses"), default(setup, "model", "hypotheses")
-    cells = {DEFAULT: evaluated(setup, setup.trained(BASE), [(value, None) for value in values], seconds=22.0)}
+    cells = {DEFAULT: evaluated(setup, setup.trained(BASE), [(value, None) for value in values], seconds=30.0)}
     for value in setup.sizes["ablation"]["hypotheses_trained"]:
         if value != usual:
             seconds = 4 + 16 * value / usual

@@ -56,7 +56,7 @@ def measured(setup: Setup, name: str, data: str, perturbations: Sequence[dict[st
     config = {key: whole[key] for key in ("data", "view_weights", "baselines", "seed", "files") if key in whole}
     config |= {"perturbations": list(perturbations), "code of perturbations": code_digest(PERTURBATIONS)}
     needs = {"model": setup.trained(sizes["trained_on"]), "data": setup.prepared(data, "test")}
-    seconds = 2 + (4.0 if data == "h36m" else 6.0) * len(perturbations)
+    seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
     name = f"robustness-{name}-seed{setup.seed}"
     return Cell(name, "ghpt.reproduction.robustness_work.curve", config, needs, seconds=seconds)
 
