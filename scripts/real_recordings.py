@@ -28,7 +28,7 @@ from ghpt.report.tables import markdown
 from ghpt.skeleton import JOINT
 
 ROOT = Path(__file__).resolve().parents[1]
-ESTIMATORS = ("linear", "weighted_linear", "ransac", "m_estimator", "lo_ransac")
+ESTIMATORS = ("linear", "weighted_linear", "ransac", "adaptive_ransac", "m_estimator", "lo_ransac")
 LIMBS = [f"{side}_{joint}" for side in ("right", "left")
          for joint in ("ankle", "knee", "hip", "shoulder", "elbow", "wrist")]  # fmt: skip
 
