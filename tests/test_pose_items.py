@@ -187,8 +187,8 @@ def test_view_weights_are_set_beside_the_papers_selection_and_the_best_classical
     assert {claim.where for claim in section.claims} == {"not in the paper"}
     rows = [[text.strip() for text in line.split("|")[1:-1]] for line in section.body.splitlines()[2:]]
     assert len(rows) == 2 + 2 * 5
-    assert rows[-1] == ["H36M, the paper's selection", "33.5", "33.4", "31.0", "32.5", "29.1", "RANSAC 27.4"]
-    assert rows[-2][:2] == ["H36M, view weights", "20.0"]
+    assert rows[-1] == ["H36M, the paper's selection", "33.50", "33.40", "31.00", "32.50", "29.10", "RANSAC 27.40"]
+    assert rows[-2][:2] == ["H36M, view weights", "20.00"]
     assert not section.compared
 
 

@@ -26,7 +26,7 @@ LABELS = NAMES | {
     "weight": "the paper's selection", "view_weights": "learned view weights", "average": "average of its pool",
     "most": "best-scored of its pool", "best": "best of its pool (looks at the truth)",
 }  # fmt: skip
-WIDTHS = {"weight": 2.2, "view_weights": 3.0, "linear": 2.6, "ransac": 3.2}
+WIDTHS = {"weight": 2.2, "view_weights": 2.6, "linear": 2.6, "ransac": 3.2, "adaptive_ransac": 4.0}
 """Of those that others often lie upon, or that matter most; 1.4 of the rest."""
 ACROSS = 6.0
 """Largest ratio of the errors in a panel on a linear axis."""

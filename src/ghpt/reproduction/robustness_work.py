@@ -22,6 +22,7 @@ KINDS = ("relative", "absolute")
 OF_POOL = ("weight", "average", "most", "best")
 """Selections of the model's pool; the best one looks at the truth."""
 LEARNED = (*OF_POOL, "view_weights")
+"""Every estimator that is not classical."""
 
 Estimator = Callable[[KeyPointBatch], PoseEstimate]
 

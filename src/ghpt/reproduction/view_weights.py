@@ -12,6 +12,8 @@ from ghpt.reproduction.item import Claim, Item, Results, Section, signed
 
 ROWS = {"view weights": "view_weights", "the paper's selection": "weight"}
 """In the table -> in metrics.json."""
+DIGITS = 2
+"""One hardly tells the rows on Panoptic apart."""
 
 
 def best_classical(results: Results, test: str) -> tuple[str, float]:
@@ -29,8 +31,8 @@ def _section(results: Results) -> Section:
     rows = []
     for test, (name, error) in classical.items():
         for row, selection in ROWS.items():
-            cells = [results.relative(f"{train} on {test}", selection).text() for train in ARRANGEMENTS]
-            rows.append([f"{test.upper()}, {row}", *cells, f"{NAMES.get(name, name)} {error:.1f}"])
+            cells = [results.relative(f"{train} on {test}", selection).text(DIGITS) for train in ARRANGEMENTS]
+            rows.append([f"{test.upper()}, {row}", *cells, f"{NAMES.get(name, name)} {error:.{DIGITS}f}"])
     header = ["test, mm \\ train", *(name.upper() for name in ARRANGEMENTS), "best classical"]
     text = (
         "Not in the paper: the scorer's weights say how much each view is worth, and one triangulation from all views "
@@ -56,9 +58,10 @@ def _beats_classical(where: str, ours: dict[tuple[str, str], float], classical: 
     leads = {(a, b): 1 - error / classical[b][1] for (a, b), error in ours.items() if b in classical}
     train, test = min(leads, key=leads.__getitem__)
     name, error = classical[test]
+    won, least = sum(lead > 0 for lead in leads.values()), f"{signed(100 * leads[train, test])} %"
     by = (
-        f"in {sum(lead > 0 for lead in leads.values())} of {len(leads)}; least, {signed(100 * leads[train, test])} %, "
-        f"{train.upper()} to {test.upper()}: {ours[train, test]:.1f} mm, {NAMES.get(name, name)} {error:.1f}"
+        f"in {won} of {len(leads)}; least, {least}, {train.upper()} to {test.upper()}: "
+        f"{ours[train, test]:.{DIGITS}f} mm, {NAMES.get(name, name)} {error:.{DIGITS}f}"
     )
     statement = f"trained on any arrangement, view weights beat every classical estimator on {where}"
     return Claim(statement, "not in the paper", min(leads.values()) > 0, by)
