@@ -89,7 +89,7 @@ def test_form_is_the_documented_one(tmp_path):
         assert set(numbers["pose_prior"]["S9"]) == {
             "upper_arm", "lower_arm", "shoulder", "hip", "upper_leg", "lower_leg"
         }  # fmt: skip
-    assert len(NAMES) == 13
+    assert len(NAMES) == 15
 
 
 def test_without_damaged_only_where_there_are_damaged_takes(tmp_path):

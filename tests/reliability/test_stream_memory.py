@@ -33,7 +33,7 @@ print("figures", max(half[len(half) // 2 :]) - max(half[: len(half) // 2]), anon
 
 
 def test_e2_memory_is_flat_over_the_frames(tmp_path, nightly, record_row):
-    frames = 1_000_000 if nightly else 120_000
+    frames = 1_000_000 if nightly else 80_000
     script = SCRIPT.format(tests=str(Path(__file__).parents[1]), frames=frames, output=str(tmp_path / "out"))
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=1200)
     assert run.returncode == 0, run.stderr
