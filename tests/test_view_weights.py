@@ -112,5 +112,5 @@ def test_a_frame_s_estimate_depends_on_no_other_frame():
 
 
 def test_an_impossible_power_is_refused():
-    with pytest.raises(GhptConfigError, match="power"):
+    with pytest.raises(GhptConfigError, match=r"view_weights\.power"):
         view_weights(power=0.0)

@@ -18,7 +18,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.geometry.triangulation import Status, Triangulation, triangulate
-from ghpt.models.baselines import Baseline, check_positive, otherwise
+from ghpt.errors import check
+from ghpt.models.baselines import Baseline, otherwise
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose import PoseHypotheses
 from ghpt.models.selection import limit_spread, softmax_weights
@@ -46,7 +47,7 @@ class ViewWeights(Baseline):
     """
 
     def __init__(self, model: StochasticEstimator, consensus: Baseline, power: float) -> None:
-        check_positive(power=power)
+        check(power > 0, "view_weights.power", f"is {power}", "It must be > 0.")
         self.model, self.consensus, self.power = model.eval(), consensus, power
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
