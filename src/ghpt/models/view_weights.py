@@ -17,8 +17,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.geometry.triangulation import Status, Triangulation, triangulate
 from ghpt.errors import check
+from ghpt.geometry.triangulation import Status, Triangulation, triangulate
 from ghpt.models.baselines import Baseline, otherwise
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose import PoseHypotheses
