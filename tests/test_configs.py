@@ -83,6 +83,11 @@ def test_every_test_configuration_builds(data):
     ]  # fmt: skip
 
 
+def test_view_weights_agree_by_the_adaptive_ransac_of_the_tables():
+    config = compose("test")
+    assert config["view_weights"]["consensus"] == config["baselines"]["adaptive_ransac"]
+
+
 @pytest.mark.parametrize("experiment", choices("experiment"))
 def test_an_experiment_changes_one_setting_and_says_which_ablation_it_is(experiment):
     def leaves(node, path=""):

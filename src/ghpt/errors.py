@@ -49,3 +49,9 @@ def check(condition: bool, key: str, problem: str, mend: str) -> None:
     """Raise GhptConfigError unless ``condition`` holds: for the constructors that yaml values reach."""
     if not condition:
         raise GhptConfigError(key, problem, mend)
+
+
+def check_positive(**values: float | int) -> None:
+    """Raise GhptConfigError for a setting that is not > 0."""
+    for name, value in values.items():
+        check(value > 0, name, f"is {value}", "It must be > 0.")

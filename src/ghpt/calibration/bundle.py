@@ -11,8 +11,9 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ghpt.calibration.normal_matrix import Linearised, linearise
-from ghpt.calibration.observations import Observations, check_positive
+from ghpt.calibration.observations import Observations
 from ghpt.calibration.resection import Rig
+from ghpt.errors import check_positive
 
 
 @dataclass(frozen=True)

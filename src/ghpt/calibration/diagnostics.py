@@ -10,9 +10,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.calibration.diagnosis import Case, Diagnosis
-from ghpt.calibration.observations import check_positive, typical_size
+from ghpt.calibration.observations import typical_size
 from ghpt.calibration.resection import Rig
 from ghpt.calibration.uncertainty import Uncertainty
+from ghpt.errors import check_positive
 from ghpt.models.scale import average_lengths, part_scales
 
 

@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.errors import check
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.epipolar import normalise
 from ghpt.models.baselines import person_size
@@ -38,12 +37,6 @@ class Observations:
         """Reprojection errors in units of noise; inf behind a camera."""
         cameras = Cameras(torch.eye(3, dtype=R.dtype).expand_as(R), R, t)
         return reprojection_error(cameras, self.xy.expand(*points.shape[:-2], -1, -1, -1), points) / self.noise
-
-
-def check_positive(**values: float | int) -> None:
-    """Raise GhptConfigError for a setting that is not > 0."""
-    for name, value in values.items():
-        check(value > 0, name, f"is {value}", "It must be > 0.")
 
 
 def usable(

@@ -10,7 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.calibration.observations import Observations, check_positive
+from ghpt.calibration.observations import Observations
+from ghpt.errors import check_positive
 from ghpt.geometry.epipolar import cross_matrix, depths, essential, homogeneous
 
 

@@ -10,8 +10,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.calibration.observations import Observations, check_positive
+from ghpt.calibration.observations import Observations
 from ghpt.calibration.pairs import PairTable, camera_dict, ransac_options
+from ghpt.errors import check_positive
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.randomness import key, uniform

@@ -12,11 +12,11 @@ from torch import Tensor
 from ghpt.calibration.bundle import Adjusted, BundleAdjustment
 from ghpt.calibration.diagnosis import Case, Diagnosis, of_stature
 from ghpt.calibration.diagnostics import Diagnostics
-from ghpt.calibration.observations import Observations, check_positive, choose_frames, observe, reweighted, usable
+from ghpt.calibration.observations import Observations, choose_frames, observe, reweighted, usable
 from ghpt.calibration.pairs import PairEstimation, PairTable
 from ghpt.calibration.resection import Resection, Rig
 from ghpt.calibration.uncertainty import uncertainty
-from ghpt.errors import GhptDataError
+from ghpt.errors import GhptDataError, check_positive
 from ghpt.geometry.cameras import Cameras
 
 

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.errors import check
+from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
 from ghpt.geometry.triangulation import Status, Triangulation, triangulate
@@ -42,11 +42,6 @@ def otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
 
 def everywhere(value: float, batch: KeyPointBatch) -> Float[Tensor, " B"]:
     return torch.full(batch.sample.shape, value, dtype=torch.float64, device=batch.sample.device)
-
-
-def check_positive(**values: float | int) -> None:
-    for name, value in values.items():
-        check(value > 0, name, f"is {value}", "It must be > 0.")
 
 
 class Baseline(ABC):

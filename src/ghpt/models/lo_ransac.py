@@ -10,9 +10,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ghpt.errors import check_positive
 from ghpt.geometry.normal_equations import usable_views
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.models.baselines import Baseline, Linear, check_positive, everywhere, otherwise, person_size
+from ghpt.models.baselines import Baseline, Linear, everywhere, otherwise, person_size
 from ghpt.recording import KeyPointBatch
 
 

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.errors import check
+from ghpt.errors import check, check_positive
 from ghpt.geometry.epipolar import MINIMUM, eight_point, pose_in_front, sampson_error
 from ghpt.models.baselines import person_size
 from ghpt.randomness import key, uniform
@@ -97,7 +97,7 @@ class Ransac(Robust):
     seed: int
 
     def __post_init__(self) -> None:
-        _check_positive(samples=self.samples, threshold=self.threshold)
+        check_positive(samples=self.samples, threshold=self.threshold)
 
     def pose(
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
@@ -131,7 +131,7 @@ class Usac(Robust):
     def __post_init__(self) -> None:
         known = [name for name in dir(cv2) if name.startswith("USAC_")]
         check(self.method in known, "method", f"is {self.method!r}", f"Choose from {', '.join(known)}.")
-        _check_positive(threshold=self.threshold, pixels=self.pixels, iterations=self.iterations)
+        check_positive(threshold=self.threshold, pixels=self.pixels, iterations=self.iterations)
         check(0 < self.confidence < 1, "confidence", f"is {self.confidence}", "It must be between 0 and 1.")
 
     def pose(
@@ -165,7 +165,7 @@ class PoseLib(Robust):
     seed: int
 
     def __post_init__(self) -> None:
-        _check_positive(threshold=self.threshold, scale=self.scale, iterations=self.iterations)
+        check_positive(threshold=self.threshold, scale=self.scale, iterations=self.iterations)
         check(self.loss in _LOSSES, "loss", f"is {self.loss!r}", f"Choose from {', '.join(_LOSSES)}.")
 
     def pose(
@@ -194,8 +194,3 @@ def _distinct(draws: Float[Tensor, "S T"], count: int) -> Int[Tensor, "S T"]:
 
 
 _LOSSES = ("TRIVIAL", "TRUNCATED", "HUBER", "CAUCHY", "TRUNCATED_LE_ZACH")
-
-
-def _check_positive(**values: float | int) -> None:
-    for name, value in values.items():
-        check(value > 0, name, f"is {value}", "It must be > 0.")

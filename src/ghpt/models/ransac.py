@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ghpt.errors import check_positive
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import (
     System,
@@ -17,7 +18,7 @@ from ghpt.geometry.triangulation import (
     triangulate,
     triangulate_subsets,
 )
-from ghpt.models.baselines import Baseline, Linear, check_positive, everywhere, otherwise, person_size
+from ghpt.models.baselines import Baseline, Linear, everywhere, otherwise, person_size
 from ghpt.randomness import key, uniform
 from ghpt.recording import KeyPointBatch
 
