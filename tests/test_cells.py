@@ -102,7 +102,7 @@ if __name__ == "__main__":
 
 
 def slow(diary):
-    return [cell(diary, 1), *(cell(diary, n, sleep=60) for n in (2, 3))]
+    return [cell(diary, 1), *(cell(diary, n, sleep=600) for n in (2, 3))]
 
 
 @pytest.mark.parametrize(("stop", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGKILL", -9)])
@@ -112,11 +112,11 @@ def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_pat
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(program), str(diary), str(tmp_path / "cells")]
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as run:
-        until(lambda: {2, 3} <= set(numbers(diary)), 60)
+        until(lambda: {2, 3} <= set(numbers(diary)), 300)
         run.send_signal(getattr(signal, stop))
-        assert run.wait(20) == status
+        assert run.wait(60) == status
     workers = {int(line.split()[1]) for line in diary.read_text().splitlines()}
-    until(lambda: not any(alive(worker) for worker in workers), 10)
+    until(lambda: not any(alive(worker) for worker in workers), 60)
     first, *others = slow(diary)
     assert first.done(tmp_path / "cells")
     assert not any(other.done(tmp_path / "cells") for other in others)

@@ -248,7 +248,7 @@ def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(tmp_path
         assert child.poll() is None, "training ended before its first save"
         time.sleep(0.01)
     child.send_signal(number)
-    _, said = child.communicate(timeout=60)
+    _, said = child.communicate(timeout=300)
     assert child.returncode == status, said
     stopped = read_checkpoint(last)["global_step"]
     assert 0 < stopped < uninterrupted["global_step"]

@@ -70,7 +70,7 @@ def trained(request, composed, typed_for_two, tmp_path_factory):
     one, two = (tmp_path_factory.mktemp(f"{request.param}{n}") for n in (1, 2))
     child = typed_for_two("train", *MODELS[request.param], f"output={two}")
     train(composed("train", *MODELS[request.param]), one)
-    out, errors = child.communicate(timeout=100)
+    out, errors = child.communicate(timeout=300)
     assert child.returncode == 0, errors
     return one, two, out, errors
 
@@ -105,7 +105,7 @@ def test_testing_on_two_processes(composed, typed_for_two, tmp_path, capsys):
     one, two = tmp_path / "one", tmp_path / "two"
     child = typed_for_two("test", f"ckpt={checkpoint}", f"output={two}")
     testing.test(composed("test", f"ckpt={checkpoint}"), one)
-    out, errors = child.communicate(timeout=100)
+    out, errors = child.communicate(timeout=300)
     assert child.returncode == 0, errors
     assert out == capsys.readouterr().out
     assert [line.split()[0] for line in errors.splitlines()] == ["Report:", "Figures:"]
@@ -125,7 +125,7 @@ def test_testing_on_two_processes(composed, typed_for_two, tmp_path, capsys):
 
 def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
     child = typed_for_two("train", "data.missing=1.0", f"output={tmp_path}")
-    out, errors = child.communicate(timeout=60)
+    out, errors = child.communicate(timeout=300)
     assert (child.returncode, out) == (1, "")
     assert errors.startswith("error: embedded: toy train: no frame has a true pelvis")
     assert errors.count("\n") == 1
@@ -133,13 +133,13 @@ def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
 
 def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
     child = typed_for_two("train", *MODELS["pose"], "trainer.max_epochs=5000", "save_every=2", f"output={tmp_path}")
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300
     while not (tmp_path / "last.ckpt").exists():
         assert time.monotonic() < end, "training did not begin"
         time.sleep(0.05)
     others = subprocess.run(["ps", "-o", "pid=", "--ppid", str(child.pid)], capture_output=True, text=True).stdout
     child.send_signal(signal.SIGINT)
-    _, errors = child.communicate(timeout=30)
+    _, errors = child.communicate(timeout=300)
     assert child.returncode == 130
     assert re.match(r"Stopped\. .*last\.ckpt holds training step \d+\.\nGo on with the same command and", errors)
     assert errors.count("\n") == 2

@@ -56,7 +56,7 @@ def in_browser(path, *options):
     if browser is None:
         pytest.skip("no browser: chromium or google-chrome")
     command = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=900,700", *options]
-    run = subprocess.run([*command, f"{path.as_uri()}"], capture_output=True, text=True, timeout=120, check=True)
+    run = subprocess.run([*command, f"{path.as_uri()}"], capture_output=True, text=True, timeout=300, check=True)
     return run.stdout
 
 
@@ -116,7 +116,7 @@ def test_the_player_s_logic(tmp_path):
     (tmp_path / "logic.js").write_text(LOGIC, encoding="utf-8")
     player = resources.files("ghpt.export") / "player.js"
     command = [node, tmp_path / "logic.js", str(player), tmp_path / "poses.html"]
-    found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout)
+    found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout)
     assert found["count"] == 6
     for t, joints in enumerate(found["drawn"]):
         placed = torch.nonzero(made.placed[t])[:, 0].tolist()

@@ -33,6 +33,6 @@ def test_the_recording_has_cameras_rays_key_points_joints_and_hypotheses(tmp_pat
     )  # fmt: skip
     assert [path.name for path in tmp_path.iterdir()] == ["poses.rrd"]
     command = [sys.executable, "-m", "rerun_cli", "rrd", "stats", str(tmp_path / "poses.rrd")]
-    stats = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60).stdout
+    stats = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
     for entity in ("/world/joints", "/world/bones", "/world/hypotheses", "/world/rays/", "key_points", "reprojected"):
         assert entity in stats

@@ -68,7 +68,7 @@ def test_testing_holds_one_batch_however_many_frames(tmp_path):
     peaks = []
     for times in (1, 6):
         command = [sys.executable, __file__, str(tmp_path), str(times * FRAMES)]
-        run = subprocess.run(command, env=os.environ | ENVIRONMENT, check=True, capture_output=True, timeout=120)
+        run = subprocess.run(command, env=os.environ | ENVIRONMENT, check=True, capture_output=True, timeout=300)
         result = json.loads(run.stdout.splitlines()[-1])
         assert result["frames"] == times * FRAMES
         peaks.append(result["peak"])

@@ -132,7 +132,7 @@ def test_processes_that_prepare_the_same_at_once(tmp_path: Path) -> None:
     for child in children:
         child.start()
     start.set()
-    assert [results.get(timeout=60) for _ in children] == [int(recording(0, frames=3000).frame.sum())] * 4
+    assert [results.get(timeout=300) for _ in children] == [int(recording(0, frames=3000).frame.sum())] * 4
     for child in children:
         child.join()
     assert len(list(tmp_path.iterdir())) == 1

@@ -39,7 +39,7 @@ def test_c1_the_same_command_twice(tmp_path, record_row):
             "GHPT_CACHE": str(tmp_path / f"cache{number}"),
         }  # fmt: skip
         command = [sys.executable, str(SCRIPT), str(folder), json.dumps({"test": True})]
-        subprocess.run(command, cwd=cwd, env=environment, check=True, capture_output=True, timeout=200)
+        subprocess.run(command, cwd=cwd, env=environment, check=True, capture_output=True, timeout=300)
         results.append((read_checkpoint(folder / "last.ckpt")["state_dict"], arrays(folder)))
     (weights, first), (again, second) = results
     same = sum(torch.equal(v, again[k]) for k, v in weights.items())

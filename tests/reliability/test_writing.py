@@ -86,7 +86,7 @@ def test_b1_and_b2_kill_training_and_resume(tmp_path, nightly, record_row):
         command = [sys.executable, str(SCRIPT), str(folder), json.dumps(wanted)]
         return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
-    assert start(tmp_path / "whole", False).wait(timeout=200) == 0
+    assert start(tmp_path / "whole", False).wait(timeout=300) == 0
     expected = read_checkpoint(tmp_path / "whole" / "last.ckpt")["state_dict"]
     runs = 10 if nightly else 2
     same = 0
@@ -99,7 +99,7 @@ def test_b1_and_b2_kill_training_and_resume(tmp_path, nightly, record_row):
         time.sleep(rng.uniform(0, 0.8))
         child.kill()
         child.wait()
-        assert start(folder, True).wait(timeout=200) == 0
+        assert start(folder, True).wait(timeout=300) == 0
         found = read_checkpoint(folder / "last.ckpt")["state_dict"]
         same += all(torch.equal(found[k], v) for k, v in expected.items())
         assert not [p for p in folder.iterdir() if p.name.endswith(".tmp")]
