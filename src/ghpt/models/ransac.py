@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -10,15 +10,8 @@ from torch import Tensor
 
 from ghpt.errors import check_positive
 from ghpt.geometry.cameras import Cameras, reprojection_error
-from ghpt.geometry.triangulation import (
-    System,
-    Triangulation,
-    flat_cameras,
-    in_parts,
-    triangulate,
-    triangulate_subsets,
-)
-from ghpt.models.baselines import Baseline, Linear, everywhere, otherwise, person_size
+from ghpt.geometry.triangulation import Status, System, Triangulation, flat_cameras, in_parts, triangulate_subsets
+from ghpt.models.baselines import Baseline, everywhere, person_size
 from ghpt.randomness import key, uniform
 from ghpt.recording import KeyPointBatch
 
@@ -44,44 +37,19 @@ class Ransac(Baseline):
         return everywhere(self.threshold, batch)
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
-        return self.at(batch, everywhere(self.threshold, batch))
-
-    def at(self, batch: KeyPointBatch, thresholds: Float[Tensor, " B"]) -> Triangulation:
-        """With a threshold for each frame."""
         rig = flat_cameras(batch.cameras, batch.seen.shape[:1])
-        limit = (thresholds[:, None] * person_size(batch.key_points, batch.seen)).clamp(min=1e-12)
-        candidates = self._pairs(batch)
+        size, pairs = person_size(batch.key_points, batch.seen), self._pairs(batch)
 
         def part(rows: slice) -> tuple[Tensor, ...]:
             own = rig if len(rig.t) == 1 else rig.index(rows)
-            return (self._inliers(own, batch.key_points[rows], batch.seen[rows], limit[rows], candidates[rows]),)
+            candidates = _Candidates(own, batch.key_points[rows], batch.seen[rows], size[rows], pairs[rows])
+            return candidates.fields(self._inliers(candidates))
 
         frames, views, joints = batch.seen.shape
-        (inlier,) = in_parts(part, torch.Size((frames, max(views, candidates.shape[1]), joints)))
-        robust = triangulate(batch.cameras, batch.key_points, inlier.to(batch.key_points.dtype))
-        return otherwise(robust, Linear().triangulate(batch))
+        return Triangulation(*in_parts(part, torch.Size((frames, max(views, pairs.shape[1]), joints))))
 
-    def _inliers(
-        self, cameras: Cameras, key_points: Tensor, seen: Bool[Tensor, "B V J"], limit: Tensor, pairs: Tensor
-    ) -> Bool[Tensor, "B V J"]:
-        """The inliers of each joint's best pair."""
-        whole = Cameras(*(x.expand(len(seen), *x.shape[1:]) for x in (cameras.K, cameras.R, cameras.t)))
-        points, ok = triangulate_subsets(whole, key_points, seen, pairs)
-        system = System(cameras, key_points, seen.permute(1, 2, 0))
-        square = torch.where(system.used, limit.double().mT[:, None] ** 2, 0.0)
-        ok, points = ok.permute(1, 2, 0), (points - system.origin[:, None, None]).permute(3, 1, 2, 0).contiguous()
-        count, rest = torch.zeros(ok.shape, dtype=points.dtype, device=ok.device), 0.0
-        for view in range(len(square)):
-            residual = system.square_residuals(points, square, view)
-            inlier = ok & (residual <= 1)
-            count += inlier
-            rest = rest + torch.where(inlier, residual.sqrt(), 0.0)
-        # the residuals sum up to less than one more inlier
-        best = (count - rest / (len(square) + 1)).argmax(0)[None]
-        chosen, right = (x.gather(-3, best.expand(*x.shape[:-3], 1, -1, -1)).squeeze(-3) for x in (points, ok))
-        return torch.stack(
-            [right & (system.square_residuals(chosen, square, view) <= 1) for view in range(len(square))]
-        ).permute(2, 0, 1)
+    def _inliers(self, candidates: _Candidates) -> Bool[Tensor, "V J B"]:
+        return candidates.inliers(candidates.residual.new_full((candidates.residual.shape[-1],), self.threshold))
 
     def _pairs(self, batch: KeyPointBatch) -> Bool[Tensor, "B P J V"]:
         """Pairs of seen views: each pair of the rig if they are few, else random ones."""
@@ -120,24 +88,77 @@ class AdaptiveRansac(Ransac):
     def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"]:
         size = person_size(batch.key_points, batch.seen).clamp(min=1e-12)[..., None]
         residual = reprojection_error(batch.cameras, batch.key_points, points) / size
-        median = torch.where(batch.seen, residual, torch.nan).flatten(1).nanmedian(dim=1).values
-        wider = torch.where(torch.isfinite(median), self.adapt * median, 0.0)
-        return wider.clamp(min=self.threshold)
+        return self._reach(residual.permute(1, 2, 0), batch.seen.permute(1, 2, 0))
 
-    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
-        thresholds = everywhere(self.threshold, batch)
-        found = self.at(batch, thresholds)
+    def _reach(self, residual: Float[Tensor, "V J B"], seen: Bool[Tensor, "V J B"]) -> Float[Tensor, " B"]:
+        """From residuals of the points, as fractions of the person's size."""
+        counted = seen & (seen.sum(0) >= 2)
+        median = torch.where(counted, residual, torch.nan).flatten(0, 1).nanmedian(dim=0).values
+        return torch.where(torch.isfinite(median), self.adapt * median, 0.0).clamp(min=self.threshold)
+
+    def _inliers(self, candidates: _Candidates) -> Bool[Tensor, "V J B"]:
+        inlier = super()._inliers(candidates)
+        thresholds = candidates.residual.new_full(inlier.shape[-1:], self.threshold)
         for _ in range(self.rounds):
-            wider = self.reach(batch, found.points)
+            wider = self._reach(candidates.residuals(candidates.point(inlier)), candidates.system.used)
             rows = torch.nonzero(wider > thresholds)[:, 0]
             if not len(rows):
                 break
             thresholds = torch.maximum(thresholds, wider)
-            found = _with_rows(found, rows, self.at(batch.rows(rows), thresholds[rows]))
-        return found
+            inlier[..., rows] = candidates.inliers(thresholds[rows], rows)
+        return inlier
 
 
-def _with_rows(whole: Triangulation, rows: Tensor, part: Triangulation) -> Triangulation:
-    """``whole`` with ``part`` in its ``rows``."""
-    names = [field.name for field in fields(Triangulation)]
-    return Triangulation(**{n: getattr(whole, n).index_copy(0, rows, getattr(part, n)) for n in names})
+class _Candidates:
+    """The points of the pairs of views of a few frames, and how far each is from every key point.
+
+    Arrays are [V, P, J, B] and [V, J, B], residuals are fractions of the person's ``size``.
+    """
+
+    def __init__(
+        self,
+        cameras: Cameras,
+        key_points: Float[Tensor, "B V J 2"],
+        seen: Bool[Tensor, "B V J"],
+        size: Float[Tensor, "B V"],
+        pairs: Bool[Tensor, "B P J V"],
+    ) -> None:
+        whole = Cameras(*(x.expand(len(seen), *x.shape[1:]) for x in (cameras.K, cameras.R, cameras.t)))
+        points, ok = triangulate_subsets(whole, key_points, seen, pairs)
+        self.seen = seen.permute(1, 2, 0)
+        self.system = System(cameras, key_points, self.seen)
+        self.square = torch.where(self.system.used, size.double().clamp(min=1e-12).mT[:, None] ** 2, 0.0)
+        points = (points - self.system.origin[:, None, None]).permute(3, 1, 2, 0).contiguous()
+        self.residual = torch.where(ok.permute(1, 2, 0), self.residuals(points), torch.inf)
+        self.all_views = self.system.solve(self.system.used.double())
+
+    def residuals(self, points: Float[Tensor, "3 *P J B"]) -> Float[Tensor, "V *P J B"]:
+        """Of points of the local world; inf where the view does not see the joint or has it behind."""
+        views = range(len(self.square))
+        return torch.stack([self.system.square_residuals(points, self.square, view) for view in views]).sqrt()
+
+    def inliers(self, thresholds: Float[Tensor, " B"], rows: Tensor | None = None) -> Bool[Tensor, "V J B"]:
+        """The views within the frame's threshold of each joint's best point: that with the most of them, and with the
+        least sum of residuals among equals. ``rows``: of some of the frames."""
+        residual = self.residual if rows is None else self.residual[..., rows]
+        # the residuals sum up to less than one more inlier
+        slope, score = 1 / (thresholds * (len(residual) + 1)), 0.0
+        for of_view in residual:
+            score = score + torch.where(of_view <= thresholds, 1 - of_view * slope, 0.0)
+        best = score.argmax(0).expand(len(residual), 1, -1, -1)
+        return residual.gather(1, best)[:, 0] <= thresholds
+
+    def point(self, inlier: Bool[Tensor, "V J B"]) -> Float[Tensor, "3 J B"]:
+        """Of the inliers; of all views where those do not fix one."""
+        point, cond = self.system.solve(inlier.double())
+        return torch.where(torch.isfinite(cond), torch.stack(list(point)), torch.stack(list(self.all_views[0])))
+
+    def fields(self, inlier: Bool[Tensor, "V J B"]) -> tuple[Tensor, ...]:
+        """The fields of Triangulation, of the inliers; of all views where those have no point."""
+        system = self.system
+        robust = system.fields(*system.solve(inlier.double()), inlier, torch.zeros_like(inlier[0]))
+        linear = system.fields(*self.all_views, system.used, (self.seen & ~system.used).any(0))
+        ok = robust[1] == Status.OK
+        return tuple(
+            torch.where(ok[..., None] if a.ndim > ok.ndim else ok, a, b) for a, b in zip(robust, linear, strict=True)
+        )
