@@ -3,8 +3,8 @@
 The errors are of the same key points for all: 5 pixels of noise, one in fifty unseen, and in the second error one
 detection in ten 100 pixels off. A point is one joint of one frame; for subsets, of one hypothesis. pycolmap and the
 loop work point by point, so their speed is taken on fewer frames. ``pycolmap alone`` is its LO-RANSAC on cameras and
-arrays that are made beforehand: the fastest that it can be called from Python. ``predict`` is the classical default of
-conf/estimator with states, covariances and swaps. The second table divides the time of twice the frames, or
+arrays that are made beforehand: the fastest that it can be called from Python. ``predict`` is its classical default
+with states, covariances and swaps. The second table divides the time of twice the frames, or
 views, by twice the time of one: 1 is linear.
 
 Settings: ``views=4,7,10,31`` ``frames=512`` ``loop_frames=64`` ``least=1`` (seconds for each figure).
@@ -102,7 +102,8 @@ def error(estimate: Callable[[KeyPointBatch], Tensor], data: KeyPointBatch) -> f
 def main() -> None:
     wanted = settings(views="4,7,10,31", frames=512, loop_frames=64, least=1.0)
     title, baselines = machine(), build(configuration("test")["baselines"], "baselines")
-    predictor = build(configuration("estimator/default")["estimator"]["classical"], "estimator.classical")
+    classical = build(configuration("estimator/default")["estimator"]["classical"], "estimator.classical")
+    predictor = classical(estimator=baselines[configuration("predict")["triangulation"]])
     methods = {name: (lambda d, b=b: b(d).points) for name, b in baselines.items()} | {"SVD loop": svd_loop}
     methods["predict"] = lambda d: predictor(d).points
     rows, lines = [], []
@@ -123,7 +124,7 @@ def main() -> None:
             errors = [f"{error(estimate, d):.2f}" for d in (few, with_outliers(few))]
             label = "lo_ransac (pycolmap)" if name == "lo_ransac" else name
             rows.append([str(views), label, f"{data.truth[..., 0].numel() / taken:,.0f}", *errors])
-        fast = {name: methods[name] for name in ("linear", "m_estimator", "ransac", "predict")}
+        fast = {name: methods[name] for name in ("linear", "m_estimator", "adaptive_ransac", "predict")}
         if views <= 10:
             lines += linearity(views, wanted["frames"], wanted["least"], fast)
     show(title, ["views", "method", "points/s", "error, mm", "with outliers, mm"], rows)

@@ -62,7 +62,7 @@ def main() -> None:
     batches = {name: validation_batches(name) for name in STRIDES}
     table = Table("adapt", "power", *(f"{name} {c}" for name in STRIDES for c in CONDITIONS), "mean")
     for adapt, power in track(list(itertools.product(ADAPT, POWER))):
-        robust = AdaptiveRansac(threshold=0.02, pairs=64, seed=0, adapt=adapt, rounds=4)
+        robust = AdaptiveRansac(threshold=0.02, pairs=24, seed=0, adapt=adapt, rounds=4)
         estimator = robust if power is None else ViewWeights(model, robust, power)
         errors = [error(estimator, batches[name], c) for name in STRIDES for c in CONDITIONS.values()]
         mean = math.exp(sum(map(math.log, errors)) / len(errors))

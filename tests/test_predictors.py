@@ -212,14 +212,18 @@ def test_no_frames_and_no_seen_joints_are_no_error(make):
 
 
 def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
-    config = yaml.safe_load((Path(__file__).parents[1] / "conf/estimator/default.yaml").read_text())
+    conf = Path(__file__).parents[1] / "conf"
+    config, baselines = (
+        yaml.safe_load((conf / name / "default.yaml").read_text()) for name in ("estimator", "baselines")
+    )
+    estimator = build(baselines["adaptive_ransac"], "baselines.adaptive_ransac")
     scene = random_scene(9, frames=30, views=5).noisy(2, 0)
     off = scene.key_points.clone()
     off[:, 2, ::2] += 200  # a view that agrees with no other is no noise
     batch = replace(scene, key_points=off).batch()
     size = person_size(scene.key_points, batch.seen).mean()
     for made in (
-        build(config["classical"], "estimator.classical"),
+        build(config["classical"], "estimator.classical")(estimator=estimator),
         build(config["learned"], "estimator.learned")(view_weights=learned().view_weights),
     ):
         assert made(batch).placed.all()

@@ -85,7 +85,9 @@ def test_calibration_on_embedded_people_known_to_the_detector_and_not(split, ban
     """Absolute positions: people that the detector was trained on are inside more often than said, others as often."""
     conf = Path(__file__).parents[1] / "conf"
     detector = Detector(**yaml.safe_load((conf / "detector/human36m.yaml").read_text()))
-    predictor = build(yaml.safe_load((conf / "estimator/default.yaml").read_text())["classical"], "estimator.classical")
+    settings = yaml.safe_load((conf / "estimator/default.yaml").read_text())["classical"]
+    estimator = yaml.safe_load((conf / "baselines/default.yaml").read_text())["adaptive_ransac"]
+    predictor = build(settings, "estimator.classical")(estimator=build(estimator, "baselines.adaptive_ransac"))
     takes = list(islice(embedded_recordings("h36m", split, 0, detector), 4))
     frames = Frames(takes, np.arange(0, sum(map(len, takes)), 16))
     batch = frames[range(len(frames))]

@@ -49,7 +49,7 @@ class Settings(InputSettings):
     person: int
     ckpt: str | None
     hypotheses: int | None
-    triangulation: str | None
+    triangulation: str
     fill: int | str | None
     interpolation: str
     smooth: float | None
@@ -150,12 +150,11 @@ def choose(config: dict[str, Any]) -> Chosen:
     kind = "learned" if config["ckpt"] else "classical"
     settings = config["estimator"][kind] | ({} if config["swaps"] else {"swaps": None})
     if not config["ckpt"]:
-        name = config["triangulation"] or _name(config)
-        if config["triangulation"]:
-            settings |= {"estimator": config["baselines"][name]}
+        name = config["triangulation"]
         text = f"{NAMES.get(name, name.replace('_', ' '))}, a classical estimator (no ckpt was given)"
-        predictor = build(settings, "estimator.classical")
-        return Chosen(name, text, predictor, predictor.swaps, None, settings)
+        estimator = config["baselines"][name]
+        predictor = build(settings, "estimator.classical")(estimator=build(estimator, f"baselines.{name}"))
+        return Chosen(name, text, predictor, predictor.swaps, None, settings | {"estimator": estimator})
     model, trained = load_model(config["ckpt"], hypotheses=config["hypotheses"], seed=config["seed"])
     if not isinstance(model.problem, PoseTriangulation):
         problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
@@ -169,13 +168,6 @@ def choose(config: dict[str, Any]) -> Chosen:
     identity = settings | {"view_weights": config["view_weights"], "ckpt_sha256": digest,
                            "hypotheses": model.hypotheses, "seed": config["seed"]}  # fmt: skip
     return Chosen("view_weights", text, predictor, predictor.swaps, model, identity)
-
-
-def _name(config: dict[str, Any]) -> str:
-    """What the classical estimator is called among the baselines, or its class."""
-    target = config["estimator"]["classical"]["estimator"]["_target_"]
-    same = [name for name, settings in config["baselines"].items() if settings["_target_"] == target]
-    return same[0] if same else target.split(".")[-1]
 
 
 def from_files(config: dict[str, Any]) -> Frames:
@@ -223,7 +215,7 @@ def _check(config: dict[str, Any]) -> None:
     for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
         check(config[name] >= 1, name, f"is {config[name]}", "Give 1 or more.")
     for key, names, existing in (
-        ("triangulation", [config["triangulation"] or "linear"], config["baselines"]),
+        ("triangulation", [] if config["ckpt"] else [config["triangulation"]], config["baselines"]),
         ("compare", config["compare"], config["baselines"]),
         ("formats", config["formats"] or [], WRITERS),
     ):  # fmt: skip

@@ -35,10 +35,10 @@ class Quality:
     little about their noise. ``shared``: deviation (mm) of what all views have in common, and no residual shows:
     where a detector takes the joint to be.
 
-    With conf/estimator/default.yaml 77, 98 and 99 % of the true positions of embedded Human3.6M lie within the
-    ellipsoids of 50, 90 and 95 % for people that the detector was trained on (too cautious), 50, 88 and 93 % for
-    others. On embedded Panoptic, whose joints are defined 19 mm elsewhere, 18, 48 and 55 %: there shared = 11 fits.
-    Views are taken to be weighted by their resolution; the M-estimator's are so where persons are equally large.
+    With conf/estimator/default.yaml and adaptive RANSAC 76, 98 and 99 % of the true positions of embedded Human3.6M lie
+    within the ellipsoids of 50, 90 and 95 % for people that the detector was trained on (too cautious), 49, 88 and 93 %
+    for others. On embedded Panoptic, whose joints are defined 19 mm elsewhere, 18, 48 and 55 %: there shared = 11 fits.
+    Views are taken to be weighted by their resolution, as they are where persons are equally large.
     """
 
     noise: float | None

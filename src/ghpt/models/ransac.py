@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -128,12 +130,16 @@ class _Candidates:
         self.seen = seen.permute(1, 2, 0)
         self.system = System(cameras, key_points, self.seen)
         self.square = torch.where(self.system.used, size.double().clamp(min=1e-12).mT[:, None] ** 2, 0.0)
-        points = (points - self.system.origin[:, None, None]).permute(3, 1, 2, 0).contiguous()
-        self.residual = torch.where(ok.permute(1, 2, 0), self.residuals(points), torch.inf)
-        self.all_views = self.system.solve(self.system.used.double())
+        points = torch.where(ok[..., None], points - self.system.origin[:, None, None], torch.nan)
+        self.residual = self.residuals(points.permute(3, 1, 2, 0).contiguous())
+
+    @cached_property
+    def of_all_views(self) -> tuple[Sequence[Tensor], Float[Tensor, "J B"]]:
+        """The solution of all views together; seldom needed."""
+        return self.system.solve(self.system.used.double())
 
     def residuals(self, points: Float[Tensor, "3 *P J B"]) -> Float[Tensor, "V *P J B"]:
-        """Of points of the local world; inf where the view does not see the joint or has it behind."""
+        """Of points of the local world; inf where there is none, and for a view that does not see it or has it behind."""
         views = range(len(self.square))
         return torch.stack([self.system.square_residuals(points, self.square, view) for view in views]).sqrt()
 
@@ -151,14 +157,17 @@ class _Candidates:
     def point(self, inlier: Bool[Tensor, "V J B"]) -> Float[Tensor, "3 J B"]:
         """Of the inliers; of all views where those do not fix one."""
         point, cond = self.system.solve(inlier.double())
-        return torch.where(torch.isfinite(cond), torch.stack(list(point)), torch.stack(list(self.all_views[0])))
+        point, fixed = torch.stack(list(point)), torch.isfinite(cond)
+        return point if fixed.all() else torch.where(fixed, point, torch.stack(list(self.of_all_views[0])))
 
     def fields(self, inlier: Bool[Tensor, "V J B"]) -> tuple[Tensor, ...]:
         """The fields of Triangulation, of the inliers; of all views where those have no point."""
         system = self.system
         robust = system.fields(*system.solve(inlier.double()), inlier, torch.zeros_like(inlier[0]))
-        linear = system.fields(*self.all_views, system.used, (self.seen & ~system.used).any(0))
         ok = robust[1] == Status.OK
+        if ok.all():
+            return robust
+        linear = system.fields(*self.of_all_views, system.used, (self.seen & ~system.used).any(0))
         return tuple(
             torch.where(ok[..., None] if a.ndim > ok.ndim else ok, a, b) for a, b in zip(robust, linear, strict=True)
         )
