@@ -7,7 +7,7 @@ the number of subsets; then each joint is a 3x3 solve.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import IntEnum
 
 import torch
@@ -72,6 +72,15 @@ class Triangulation:
     @property
     def ok(self) -> Bool[Tensor, "*B J"]:
         return self.status == Status.OK
+
+    @property
+    def placed(self) -> Bool[Tensor, "*B J"]:
+        """The joints that have a point."""
+        return self.ok | (self.status == Status.NOT_CONVERGED)
+
+    def with_rows(self, rows: Int[Tensor, " b"], part: Triangulation) -> Triangulation:
+        """This, with ``part`` in these rows of the first dimension."""
+        return Triangulation(*(getattr(self, f.name).index_copy(0, rows, getattr(part, f.name)) for f in fields(self)))
 
 
 def triangulate(

@@ -18,7 +18,7 @@ from torch import Tensor
 from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
-from ghpt.geometry.triangulation import Status, Triangulation, triangulate
+from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.recording import KeyPointBatch, PoseEstimate
 
 
@@ -38,6 +38,10 @@ def otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
         a, b = getattr(first, field.name), getattr(second, field.name)
         chosen[field.name] = torch.where(first.ok[..., None] if a.ndim > first.ok.ndim else first.ok, a, b)
     return Triangulation(**chosen)
+
+
+def poses_of(result: Triangulation, batch: KeyPointBatch) -> PoseEstimate:
+    return PoseEstimate(result.points.to(batch.key_points.dtype), result.placed)
 
 
 def everywhere(value: float, batch: KeyPointBatch) -> Float[Tensor, " B"]:
@@ -72,9 +76,7 @@ class Baseline(ABC):
 
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> PoseEstimate:
-        result = self.triangulate(batch)
-        estimated = result.ok | (result.status == Status.NOT_CONVERGED)
-        return PoseEstimate(result.points.to(batch.key_points.dtype), estimated)
+        return poses_of(self.triangulate(batch), batch)
 
 
 class Linear(Baseline):

@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from ghpt.geometry.normal_equations import usable_views
-from ghpt.geometry.triangulation import Status
-from ghpt.models.baselines import Baseline
+from ghpt.geometry.triangulation import Status, Triangulation
+from ghpt.models.baselines import Baseline, poses_of
 from ghpt.models.quality import JointQuality, Quality
 from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.models.view_weights import ViewWeights
@@ -50,17 +50,14 @@ class Classical:
         self.estimator, self.quality, self.swaps, self.reject = estimator, quality, swaps, reject
 
     def fitted(self, batch: KeyPointBatch) -> Classical:
-        clean, _, _ = _prepared(batch, self.swaps)
-        result = self.estimator.triangulate(clean)
-        placed = result.ok | (result.status == Status.NOT_CONVERGED)
-        views, _ = self.estimator.agreeing(clean, result.points, placed)
+        clean, _, _, result = _prepared(batch, self.swaps, self.estimator)
+        views, _ = self.estimator.agreeing(clean, result.points, result.placed)
         quality = self.quality.fitted(clean, result.points, views)
         return Classical(self.estimator, quality, self.swaps, self.reject)
 
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> Reconstruction:
-        clean, spoilt, swapped = _prepared(batch, self.swaps)
-        result = self.estimator.triangulate(clean)
+        clean, spoilt, swapped, result = _prepared(batch, self.swaps, self.estimator)
         state = _states(result.status, spoilt)
         views, agreed = self.estimator.agreeing(clean, result.points, state == State.OBSERVED)
         if self.reject:
@@ -83,15 +80,15 @@ class Learned:
         self.view_weights, self.quality, self.swaps = view_weights, quality, swaps
 
     def fitted(self, batch: KeyPointBatch) -> Learned:
-        clean, _, _ = _prepared(batch, self.swaps)
-        weighed = self.view_weights.weigh(clean)
+        clean, _, _, robust = _prepared(batch, self.swaps, self.view_weights.consensus)
+        weighed = self.view_weights.weigh(clean, robust)
         quality = self.quality.fitted(clean, weighed.triangulation.points, weighed.views)
         return Learned(self.view_weights, quality, self.swaps)
 
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> Reconstruction:
-        clean, spoilt, swapped = _prepared(batch, self.swaps)
-        weighed = self.view_weights.weigh(clean)
+        clean, spoilt, swapped, robust = _prepared(batch, self.swaps, self.view_weights.consensus)
+        weighed = self.view_weights.weigh(clean, robust)
         points = weighed.triangulation.points
         state = _states(weighed.triangulation.status, spoilt)
         views = weighed.views & (state == State.OBSERVED)[:, None]
@@ -101,14 +98,19 @@ class Learned:
 
 
 def _prepared(
-    batch: KeyPointBatch, swaps: Swaps | None
-) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"], Bool[Tensor, "B V"]]:
-    """The batch to triangulate, what was taken out of it, and in which views left and right were exchanged."""
+    batch: KeyPointBatch, swaps: Swaps | None, estimator: Baseline
+) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"], Bool[Tensor, "B V"], Triangulation]:
+    """The batch to triangulate, what was taken out of it, in which views left and right were exchanged, and what
+    ``estimator`` makes of the batch. It does so once where it is the one that looks for swaps."""
     clean, spoilt = cleaned(batch)
+    result = estimator.triangulate(clean)
     if swaps is None:
-        return clean, spoilt, torch.zeros_like(batch.seen[..., 0])
-    clean, swapped = undo_swaps(clean, swaps)
-    return clean, spoilt, swapped
+        return clean, spoilt, torch.zeros_like(batch.seen[..., 0]), result
+    clean, swapped = undo_swaps(clean, swaps, poses_of(result, clean) if estimator == swaps.estimator else None)
+    rows = torch.nonzero(swapped.any(-1))[:, 0]
+    if len(rows):
+        result = result.with_rows(rows, estimator.triangulate(clean.rows(rows)))
+    return clean, spoilt, swapped, result
 
 
 def cleaned(batch: KeyPointBatch) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"]]:

@@ -139,7 +139,7 @@ class _Candidates:
         return self.system.solve(self.system.used.double())
 
     def residuals(self, points: Float[Tensor, "3 *P J B"]) -> Float[Tensor, "V *P J B"]:
-        """Of points of the local world; inf where there is none, and for a view that does not see it or has it behind."""
+        """Of points of the local world; inf where there is none, and for views that do not see it or have it behind."""
         views = range(len(self.square))
         return torch.stack([self.system.square_residuals(points, self.square, view) for view in views]).sqrt()
 

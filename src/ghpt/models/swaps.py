@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.errors import check
-from ghpt.geometry.cameras import Cameras, reprojection_error
+from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.baselines import Baseline, person_size
 from ghpt.recording import KeyPointBatch, PoseEstimate
 from ghpt.skeleton import JOINTS, MIRROR
@@ -47,17 +47,20 @@ class Swaps:
 
 
 @torch.no_grad()
-def undo_swaps(batch: KeyPointBatch, swaps: Swaps) -> tuple[KeyPointBatch, Bool[Tensor, "B V"]]:
+def undo_swaps(
+    batch: KeyPointBatch, swaps: Swaps, estimate: PoseEstimate | None = None
+) -> tuple[KeyPointBatch, Bool[Tensor, "B V"]]:
     """The batch with left and right put right, and in which views of which frames they were not.
 
     Only in frames with three views or more, and in fewer than half of these: of views that stand two against two
-    neither side is the swapped one. Frames in which no view fits badly cost one estimate.
+    neither side is the swapped one. ``estimate``: what ``swaps.estimator`` makes of the batch, if that is known; frames
+    in which no view fits it badly cost nothing more.
     """
     exchanged = torch.zeros(*batch.seen.shape[:2], len(LIMBS), dtype=torch.bool, device=batch.seen.device)
     most = (batch.seen.any(-1).sum(-1) - 1) // 2
     if not len(batch) or int(most.max()) < 1:
         return batch, exchanged.any(-1)
-    estimate = swaps.estimator(batch)
+    estimate = estimate or swaps.estimator(batch)
     before = _costs(batch, estimate, swaps.scale)
     # a view that is right in a pose that is nearly right is far from its mirror image
     mirrored = _costs(_exchange(batch, ~exchanged), estimate, swaps.scale)
@@ -69,7 +72,7 @@ def undo_swaps(batch: KeyPointBatch, swaps: Swaps) -> tuple[KeyPointBatch, Bool[
         own = exchanged[doubtful]
         candidates = _candidates(own, before[doubtful], min(swaps.views, batch.seen.shape[1]))
         count = candidates.shape[1]
-        hypotheses = _exchange(_frames(batch, doubtful.repeat_interleave(count)), candidates.flatten(0, 1))
+        hypotheses = _exchange(batch.rows(doubtful.repeat_interleave(count)), candidates.flatten(0, 1))
         costs = _costs(hypotheses, swaps.estimator(hypotheses), swaps.scale).unflatten(0, (-1, count))
         allowed = candidates.any(-1).sum(-1) <= most[doubtful, None]
         best = torch.where(allowed, costs.sum(-1), torch.inf).argmin(-1)
@@ -88,12 +91,6 @@ def _candidates(exchanged: Bool[Tensor, "S V G"], costs: Float[Tensor, "S V"], v
     kinds = torch.tensor(_HYPOTHESES, device=costs.device)
     one = torch.nn.functional.one_hot(worst, costs.shape[1]).bool()[:, :, None, :, None] & kinds[:, None]
     return exchanged[:, None] ^ one.flatten(1, 2)
-
-
-def _frames(batch: KeyPointBatch, rows: Int[Tensor, " S"]) -> KeyPointBatch:
-    return KeyPointBatch(
-        **{name: x.index(rows) if isinstance(x, Cameras) else x[rows] for name, x in vars(batch).items()}
-    )
 
 
 def _exchange(batch: KeyPointBatch, which: Bool[Tensor, "B V G"]) -> KeyPointBatch:

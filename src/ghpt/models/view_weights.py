@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.errors import check
-from ghpt.geometry.triangulation import Status, Triangulation, triangulate
+from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.baselines import Baseline, otherwise
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose import PoseHypotheses
@@ -54,12 +54,12 @@ class ViewWeights(Baseline):
         return self.weigh(batch).triangulation
 
     @torch.no_grad()
-    def weigh(self, batch: KeyPointBatch) -> Weighed:
-        """The joints and all that they were made of."""
+    def weigh(self, batch: KeyPointBatch, robust: Triangulation | None = None) -> Weighed:
+        """The joints and all that they were made of. ``robust``: what ``consensus`` makes of the batch, if that is
+        known."""
         model, problem = self.model, self.model.problem
-        robust = self.consensus.triangulate(batch)
-        placed = robust.ok | (robust.status == Status.NOT_CONVERGED)
-        views, _ = self.consensus.agreeing(batch, robust.points, placed)
+        robust = robust or self.consensus.triangulate(batch)
+        views, _ = self.consensus.agreeing(batch, robust.points, robust.placed)
         agreed = replace(batch, seen=views)
         hypotheses = problem.generate(agreed, model.hypotheses, model.keys("view weights", batch))
         logits = model.scorer(problem.describe(hypotheses))
