@@ -27,7 +27,7 @@ def measured(self, shard, part):
     seen.append(anonymous()["RssAnon"])
 run.Shards.write = measured
 command._from_data = lambda _: frames_of({frames})
-words = ("triangulation=linear", "shard_frames=4000", "batch=1000", "formats=[npz,csv]", "trainer.accelerator=cpu")
+words = ("triangulation=linear", "shard_frames=2000", "batch=1000", "formats=[npz,csv]", "trainer.accelerator=cpu")
 command.predict(config(*words), Path({output!r}))
 third = len(seen) // 3
 print("figures", max(seen[-third:]) - max(seen[third:-third]), anonymous()["VmHWM"])
@@ -35,7 +35,7 @@ print("figures", max(seen[-third:]) - max(seen[third:-third]), anonymous()["VmHW
 
 
 def test_e2_memory_is_flat_over_the_frames(tmp_path, nightly, record_row):
-    frames = 1_000_000 if nightly else 48_000
+    frames = 1_000_000 if nightly else 24_000
     script = SCRIPT.format(tests=str(Path(__file__).parents[1]), frames=frames, output=str(tmp_path / "out"))
     run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=1200)
     assert run.returncode == 0, run.stderr
