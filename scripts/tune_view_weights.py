@@ -1,4 +1,6 @@
-"""Choose ``adapt`` and ``power`` on validation data: ``python scripts/tune_view_weights.py runs/cmu2/last.ckpt``.
+"""Choose ``adapt``, ``quantile`` and ``power`` on validation data.
+
+    python scripts/tune_view_weights.py runs/cmu2/last.ckpt
 
 Prints the pelvis-relative MPJPE of adaptive RANSAC and of the view weights on the embedded validation splits, as they
 are and perturbed, and the geometric mean over all, by which conf/view_weights and conf/baselines are chosen. Test data
@@ -14,10 +16,11 @@ import hydra
 import torch
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
+from rich.table import Column, Table
 
 from ghpt.config import build, plain
 from ghpt.metrics.pose_error import joint_errors
+from ghpt.models.baselines import Linear
 from ghpt.models.checkpoint import load_model
 from ghpt.models.ransac import AdaptiveRansac
 from ghpt.models.view_weights import ViewWeights
@@ -25,15 +28,21 @@ from ghpt.reproduction.perturbation import MissingDetections, Noise, Outliers, R
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STRIDES = {"h36m": 256, "cmu3": 512}
-ADAPT, POWER = (3.0, 4.0, 5.0, 6.0, 8.0), (None, 1.0, 1.5, 2.0, 3.0)
+CONSENSUS = list(itertools.product((0.5, 0.6, 0.7), (3.0, 4.0, 5.0)))
+POWERS = (1.0, 2.0, 2.5, 3.0)
 CONDITIONS = {
     "as is": lambda batch, seed: batch,
     "5 % out": Outliers(0.05, 0.1, 0.5),
+    "10 % out": Outliers(0.1, 0.1, 0.5),
     "20 % out": Outliers(0.2, 0.1, 0.5),
     "noise": Noise(0.01),
-    "missing": MissingDetections(0.3),
+    "30 % miss": MissingDetections(0.3),
+    "40 % miss": MissingDetections(0.4),
     "0.5 deg": RotatedCameras(0.5),
+    "1 deg": RotatedCameras(1.0),
+    "2 deg": RotatedCameras(2.0),
     "20 mm": ShiftedCameras(20.0),
+    "100 mm": ShiftedCameras(100.0),
 }
 
 
@@ -60,15 +69,19 @@ def main() -> None:
     model, _ = load_model(parser.parse_args().checkpoint, seed=0)
     torch.set_num_threads(2)
     batches = {name: validation_batches(name) for name in STRIDES}
-    table = Table("adapt", "power", *(f"{name} {c}" for name in STRIDES for c in CONDITIONS), "mean")
-    for adapt, power in track(list(itertools.product(ADAPT, POWER))):
-        robust = AdaptiveRansac(threshold=0.02, pairs=24, seed=0, adapt=adapt, rounds=4)
-        estimator = robust if power is None else ViewWeights(model, robust, power)
-        errors = [error(estimator, batches[name], c) for name in STRIDES for c in CONDITIONS.values()]
+    estimators = [("linear", Linear())]
+    for quantile, adapt in CONSENSUS:
+        settings = {"threshold": 0.02, "pairs": 24, "seed": 0, "adapt": adapt, "quantile": quantile, "rounds": 4}
+        robust = AdaptiveRansac(**settings)
+        estimators.append((f"RANSAC, quantile {quantile:g}, adapt {adapt:g}", robust))
+        estimators += [(f"  power {power:g}", ViewWeights(model, robust, power)) for power in POWERS]
+    columns = [Column("estimator", no_wrap=True), "mean", *(f"{name} {c}" for name in STRIDES for c in CONDITIONS)]
+    table = Table(*columns)
+    for name, estimator in track(estimators):
+        errors = [error(estimator, batches[data], c) for data in STRIDES for c in CONDITIONS.values()]
         mean = math.exp(sum(map(math.log, errors)) / len(errors))
-        shown = "RANSAC" if power is None else f"{power:g}"
-        table.add_row(f"{adapt:g}", shown, *(f"{e:.2f}" for e in errors), f"{mean:.2f}")
-    Console(width=190).print(table)
+        table.add_row(name, f"{mean:.2f}", *(f"{e:.2f}" for e in errors))
+    Console(width=260).print(table)
 
 
 if __name__ == "__main__":

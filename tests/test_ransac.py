@@ -8,10 +8,11 @@ import torch
 from ghpt.errors import GhptConfigError
 from ghpt.models.baselines import Linear, person_size
 from ghpt.models.ransac import AdaptiveRansac, Ransac
+from ghpt.reproduction.perturbation import RotatedCameras
 from scenes import random_scene
 
 FIXED = Ransac(threshold=0.005, pairs=64, seed=0)
-ADAPTIVE = AdaptiveRansac(threshold=0.005, pairs=64, seed=0, adapt=5.0, rounds=4)
+ADAPTIVE = AdaptiveRansac(threshold=0.005, pairs=64, seed=0, adapt=4.0, quantile=0.6, rounds=4)
 
 
 def error(estimator, scene, batch):
@@ -36,6 +37,14 @@ def test_much_noise_widens_it_in_the_frames_that_have_it():
     assert error(ADAPTIVE, loud, loud.batch()) < 1.1 * linear < error(FIXED, loud, loud.batch())
 
 
+def test_cameras_that_are_off_widen_it_though_two_of_four_views_agree_by_chance():
+    scene = random_scene(0, frames=40, views=4).noisy(1, 0)
+    batch = RotatedCameras(2.0)(scene.batch(), 0)
+    above, median = (replace(ADAPTIVE, adapt=2.0, quantile=quantile) for quantile in (0.6, 0.5))
+    linear, fixed, above, median = (error(estimator, scene, batch) for estimator in (Linear(), FIXED, above, median))
+    assert above < 1.05 * linear < median < fixed
+
+
 def test_outliers_do_not_widen_it():
     scene = random_scene(1, frames=5, views=6).noisy(0.2, 1)
     wrong = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.2
@@ -58,7 +67,9 @@ def test_a_frame_in_which_nothing_is_seen_keeps_the_threshold():
     assert ADAPTIVE.reach(batch, found.points)[1] == 0.005
 
 
-@pytest.mark.parametrize("settings", [{"adapt": 0.0}, {"rounds": 0}, {"threshold": -1.0}])
+@pytest.mark.parametrize("settings", [{"adapt": 0.0}, {"rounds": 0}, {"threshold": -1.0}, {"quantile": 1.0}])
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(GhptConfigError):
-        AdaptiveRansac(**{"threshold": 0.1, "pairs": 4, "seed": 0, "adapt": 5.0, "rounds": 4} | settings)
+        AdaptiveRansac(
+            **{"threshold": 0.1, "pairs": 4, "seed": 0, "adapt": 4.0, "quantile": 0.6, "rounds": 4} | settings
+        )

@@ -11,8 +11,9 @@ from ghpt.models.baselines import Linear, person_size
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose import PoseTriangulation
-from ghpt.models.ransac import Ransac
+from ghpt.models.ransac import AdaptiveRansac, Ransac
 from ghpt.models.view_weights import ViewWeights
+from ghpt.reproduction.perturbation import RotatedCameras
 from scenes import random_scene
 
 CONSENSUS = Ransac(threshold=0.03, pairs=64, seed=0)
@@ -94,6 +95,20 @@ def test_hypotheses_are_made_of_views_that_agree():
     assert not (found.hypotheses.views & ~found.views.mT[:, None]).any()
     assert error(found.triangulation.points, scene) < 0.2 * error(Linear()(far.batch()).points, scene)
     torch.testing.assert_close(found.weights.sum(-1), torch.ones(3))
+
+
+def test_where_the_views_disagree_as_a_whole_a_scorer_that_is_wrong_harms_less():
+    scene = random_scene(7, frames=20, views=4).noisy(1, 0)
+    batch = RotatedCameras(2.0)(scene.batch(), 0)
+    adaptive = AdaptiveRansac(threshold=0.005, pairs=64, seed=0, adapt=100.0, quantile=0.6, rounds=4)
+    wrong = replace(scene, points=scene.points.roll(1, 0))
+    points = {}
+    for name, consensus in {"adaptive": adaptive, "fixed": Ransac(threshold=10.0, pairs=64, seed=0)}.items():
+        found = knowing(view_weights(consensus=consensus), wrong).weigh(batch)
+        assert found.views.all()  # the same pool
+        points[name] = found.triangulation.points
+    linear = error(Linear()(batch).points, scene)
+    assert error(points["adaptive"], scene) - linear < 0.5 * (error(points["fixed"], scene) - linear)
 
 
 def test_what_linear_determines_is_estimated_and_nothing_else():

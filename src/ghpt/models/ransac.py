@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.errors import check_positive
+from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import Status, System, Triangulation, flat_cameras, in_parts, triangulate_subsets
 from ghpt.models.baselines import Baseline, everywhere, person_size
@@ -73,19 +73,23 @@ class Ransac(Baseline):
 
 @dataclass(frozen=True)
 class AdaptiveRansac(Ransac):
-    """RANSAC whose threshold in a frame is at least ``adapt`` times the median residual of what it finds there.
+    """RANSAC whose threshold in a frame is at least ``adapt`` times the ``quantile`` of the residuals that it leaves
+    there.
 
     Where the whole frame is noisy or the cameras are off, views that are as good as the others are outliers to a
     fixed threshold, and what remains are pairs that agree by chance. The threshold grows in at most ``rounds``
-    rounds; outliers, as long as they are less than half, do not move a median.
+    rounds. The quantile is above the median, because two of four views that agree by chance make half of the residuals
+    small; outliers do not move it as long as they are fewer than the rest.
     """
 
     adapt: float
+    quantile: float
     rounds: int
 
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(adapt=self.adapt, rounds=self.rounds)
+        check(0 < self.quantile < 1, "quantile", f"is {self.quantile}", "It must be between 0 and 1.")
 
     def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"]:
         size = person_size(batch.key_points, batch.seen).clamp(min=1e-12)[..., None]
@@ -94,9 +98,11 @@ class AdaptiveRansac(Ransac):
 
     def _reach(self, residual: Float[Tensor, "V J B"], seen: Bool[Tensor, "V J B"]) -> Float[Tensor, " B"]:
         """From residuals of the points, as fractions of the person's size."""
-        counted = seen & (seen.sum(0) >= 2)
-        median = torch.where(counted, residual, torch.nan).flatten(0, 1).nanmedian(dim=0).values
-        return torch.where(torch.isfinite(median), self.adapt * median, 0.0).clamp(min=self.threshold)
+        counted = (seen & (seen.sum(0) >= 2) & ~residual.isnan()).flatten(0, 1)
+        ordered = torch.where(counted, residual.flatten(0, 1), torch.inf).sort(dim=0).values
+        place = (self.quantile * (counted.sum(0) - 1).clamp(min=0)).long()
+        noise = ordered.gather(0, place[None])[0]
+        return torch.where(torch.isfinite(noise), self.adapt * noise, 0.0).clamp(min=self.threshold)
 
     def _inliers(self, candidates: _Candidates) -> Bool[Tensor, "V J B"]:
         inlier = super()._inliers(candidates)

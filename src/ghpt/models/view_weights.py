@@ -22,6 +22,7 @@ from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.baselines import Baseline, otherwise
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose import PoseHypotheses
+from ghpt.models.ransac import Ransac
 from ghpt.models.selection import limit_spread, softmax_weights
 from ghpt.recording import KeyPointBatch
 
@@ -43,10 +44,12 @@ class Weighed:
 class ViewWeights(Baseline):
     """``model``'s scores of poses made of the views on which ``consensus`` finds agreement, turned into view weights.
 
-    ``power``: of the probabilities; 1 is their definition, more trusts the scorer more.
+    ``power``: of the probabilities; 1 is their definition, more trusts the scorer more. In a frame whose views disagree
+    as a whole (cameras that are off, much noise) it falls with the square root of how far the consensus had to reach:
+    what makes a pose likely there is hardly a single view.
     """
 
-    def __init__(self, model: StochasticEstimator, consensus: Baseline, power: float) -> None:
+    def __init__(self, model: StochasticEstimator, consensus: Ransac, power: float) -> None:
         check(power > 0, "view_weights.power", f"is {power}", "It must be > 0.")
         self.model, self.consensus, self.power = model.eval(), consensus, power
 
@@ -65,5 +68,7 @@ class ViewWeights(Baseline):
         logits = model.scorer(problem.describe(hypotheses))
         weights = softmax_weights(limit_spread(logits, model.spread), model.temperature)
         probability = torch.einsum("bh,bhjv->bvj", weights.double(), hypotheses.views.double())
-        result = triangulate(batch.cameras, batch.key_points, views * probability**self.power)
+        reach = self.consensus.reach(batch, robust.points)
+        power = self.power * (self.consensus.threshold / reach[:, None, None]).sqrt()
+        result = triangulate(batch.cameras, batch.key_points, views * probability**power)
         return Weighed(otherwise(result, robust), views, hypotheses, logits, weights)
