@@ -28,13 +28,14 @@ from ghpt.reproduction.perturbation import MissingDetections, Noise, Outliers, R
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STRIDES = {"h36m": 256, "cmu3": 512}
-CONSENSUS = list(itertools.product((0.5, 0.6, 0.7), (3.0, 4.0, 5.0)))
+CONSENSUS = list(itertools.product((0.5, 0.55, 0.6), (4.0, 5.0)))
 POWERS = (1.0, 2.0, 2.5, 3.0)
 CONDITIONS = {
     "as is": lambda batch, seed: batch,
     "5 % out": Outliers(0.05, 0.1, 0.5),
     "10 % out": Outliers(0.1, 0.1, 0.5),
     "20 % out": Outliers(0.2, 0.1, 0.5),
+    "30 % out": Outliers(0.3, 0.1, 0.5),
     "noise": Noise(0.01),
     "30 % miss": MissingDetections(0.3),
     "40 % miss": MissingDetections(0.4),

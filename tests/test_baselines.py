@@ -15,7 +15,7 @@ from scenes import random_scene
 ROBUST = {
     "ransac": Ransac(threshold=0.02, pairs=100, seed=0),
     "ransac_random": Ransac(threshold=0.02, pairs=9, seed=0),
-    "adaptive_ransac": AdaptiveRansac(threshold=0.02, pairs=100, seed=0, adapt=4.0, quantile=0.6, rounds=4),
+    "adaptive_ransac": AdaptiveRansac(threshold=0.02, pairs=100, seed=0, adapt=5.0, quantile=0.55, rounds=4),
     "huber": MEstimator(loss="huber", scale=0.002, iterations=40, tolerance=1e-3),
     "cauchy": MEstimator(loss="cauchy", scale=0.002, iterations=40, tolerance=1e-3),
     "geman_mcclure": MEstimator(loss="geman_mcclure", scale=0.01, iterations=40, tolerance=1e-3),

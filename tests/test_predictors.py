@@ -45,7 +45,7 @@ def learned():
         PoseTriangulation(True, True), scorer, loss, torch.optim.Adam, 50, 1.5, False, 1.5, "weight", 0
     )
     model.fit_statistics(iter([random_scene(0, frames=20).batch()]))
-    consensus = AdaptiveRansac(threshold=0.02, pairs=64, seed=0, adapt=4.0, quantile=0.6, rounds=4)
+    consensus = AdaptiveRansac(threshold=0.02, pairs=64, seed=0, adapt=5.0, quantile=0.55, rounds=4)
     return Learned(ViewWeights(model, consensus, power=1.5), QUALITY, None)
 
 

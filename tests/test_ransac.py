@@ -12,7 +12,7 @@ from ghpt.reproduction.perturbation import RotatedCameras
 from scenes import random_scene
 
 FIXED = Ransac(threshold=0.005, pairs=64, seed=0)
-ADAPTIVE = AdaptiveRansac(threshold=0.005, pairs=64, seed=0, adapt=4.0, quantile=0.6, rounds=4)
+ADAPTIVE = AdaptiveRansac(threshold=0.005, pairs=64, seed=0, adapt=5.0, quantile=0.55, rounds=4)
 
 
 def error(estimator, scene, batch):
@@ -71,5 +71,5 @@ def test_a_frame_in_which_nothing_is_seen_keeps_the_threshold():
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(GhptConfigError):
         AdaptiveRansac(
-            **{"threshold": 0.1, "pairs": 4, "seed": 0, "adapt": 4.0, "quantile": 0.6, "rounds": 4} | settings
+            **{"threshold": 0.1, "pairs": 4, "seed": 0, "adapt": 5.0, "quantile": 0.55, "rounds": 4} | settings
         )

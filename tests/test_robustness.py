@@ -31,7 +31,7 @@ BASELINES = {
 VIEW_WEIGHTS = {
     "_target_": "ghpt.models.view_weights.ViewWeights", "_partial_": True, "power": 1.5,
     "consensus": {"_target_": "ghpt.models.ransac.AdaptiveRansac", "threshold": 0.02, "pairs": 64, "seed": 0,
-                  "adapt": 4.0, "quantile": 0.6, "rounds": 4},
+                  "adapt": 5.0, "quantile": 0.55, "rounds": 4},
 }  # fmt: skip
 
 

@@ -10,7 +10,7 @@ from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.skeleton import MIRROR
 from scenes import random_scene
 
-ROBUST = AdaptiveRansac(threshold=0.02, pairs=24, seed=0, adapt=4.0, quantile=0.6, rounds=4)
+ROBUST = AdaptiveRansac(threshold=0.02, pairs=24, seed=0, adapt=5.0, quantile=0.55, rounds=4)
 SWAPS = Swaps(ROBUST, scale=0.04, gain=6.0, rounds=3, views=4)
 
 
