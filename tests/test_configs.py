@@ -83,9 +83,11 @@ def test_every_test_configuration_builds(data):
     ]  # fmt: skip
 
 
-def test_view_weights_agree_by_the_adaptive_ransac_of_the_tables():
-    config = compose("test")
-    assert config["view_weights"]["consensus"] == config["baselines"]["adaptive_ransac"]
+def test_the_adaptive_ransac_of_the_tables_is_everyone_s():
+    config = compose("predict")
+    users = (config["view_weights"]["consensus"], *(config["estimator"][kind]["swaps"]["estimator"] for kind in
+             ("classical", "learned")))  # fmt: skip
+    assert all(settings == config["baselines"]["adaptive_ransac"] for settings in users)
 
 
 @pytest.mark.parametrize("experiment", choices("experiment"))
