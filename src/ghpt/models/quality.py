@@ -38,8 +38,8 @@ class Quality:
     With conf/estimator/default.yaml and adaptive RANSAC 76, 98 and 99 % of the true positions of embedded Human3.6M lie
     within the ellipsoids of 50, 90 and 95 % for people that the detector was trained on (too cautious), 49, 88 and 93 %
     for others. On embedded Panoptic, whose joints are defined 19 mm elsewhere, 18, 48 and 55 %: there shared = 11 fits.
-    Views are taken to be weighted by ``size``^-2, as linear triangulation and so adaptive RANSAC weights them where focal
-    lengths are equal.
+    Views are taken to be weighted by ``size``^-2, as linear triangulation and so adaptive RANSAC weights them where
+    focal lengths are equal.
     """
 
     noise: float | None
