@@ -139,7 +139,7 @@ def after(gaps: Gaps, shards: Shards, joints: int, folder: Path) -> Iterator[Chu
         return
     frames = shards.frames
     with tempfile.TemporaryFile(dir=folder) as one, tempfile.TemporaryFile(dir=folder) as other:
-        points = np.memmap(one, "<f4", "w+", shape=(joints, frames, 3))
+        points = np.memmap(one, "<f8", "w+", shape=(joints, frames, 3))
         state = np.memmap(other, "|i1", "w+", shape=(joints, frames))
         frame = np.zeros(frames, np.int64)
         for shard, part in enumerate(shards.chunks()):

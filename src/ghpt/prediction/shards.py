@@ -22,10 +22,10 @@ from ghpt.files import atomic_write, sweep_temporaries
 from ghpt.reconstruction import Reconstruction
 from ghpt.report.stored_npz import add_member, members_of, read_rows
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MANIFEST = "manifest.jsonl"
 _DTYPES = {
-    "frame": "<i8", "points": "<f4", "state": "|i1", "error": "<f4", "views": "|b1", "covariance": "<f4",
+    "frame": "<i8", "points": "<f8", "state": "|i1", "error": "<f4", "views": "|b1", "covariance": "<f4",
     "score": "<f4", "swapped": "|b1",
 }  # fmt: skip
 _MEND = "Run the prediction again: what is damaged is made anew"
