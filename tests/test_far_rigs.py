@@ -3,26 +3,34 @@
 import base64
 import json
 import re
+import sys
+import zipfile
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
 import torch
 
 from ghpt.data.camera_files import read_cameras
-from ghpt.data.camera_writers import write_pose2sim
+from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.data.rigs import Rig, human36m_rig
-from ghpt.export import read_reconstruction
-from ghpt.export.c3d import write_c3d
-from ghpt.geometry.cameras import project
+from ghpt.errors import GhptDataError
+from ghpt.export import WRITERS, Scene, read_reconstruction
 from ghpt.predict import predict
-from predicting import cameras_file, config, walk
+from ghpt.prediction.frames import Frames
+from ghpt.recording import Recording
+from ghpt.report.rig_files import write_poses
+from ghpt.report.stored_npz import add_member
+from ghpt.skeleton import MIRROR
+from predicting import config, walk
 from reconstructions import about, in_parts, random_reconstruction
-from test_predict import checkpoint, points_file
+from test_predict import PIXELS, checkpoint, points_file
 
 FRAMES = 6
 METRE = 1000.0
+"""mm."""
 OFFSETS = {
     "at the zero": (0.0, 0.0, 0.0),
     "10 km": (1e4 * METRE, 0.0, 0.0),
@@ -106,3 +114,171 @@ def test_positions_are_exact_in_every_format(outputs, name, format):
     error = np.abs(READERS[format](outputs[name]) - truth).max()
     at_the_zero = np.abs(READERS[format](outputs["at the zero"]) - walk()[:FRAMES].numpy()).max()
     assert error <= at_the_zero + LIMIT
+
+
+def noisy_points(folder: Path) -> Path:
+    """Seen with noise, so that weights matter, and with left and right exchanged in one view."""
+    pixels = PIXELS[:FRAMES] + np.random.default_rng(0).normal(0, 3, PIXELS[:FRAMES].shape)
+    pixels[2:4, 1] = pixels[2:4, 1][:, list(MIRROR)]
+    return points_file(folder, pixels.astype(np.float64))
+
+
+def learned(folder: Path, name: str) -> tuple[dict, np.ndarray]:
+    """What an untrained model and the classical estimators make of it: the numbers and the positions at the zero."""
+    write_pose2sim(folder / "rig.toml", moved_rig(OFFSETS[name]), {})
+    words = [
+        f"keypoints={noisy_points(folder)}",
+        f"cameras={folder / 'rig.toml'}",
+        f"ckpt={checkpoint(folder, 'pose')}",
+    ]
+    numbers = predict(config(*words, "formats=[npz]", "compare=[linear,m_estimator]"), folder / "out")
+    return numbers, in_npz(folder / "out") - OFFSETS[name]
+
+
+@pytest.fixture(scope="module")
+def near_and_far(tmp_path_factory) -> list[tuple[dict, np.ndarray]]:
+    torch.manual_seed(0)
+    state = torch.get_rng_state()
+    found = []
+    for name in ("at the zero", "UTM"):
+        torch.set_rng_state(state)  # the same untrained model
+        found.append(learned(tmp_path_factory.mktemp("learned"), name))
+    return found
+
+
+def test_a_learned_model_and_swaps_do_not_depend_on_where_the_world_s_zero_is(near_and_far):
+    (near, points), (far, moved) = near_and_far
+    assert near["swapped"]["cam_01"] == 2
+    assert far["swapped"] == near["swapped"]
+    assert np.abs(moved - points).max() <= LIMIT
+
+
+def test_the_comparison_of_estimators_does_not_depend_on_it_either(near_and_far):
+    near, far = (numbers["evaluation"]["estimators"] for numbers, _ in near_and_far)
+    assert len(near) == 3
+    for name, found in near.items():
+        for error in ("reprojection", "held_out"):
+            assert far[name][error]["median"] == pytest.approx(found[error]["median"], abs=1e-3)
+        assert far[name]["segments"]["median"] == pytest.approx(found["segments"]["median"], abs=1e-6)
+
+
+def frames_at(distance: float) -> Frames:
+    """A rig whose centre is so far along z, mm, and which shows nothing."""
+    rig = human36m_rig("S9").cameras
+    middle = rig.centre.nanmedian(0).values
+    there = rig.relative_to(middle - torch.tensor([0.0, 0.0, distance]))
+    return Frames("", "", ("a", "b", "c", "d"), there, np.arange(1), None, lambda rows: ())
+
+
+def test_a_rig_within_100_m_stays_where_it_is_to_the_bit():
+    frames = frames_at(99.9 * METRE)
+    assert frames.origin.tolist() == [0, 0, 0]
+    assert torch.equal(frames.cameras.relative_to(frames.origin).t, frames.cameras.t)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_one_farther_away_is_worked_on_near_its_centre_to_the_metre(sign):
+    assert frames_at(sign * 100.6 * METRE).origin.tolist() == [0, 0, sign * 101 * METRE]
+
+
+def test_the_zero_of_single_precision_is_said_where_it_is_not_the_world_s(tmp_path, caplog):
+    predicted(tmp_path, OFFSETS["UTM"])
+    said = [record.getMessage() for record in caplog.records if "single precision" in record.getMessage()]
+    assert len(said) == 1
+    assert "poses.c3d, poses.html" in said[0]
+    assert re.search(r"zero is at \(5003\d\d000, 54123\d\d000, 31\d000\) mm", said[0])
+
+
+def test_nothing_is_said_of_an_ordinary_rig_and_its_c3d_has_no_origin(tmp_path, caplog):
+    out = predicted(tmp_path, OFFSETS["at the zero"])
+    assert "single precision" not in caplog.text
+    assert b"ORIGIN" not in (out / "poses.c3d").read_bytes()
+
+
+def test_rerun_gets_positions_that_float32_holds(tmp_path, monkeypatch):
+    rr = MagicMock()
+    monkeypatch.setitem(sys.modules, "rerun", rr)
+    origin = tuple(round(x / METRE) * METRE for x in OFFSETS["UTM"])
+    made = random_reconstruction(5, views=4, missing=0.0)
+    far = replace(made, points=made.points + torch.tensor(OFFSETS["UTM"], dtype=torch.float64))
+    who = replace(about(cameras=("a", "b", "c", "d")), origin=origin)
+    scene = Scene(moved_rig(OFFSETS["UTM"]).cameras)
+    WRITERS["rerun"].write(tmp_path / "poses.rrd", who, in_parts(far), scene=scene)
+    positions = rr.Points3D.columns.call_args_list[0].kwargs["positions"].astype(float) + origin
+    assert np.abs(positions - far.points.flatten(0, 1).numpy()).max() <= LIMIT
+    centres = [np.array(call.kwargs["translation"]) + origin for call in rr.Transform3D.call_args_list]
+    assert np.abs(centres - scene.cameras.centre.numpy()).max() <= LIMIT
+    name = rr.RecordingStream().send_recording_name.call_args.args[0]
+    assert name.endswith("zero is at (500321000, 5412346000, 313000) mm of the cameras' world")
+
+
+@pytest.mark.parametrize("write", [write_pose2sim, write_aniposelib, write_opencv])
+def test_rig_files_have_the_digits(tmp_path, write):
+    rig = moved_rig(OFFSETS["10,000 km"])
+    if write is write_opencv:
+        write(tmp_path, rig)
+    else:
+        write(tmp_path / "rig.toml", rig, {})
+    read = read_cameras(tmp_path if write is write_opencv else tmp_path / "rig.toml")
+    assert float((read.cameras.centre - rig.cameras.centre).abs().max()) <= LIMIT
+
+
+def test_the_poses_of_a_calibration_have_them_too(tmp_path):
+    points = walk()[:FRAMES] + torch.tensor(OFFSETS["10,000 km"], dtype=torch.float64)
+    recording = MagicMock(spec=Recording, frame=np.arange(FRAMES), rate_hz=50.0)
+    keys = ("data", "source", "scale", "world", "triangulation", "usable", "provenance")
+    write_poses(tmp_path / "poses.npz", recording, points, torch.ones(FRAMES, 17, dtype=bool), dict.fromkeys(keys))
+    assert np.abs(in_npz(tmp_path) - points.numpy()).max() == 0
+
+
+def rewritten(path: Path, change) -> Path:
+    """The npz file with ``change`` done to its arrays."""
+    with np.load(path, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    arrays = change(arrays)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, value in arrays.items():
+            add_member(archive, name, value.dtype, value.shape, value.tobytes())
+    return path
+
+
+def with_meta(**changed):
+    def change(arrays: dict) -> dict:
+        meta = json.loads(str(arrays["meta"])) | changed
+        return arrays | {"meta": np.array(json.dumps({k: v for k, v in meta.items() if v is not None}))}
+
+    return change
+
+
+def test_the_origin_comes_back(tmp_path):
+    who = replace(about(), origin=(1e9, -2e9, 3000.0))
+    WRITERS["npz"].write(tmp_path / "poses.npz", who, in_parts(random_reconstruction(3)))
+    assert read_reconstruction(tmp_path / "poses.npz")[0] == who
+
+
+def test_a_file_of_the_first_version_is_still_read(tmp_path):
+    made = random_reconstruction(9, missing=0.0)
+    WRITERS["npz"].write(tmp_path / "poses.npz", about(), in_parts(made))
+
+    def first_version(arrays: dict) -> dict:
+        changed = with_meta(format_version=1, origin=None)(arrays)
+        return changed | {"points": arrays["points"].astype("<f4")}
+
+    who, parts = read_reconstruction(rewritten(tmp_path / "poses.npz", first_version))
+    read = next(parts)
+    assert who == about()
+    assert read.points.dtype == torch.float64
+    assert torch.equal(read.points, made.points)  # made of float32
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [({"format_version": 3}, "is 3; this ghpt reads 1 and 2"), ({"format_version": True}, "is True"),
+     ({"format_version": [2]}, "meta.format_version"), ({"format_version": 1}, "points: is not <f4"),
+     ({"origin": [1.0, 2.0]}, "meta.origin"), ({"origin": [1.0, 2.0, float("nan")]}, "meta.origin"),
+     ({"origin": "zero"}, "meta.origin")],
+)  # fmt: skip
+def test_a_version_or_an_origin_that_cannot_be_is_named(tmp_path, changed, said):
+    WRITERS["npz"].write(tmp_path / "poses.npz", about(), in_parts(random_reconstruction(3)))
+    with pytest.raises(GhptDataError, match=said):
+        read_reconstruction(rewritten(tmp_path / "poses.npz", with_meta(**changed)))
