@@ -1,4 +1,4 @@
-"""Rigs far from their world's zero, as national grids have them: positions keep 0.01 mm in every file."""
+"""Rigs far from their world's zero, as in national grids: every file keeps 0.01 mm."""
 
 import base64
 import json
@@ -62,13 +62,14 @@ def in_npz(path: Path) -> np.ndarray:
 
 
 def in_csv(path: Path) -> np.ndarray:
-    lines = [line.split(",") for line in (path / "poses.csv").read_text(encoding="utf-8").splitlines()]
+    text = (path / "poses.csv").read_text(encoding="utf-8")
+    lines = [line.split(",") for line in text.splitlines()]
     columns = [i for i, name in enumerate(lines[0]) if re.search(r"_[xyz]_mm$", name)]
     return np.array([[float(row[i]) for i in columns] for row in lines[1:]]).reshape(FRAMES, 17, 3)
 
 
 def in_parquet(path: Path) -> np.ndarray:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow reads Parquet; it comes with ghpt[io]")
+    parquet = pytest.importorskip("pyarrow.parquet", reason="comes with ghpt[io]")
     table = parquet.read_table(path / "poses.parquet")
     names = [name for name in table.column_names if re.search(r"_[xyz]_mm$", name)]
     return np.stack([table[name].to_numpy() for name in names], axis=-1).reshape(FRAMES, 17, 3)
@@ -81,7 +82,7 @@ def in_trc(path: Path) -> np.ndarray:
 
 
 def in_c3d(path: Path) -> np.ndarray:
-    ezc3d = pytest.importorskip("ezc3d", reason="ezc3d reads C3D; it comes with ghpt[test]")
+    ezc3d = pytest.importorskip("ezc3d", reason="comes with ghpt[test]")
     file = ezc3d.c3d(str(path / "poses.c3d"))
     ours = file["parameters"]["GHPT"]
     origin = [float(x) for x in ours["ORIGIN"]["value"]] if "ORIGIN" in ours else [0.0, 0.0, 0.0]
@@ -91,20 +92,26 @@ def in_c3d(path: Path) -> np.ndarray:
 def in_html(path: Path) -> np.ndarray:
     text = (path / "poses.html").read_text(encoding="utf-8")
     data = json.loads(re.search(r'application/json">(.*?)</script>', text, re.DOTALL)[1])
-    points = np.frombuffer(base64.b64decode(data["points"]), "<f4").astype(float).reshape(FRAMES, 17, 3)
+    points = np.frombuffer(base64.b64decode(data["points"]), "<f4").reshape(FRAMES, 17, 3)
     stated = re.search(r"zero is at \((.*?)\) mm", data["about"])
     origin = [float(x) for x in stated[1].split(",")] if stated else [0.0, 0.0, 0.0]
-    return points @ np.array(data["axes"]).T + origin
+    return points.astype(float) @ np.array(data["axes"]).T + origin
 
 
 READERS = {
-    "npz": in_npz, "csv": in_csv, "parquet": in_parquet, "trc": in_trc, "c3d": in_c3d, "html": in_html,
-}  # fmt: skip
+    "npz": in_npz,
+    "csv": in_csv,
+    "parquet": in_parquet,
+    "trc": in_trc,
+    "c3d": in_c3d,
+    "html": in_html,
+}
 
 
 @pytest.fixture(scope="module")
 def outputs(tmp_path_factory) -> dict[str, Path]:
-    return {name: predicted(tmp_path_factory.mktemp("far"), offset) for name, offset in OFFSETS.items()}
+    folder = tmp_path_factory.mktemp
+    return {name: predicted(folder("far"), offset) for name, offset in OFFSETS.items()}
 
 
 @pytest.mark.parametrize("format", READERS)
@@ -124,14 +131,12 @@ def noisy_points(folder: Path) -> Path:
 
 
 def learned(folder: Path, name: str) -> tuple[dict, np.ndarray]:
-    """What an untrained model and the classical estimators make of it: the numbers and the positions at the zero."""
+    """What an untrained model and the classical estimators make of it: the numbers, and the
+    positions relative to the rig's offset."""
     write_pose2sim(folder / "rig.toml", moved_rig(OFFSETS[name]), {})
-    words = [
-        f"keypoints={noisy_points(folder)}",
-        f"cameras={folder / 'rig.toml'}",
-        f"ckpt={checkpoint(folder, 'pose')}",
-    ]
-    numbers = predict(config(*words, "formats=[npz]", "compare=[linear,m_estimator]"), folder / "out")
+    given = [f"keypoints={noisy_points(folder)}", f"cameras={folder / 'rig.toml'}"]
+    words = [f"ckpt={checkpoint(folder, 'pose')}", "formats=[npz]", "compare=[linear,m_estimator]"]
+    numbers = predict(config(*given, *words), folder / "out")
     return numbers, in_npz(folder / "out") - OFFSETS[name]
 
 
@@ -159,7 +164,8 @@ def test_the_comparison_of_estimators_does_not_depend_on_it_either(near_and_far)
     for name, found in near.items():
         for error in ("reprojection", "held_out"):
             assert far[name][error]["median"] == pytest.approx(found[error]["median"], abs=1e-3)
-        assert far[name]["segments"]["median"] == pytest.approx(found["segments"]["median"], abs=1e-6)
+        variation = found["segments"]["median"]
+        assert far[name]["segments"]["median"] == pytest.approx(variation, abs=1e-6)
 
 
 def frames_at(distance: float) -> Frames:
@@ -183,7 +189,8 @@ def test_one_farther_away_is_worked_on_near_its_centre_to_the_metre(sign):
 
 def test_the_zero_of_single_precision_is_said_where_it_is_not_the_world_s(tmp_path, caplog):
     predicted(tmp_path, OFFSETS["UTM"])
-    said = [record.getMessage() for record in caplog.records if "single precision" in record.getMessage()]
+    messages = [record.getMessage() for record in caplog.records]
+    said = [message for message in messages if "single precision" in message]
     assert len(said) == 1
     assert "poses.c3d, poses.html" in said[0]
     assert re.search(r"zero is at \(5003\d\d000, 54123\d\d000, 31\d000\) mm", said[0])
@@ -206,8 +213,8 @@ def test_rerun_gets_positions_that_float32_holds(tmp_path, monkeypatch):
     WRITERS["rerun"].write(tmp_path / "poses.rrd", who, in_parts(far), scene=scene)
     positions = rr.Points3D.columns.call_args_list[0].kwargs["positions"].astype(float) + origin
     assert np.abs(positions - far.points.flatten(0, 1).numpy()).max() <= LIMIT
-    centres = [np.array(call.kwargs["translation"]) + origin for call in rr.Transform3D.call_args_list]
-    assert np.abs(centres - scene.cameras.centre.numpy()).max() <= LIMIT
+    centres = [call.kwargs["translation"] for call in rr.Transform3D.call_args_list]
+    assert np.abs(np.array(centres) + origin - scene.cameras.centre.numpy()).max() <= LIMIT
     name = rr.RecordingStream().send_recording_name.call_args.args[0]
     assert name.endswith("zero is at (500321000, 5412346000, 313000) mm of the cameras' world")
 
@@ -227,7 +234,8 @@ def test_the_poses_of_a_calibration_have_them_too(tmp_path):
     points = walk()[:FRAMES] + torch.tensor(OFFSETS["10,000 km"], dtype=torch.float64)
     recording = MagicMock(spec=Recording, frame=np.arange(FRAMES), rate_hz=50.0)
     keys = ("data", "source", "scale", "world", "triangulation", "usable", "provenance")
-    write_poses(tmp_path / "poses.npz", recording, points, torch.ones(FRAMES, 17, dtype=bool), dict.fromkeys(keys))
+    estimated = torch.ones(FRAMES, 17, dtype=torch.bool)
+    write_poses(tmp_path / "poses.npz", recording, points, estimated, dict.fromkeys(keys))
     assert np.abs(in_npz(tmp_path) - points.numpy()).max() == 0
 
 
@@ -245,7 +253,8 @@ def rewritten(path: Path, change) -> Path:
 def with_meta(**changed):
     def change(arrays: dict) -> dict:
         meta = json.loads(str(arrays["meta"])) | changed
-        return arrays | {"meta": np.array(json.dumps({k: v for k, v in meta.items() if v is not None}))}
+        kept = {key: value for key, value in meta.items() if value is not None}
+        return arrays | {"meta": np.array(json.dumps(kept))}
 
     return change
 
@@ -273,11 +282,16 @@ def test_a_file_of_the_first_version_is_still_read(tmp_path):
 
 @pytest.mark.parametrize(
     ("changed", "said"),
-    [({"format_version": 3}, "is 3; this ghpt reads 1 and 2"), ({"format_version": True}, "is True"),
-     ({"format_version": [2]}, "meta.format_version"), ({"format_version": 1}, "points: is not <f4"),
-     ({"origin": [1.0, 2.0]}, "meta.origin"), ({"origin": [1.0, 2.0, float("nan")]}, "meta.origin"),
-     ({"origin": "zero"}, "meta.origin")],
-)  # fmt: skip
+    [
+        ({"format_version": 3}, "is 3; this ghpt reads 1 and 2"),
+        ({"format_version": True}, "is True"),
+        ({"format_version": [2]}, "meta.format_version"),
+        ({"format_version": 1}, "points: is not <f4"),
+        ({"origin": [1.0, 2.0]}, "meta.origin"),
+        ({"origin": [1.0, 2.0, float("nan")]}, "meta.origin"),
+        ({"origin": "zero"}, "meta.origin"),
+    ],
+)
 def test_a_version_or_an_origin_that_cannot_be_is_named(tmp_path, changed, said):
     WRITERS["npz"].write(tmp_path / "poses.npz", about(), in_parts(random_reconstruction(3)))
     with pytest.raises(GhptDataError, match=said):

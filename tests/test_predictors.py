@@ -59,7 +59,8 @@ def sound(result, batch):
     assert result.points.shape == (frames, joints, 3)
     for field in ("points", "error", "covariance", "score"):
         assert torch.isfinite(getattr(result, field)).all(), field
-        assert getattr(result, field).dtype == (torch.float64 if field == "points" else torch.float32)
+        expected = torch.float64 if field == "points" else torch.float32
+        assert getattr(result, field).dtype == expected
     assert torch.equal(result.frame, batch.sample)
     missing = ~result.placed
     for field in ("points", "error", "covariance"):

@@ -38,9 +38,12 @@ def write_c3d(path: Path, about: About, chunks: Chunks) -> None:
 
     A missing joint is (0, 0, 0) with residual -1, a filled one has residual 0 and no camera, as the format prescribes;
     else the residual is the reprojection error in pixels (0.25 to 63.75) and the mask the first seven views that made
-    it. The format has 24 bits for a coordinate: positions are relative to ``about.origin``, which is in ``GHPT:ORIGIN``
-    (mm, as text) unless it is the world's own. Above 65,535 frames the count is in TRIAL:ACTUAL_END_FIELD and POINT:LONG_FRAMES. Raises GhptConfigError where
-    the rate is unknown and GhptDataError for names that the format cannot hold.
+    it. Above 65,535 frames the count is in TRIAL:ACTUAL_END_FIELD and POINT:LONG_FRAMES.
+
+    The format's coordinates have single precision, so positions are relative to ``about.origin``. Where that is not
+    the world's own zero, GHPT:ORIGIN is it: x, y and z in mm, as text, because a number has too few digits.
+
+    Raises GhptConfigError where the rate is unknown and GhptDataError for names that the format cannot hold.
     """
     rate, whole = required_rate(about, "C3D"), extent_without_gaps(path, about, chunks)
     frames, joints = whole.last - whole.first + 1, len(about.joints)

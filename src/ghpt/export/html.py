@@ -25,8 +25,9 @@ _FRUSTUM = 300.0
 
 def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = None) -> None:
     """A page that plays the skeleton: left blue, right orange; filled joints hollow, missing ones absent; below it the
-    reprojection error. ``scene``: cameras to draw. Up is the world axis nearest to the body's. Positions are relative
-    to ``about.origin``, which the page tells."""
+    reprojection error. ``scene``: cameras to draw. Up is the world axis nearest to the body's.
+
+    Positions are relative to ``about.origin``, which the page tells."""
     whole = extent(path, about, chunks)
     stride = math.ceil(whole.count / MOST_FRAMES)
     arrays, up, at = [], torch.zeros(3, dtype=torch.float64), 0

@@ -21,17 +21,26 @@ from ghpt.report.stored_npz import Member, add_member, members_of, read_rows, te
 
 FORMAT_VERSION = 2
 _POINTS = {1: "<f4", 2: "<f8"}
-"""How each version that is read stores positions. The first was short of digits far from the world's zero."""
+"""How each version that is read stores positions; the first had few digits far from the zero."""
 _MEND = "Predict this recording again, or copy the file again"
 _TEXTS = ("meta", "joints", "camera_names")
 
 
-def _layout(views: int, joints: int, version: int = FORMAT_VERSION) -> dict[str, tuple[str, tuple[int, ...]]]:
+_Layout = dict[str, tuple[str, tuple[int, ...]]]
+
+
+def _layout(views: int, joints: int, version: int = FORMAT_VERSION) -> _Layout:
+    """The type of each array and the shape of its rows."""
     return {
-        "frame": ("<i8", ()), "points": (_POINTS[version], (joints, 3)), "state": ("|i1", (joints,)), "error": ("<f4", (joints,)),
-        "views": ("|b1", (views, joints)), "covariance": ("<f4", (joints, 6)), "score": ("<f4", ()),
+        "frame": ("<i8", ()),
+        "points": (_POINTS[version], (joints, 3)),
+        "state": ("|i1", (joints,)),
+        "error": ("<f4", (joints,)),
+        "views": ("|b1", (views, joints)),
+        "covariance": ("<f4", (joints, 6)),
+        "score": ("<f4", ()),
         "swapped": ("|b1", (views,)),
-    }  # fmt: skip
+    }
 
 
 def write_npz(path: Path, about: About, chunks: Chunks) -> None:
@@ -88,7 +97,8 @@ def read_reconstruction(path: str | Path, size: int = PIECE) -> tuple[About, Ite
     members, texts, meta = _open(path)
     joints, cameras = texts["joints"], texts["camera_names"]
     frames = members["frame"].shape[0] if "frame" in members and members["frame"].shape else 0
-    for name, (dtype, shape) in _layout(len(cameras), len(joints), meta["format_version"]).items():
+    layout = _layout(len(cameras), len(joints), meta["format_version"])
+    for name, (dtype, shape) in layout.items():
         if name not in members or members[name][1:] != (np.dtype(dtype), (frames, *shape)):
             raise GhptDataError(path, name, f"is not {dtype} of shape {(frames, *shape)}", _MEND)
     about = About(
@@ -102,7 +112,8 @@ def read_reconstruction(path: str | Path, size: int = PIECE) -> tuple[About, Ite
 
 def _origin(path: Path, meta: dict[str, Any]) -> tuple[float, float, float]:
     origin = meta.get("origin", [0.0, 0.0, 0.0])
-    if not isinstance(origin, list) or [type(x) for x in origin] != [float] * 3 or not np.isfinite(origin).all():
+    numbers = isinstance(origin, list) and [type(x) for x in origin] == [float] * 3
+    if not numbers or not np.isfinite(origin).all():
         raise GhptDataError(path, "meta.origin", f"is {origin!r}", _MEND)
     return tuple(origin)
 
@@ -117,9 +128,11 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
     except (OSError, ValueError, TypeError, EOFError, IndexError, RuntimeError, zipfile.BadZipFile) as error:
         raise GhptDataError(path, "", f"is not a readable reconstruction ({error})", _MEND) from error
     version = meta.get("format_version") if isinstance(meta, dict) else None
-    if type(version) is not int or version not in _POINTS or meta.get("format") != "ghpt reconstruction":
+    readable = type(version) is int and version in _POINTS
+    if not readable or meta.get("format") != "ghpt reconstruction":
         known = " and ".join(map(str, _POINTS))
-        raise GhptDataError(path, "meta.format_version", f"is {version!r}; this ghpt reads {known}", _MEND)
+        problem = f"is {version!r}; this ghpt reads {known}"
+        raise GhptDataError(path, "meta.format_version", problem, _MEND)
     forms = {"name": str, "source": str, "estimator": str, "rate_hz": (float, int, type(None)), "smoothed": bool,
              "provenance": dict}  # fmt: skip
     for field, form in forms.items():

@@ -28,9 +28,10 @@ _GREY = 0x99999966
 def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = None) -> None:
     """Timelines ``frame`` and, with a known rate, ``time``; mm. Missing joints are absent, filled ones pale.
 
-    ``scene`` adds cameras and rays, and with evidence key points, reprojections and hypotheses. All is relative to
-    ``about.origin``, which the recording's name tells, because the viewer has float32. Raises GhptConfigError without
-    the package.
+    ``scene`` adds cameras and rays, and with evidence key points, reprojections and hypotheses. The viewer has
+    float32, so all is relative to ``about.origin``, which the recording's name tells.
+
+    Raises GhptConfigError without the package.
     """
     try:
         import rerun as rr

@@ -27,7 +27,7 @@ class Cameras:
         return -(self.R.mT @ self.t[..., None])[..., 0]
 
     def relative_to(self, origin: Float[Tensor, " 3"]) -> Cameras:
-        """The same cameras in a world whose zero is ``origin`` (mm, in the cameras' own world); float64."""
+        """The same cameras in a world whose zero is ``origin`` (mm) of theirs; float64."""
         double = self.to(torch.float64)
         shift = double.R @ origin.to(double.R)[:, None]
         return Cameras(double.K, double.R, double.t + shift[..., 0])

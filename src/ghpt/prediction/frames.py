@@ -25,9 +25,11 @@ from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import JOINTS
 
 _NEAR = 1e5
-"""Distance (mm, along an axis) from the world's zero up to which a rig stays where it is: float32, in
-which hypotheses are scored and estimators compared, has steps of 0.008 mm there. Farther away they
-grow past 0.01 mm, and in national grids (5,000 km) to half a metre."""
+"""Distance (mm, along an axis) from the world's zero up to which a rig stays where it is.
+
+float32, in which hypotheses are scored and estimators compared, has steps of 0.008 mm there; farther
+away they pass 0.01 mm, and reach half a metre in national grids (5,000 km). Nearer rigs are left alone
+because their scores would change in the last digit, for nothing."""
 _WHOLE = 1000.0
 """The origin of a rig farther away has whole metres, so that people can read it and add it."""
 _STAMPED = 4096
