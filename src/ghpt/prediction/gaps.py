@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.signal import butter, sosfiltfilt
 
 from ghpt.errors import GhptConfigError, check
+from ghpt.files import allocate
 from ghpt.prediction.shards import Shards
 from ghpt.reconstruction import Reconstruction, State
 
@@ -128,19 +130,27 @@ def _interpolated(x: np.ndarray, y: np.ndarray, at: np.ndarray, kind: str) -> np
 
 
 @contextmanager
+def _scratch(folder: Path, dtype: str, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
+    """An array of zeros in a nameless file of ``folder``. Raises OSError if the disk lacks the space."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    with tempfile.TemporaryFile(dir=folder) as handle:
+        allocate(handle, size, folder)
+        yield np.memmap(handle, dtype, "r+", shape=shape)
+
+
+@contextmanager
 def after(gaps: Gaps, shards: Shards, joints: int, folder: Path) -> Iterator[Chunks]:
     """The shards as they are to be written: as they are, or filled and smoothed.
 
     Joint by joint, each over all frames, so that no border between chunks shows: memory holds one joint's path, the
-    others are in a nameless temporary file in ``folder``.
+    others are in a nameless temporary file in ``folder``. Raises OSError if the disk lacks the space for it.
     """
     if gaps.nothing:
         yield shards.chunks
         return
     frames = shards.frames
-    with tempfile.TemporaryFile(dir=folder) as one, tempfile.TemporaryFile(dir=folder) as other:
-        points = np.memmap(one, "<f8", "w+", shape=(joints, frames, 3))
-        state = np.memmap(other, "|i1", "w+", shape=(joints, frames))
+    paths, states = (joints, frames, 3), (joints, frames)
+    with _scratch(folder, "<f8", paths) as points, _scratch(folder, "|i1", states) as state:
         frame = np.zeros(frames, np.int64)
         for shard, part in enumerate(shards.chunks()):
             rows = slice(shards.rows(shard).start, shards.rows(shard).stop)
