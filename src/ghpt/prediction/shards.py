@@ -122,7 +122,7 @@ class Shards:
         if not entries or entries[0] != self._header:
             _log.info("%s is of other key points, cameras or settings: starting anew.", self.folder)
             return {}
-        return {e["shard"]: e for e in entries[1:] if type(e.get("shard")) is int and 0 <= e["shard"] < len(self)}
+        return {e["shard"]: e for e in entries if type(e.get("shard")) is int and 0 <= e["shard"] < len(self)}
 
     def _vouched(self, shard: int, entry: dict[str, Any]) -> bool:
         path = self.path(shard)
@@ -143,7 +143,7 @@ class Shards:
 
 
 def _line(entry: dict[str, Any]) -> bytes:
-    return json.dumps(entry, sort_keys=True).encode() + b"\n"
+    return json.dumps(entry).encode() + b"\n"
 
 
 def _parsed(line: bytes) -> Any:
