@@ -17,7 +17,7 @@ from ghpt.data.camera_files import read_cameras
 from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.data.rigs import Rig, human36m_rig
 from ghpt.errors import GhptDataError
-from ghpt.export import WRITERS, Scene, read_reconstruction
+from ghpt.export import WRITERS, Evidence, Scene, read_reconstruction
 from ghpt.predict import predict
 from ghpt.prediction.frames import Frames
 from ghpt.recording import Recording
@@ -209,14 +209,28 @@ def test_rerun_gets_positions_that_float32_holds(tmp_path, monkeypatch):
     made = random_reconstruction(5, views=4, missing=0.0)
     far = replace(made, points=made.points + torch.tensor(OFFSETS["UTM"], dtype=torch.float64))
     who = replace(about(cameras=("a", "b", "c", "d")), origin=origin)
-    scene = Scene(moved_rig(OFFSETS["UTM"]).cameras)
+    pool = far.points[:, None].expand(-1, 2, -1, -1)
+    evidence = Evidence(torch.zeros(5, 4, 17, 2), made.views, pool)
+    scene = Scene(moved_rig(OFFSETS["UTM"]).cameras, lambda: iter([evidence]))
     WRITERS["rerun"].write(tmp_path / "poses.rrd", who, in_parts(far), scene=scene)
-    positions = rr.Points3D.columns.call_args_list[0].kwargs["positions"].astype(float) + origin
-    assert np.abs(positions - far.points.flatten(0, 1).numpy()).max() <= LIMIT
+    joints, hypotheses = (call.kwargs["positions"] for call in rr.Points3D.columns.call_args_list)
+    for shown, true in ((joints, far.points), (hypotheses, pool)):
+        assert np.abs(shown + np.array(origin) - true.reshape(-1, 3).numpy()).max() <= LIMIT
     centres = [call.kwargs["translation"] for call in rr.Transform3D.call_args_list]
     assert np.abs(np.array(centres) + origin - scene.cameras.centre.numpy()).max() <= LIMIT
     name = rr.RecordingStream().send_recording_name.call_args.args[0]
     assert name.endswith("zero is at (500321000, 5412346000, 313000) mm of the cameras' world")
+
+
+def test_the_page_s_cameras_are_where_its_joints_are(outputs):
+    text = (outputs["UTM"] / "poses.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'application/json">(.*?)</script>', text, re.DOTALL)[1])
+    stated = re.search(r"zero is at \((.*?)\) mm", data["about"])[1]
+    centres = np.array([camera["centre"] for camera in data["cameras"]]) @ np.array(data["axes"]).T
+    expected = moved_rig(OFFSETS["UTM"]).cameras.centre.numpy()
+    found = centres + [float(x) for x in stated.split(",")]
+    assert np.abs(found - expected).max() <= LIMIT
+    assert np.abs(centres).max() < 10 * METRE
 
 
 @pytest.mark.parametrize("write", [write_pose2sim, write_aniposelib, write_opencv])
