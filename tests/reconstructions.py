@@ -26,7 +26,8 @@ def random_reconstruction(frames, joints=17, views=3, seed=0, missing=0.3, first
     covariance = torch.rand(frames, joints, 6, generator=g) * 100 * observed[..., None]
     return Reconstruction(
         frame=torch.arange(first, first + frames),
-        points=torch.randn(frames, joints, 3, generator=g) * 1500,
+        # made of float32, so that C3D holds them exactly
+        points=(torch.randn(frames, joints, 3, generator=g) * 1500).double(),
         state=state,
         error=torch.rand(frames, joints, generator=g) * 20 * observed,
         views=(torch.rand(frames, views, joints, generator=g) < 0.7) & observed[:, None],

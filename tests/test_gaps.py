@@ -1,9 +1,12 @@
 """Filling and smoothing: only on request, only between what was observed, the same however it is cut up."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.interpolate import PchipInterpolator
+from scipy.signal import butter, sosfiltfilt
 
 from ghpt.errors import GhptConfigError
 from ghpt.export.stream import part
@@ -165,3 +168,120 @@ def test_other_gaps_are_named_errors(fill, rate, said):
 def test_a_filter_that_cannot_be_is_a_named_error(arguments, said):
     with pytest.raises(GhptConfigError, match=said):
         Gaps(*arguments)
+
+
+def test_filled_is_the_gap_alone():
+    frame, points, state = path(S, M, M, S, M, M, M, S)
+    found, states = filling(2)(frame, points, state)
+    changed = (found != points).any(-1)
+    assert np.flatnonzero(changed).tolist() == [1, 2]
+    assert np.flatnonzero(states == F).tolist() == [1, 2]
+
+
+@pytest.mark.parametrize("count", [2, 5, 9, 10, 11, 40])
+def test_smoothing_is_a_butterworth_filter_of_second_order_in_both_directions(count):
+    frame, points, state = path(*[S] * count)
+    padding = min(9, count - 1)  # three times the filter's three coefficients
+    low_pass = butter(2, 5.0, fs=100.0, output="sos")
+    expected = sosfiltfilt(low_pass, points.astype(float), axis=0, padlen=padding)
+    found, _ = smoothing(5.0)(frame, points.astype(float), state)
+    np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_a_frame_alone_is_not_smoothed():
+    frame, points, state = path(*[S, M] * 50, seed=3)
+    found, _ = smoothing(5.0)(frame, points.astype(float), state)
+    assert np.array_equal(found, points)
+
+
+def test_smoothing_goes_through_what_was_filled():
+    frame, points, state = path(*[S] * 20, M, M, *[S] * 20)
+    filled, _ = filling(2)(frame, points.astype(float), state)
+    expected, _ = smoothing(5.0)(frame, filled, np.zeros_like(state))
+    found, states = Gaps(2, "linear", 5.0, 100.0)(frame, points.astype(float), state)
+    np.testing.assert_array_equal(found, expected)
+    assert states[20:22].tolist() == [F, F]
+
+
+def test_what_is_missing_keeps_its_reason_and_place():
+    frame, points, state = path(S, M, M, M, S, int(State.PARALLEL), S)
+    found, states = Gaps(1, "linear", 5.0, 100.0)(frame, points, state)
+    assert states.tolist() == [S, M, M, M, S, F, S]
+    assert np.array_equal(found[1:4], points[1:4])
+
+
+@pytest.mark.parametrize(("frame", "step"), [([], 1), ([7], 1), ([0, 10], 10), ([0, 1, 2, 9], 1), ([0, 2, 4, 5], 2)])
+def test_the_step_is_the_usual_distance(frame, step):
+    assert frame_step(np.array(frame, np.int64)) == step
+
+
+def test_runs_of_every_tenth_frame_end_where_one_is_left_out():
+    frame = np.array([0, 10, 20, 40, 50])
+    found = runs(frame, np.ones(5, bool), 10)
+    assert [run.tolist() for run in found] == [[0, 1, 2], [3, 4]]
+
+
+@pytest.mark.parametrize(("fill", "rate", "frames"), [(1, None, 1), ("0.1s", 10.0, 1), ("4s", 0.5, 2), ("2s", 0.75, 1)])
+def test_a_gap_of_one_frame_and_a_slow_rate_are_some(fill, rate, frames):
+    assert gap_frames(fill, rate) == frames
+
+
+@pytest.mark.parametrize(
+    ("fill", "rate", "said"),
+    [
+        (True, 60.0, "is True"),
+        ("1s", 0.0, "needs the frame rate"),
+        ("1s", -0.5, "needs the frame rate"),
+        ("1s", np.nan, "needs the frame rate"),
+        ("1s", np.inf, "needs the frame rate"),
+    ],
+)
+def test_what_is_no_gap_or_no_rate_is_named(fill, rate, said):
+    with pytest.raises(GhptConfigError, match=f"fill: {said}"):
+        gap_frames(fill, rate)
+
+
+@pytest.mark.parametrize(("cut_off", "rate"), [(0.1, 0.5), (0.5, 10.0), (5.9, 12.0)])
+def test_a_filter_below_half_the_rate_can_be(cut_off, rate):
+    assert not Gaps(None, "pchip", cut_off, rate).nothing
+
+
+@pytest.mark.parametrize(
+    ("cut_off", "rate", "said"),
+    [
+        (0.1, -0.5, "needs the frame rate"),
+        (0.1, 0.0, "needs the frame rate"),
+        (0.1, np.inf, "needs the frame rate"),
+        (-0.5, 12.0, "is -0.5 Hz"),
+        (0.0, 12.0, "is 0 Hz"),
+    ],
+)
+def test_a_rate_or_a_cut_off_that_is_not_positive_is_named(cut_off, rate, said):
+    with pytest.raises(GhptConfigError, match=f"smooth: {said}"):
+        Gaps(None, "pchip", cut_off, rate)
+
+
+def test_either_request_is_something_and_none_takes_no_file(tmp_path, monkeypatch):
+    assert not filling(3).nothing
+    assert not smoothing(5.0).nothing
+    shards = Shards(tmp_path, "key", 90, 40)
+    monkeypatch.setattr("ghpt.prediction.gaps.allocate", None)
+    with after(Gaps(None, "linear", None, None), shards, 17, tmp_path) as chunks:
+        assert chunks == shards.chunks
+    shards.close()
+
+
+@pytest.mark.parametrize("gaps", [filling(3), smoothing(5.0)])
+def test_far_from_the_zero_paths_keep_their_digits(tmp_path, gaps):
+    whole = random_reconstruction(30)
+    far = replace(whole, points=whole.points + 1e10)
+    shards = Shards(tmp_path, "key", 30, 12)
+    for shard in shards.missing():
+        shards.write(shard, part(far, shards.rows(shard).start, shards.rows(shard).stop))
+    with after(gaps, shards, 17, tmp_path) as chunks:
+        found = torch.cat([chunk.points for chunk in chunks()])
+    shards.close()
+    for joint in range(17):
+        points, state = whole.points[:, joint].numpy(), whole.state[:, joint].numpy()
+        expected, _ = gaps(whole.frame.numpy(), points, state)
+        np.testing.assert_allclose(found[:, joint].numpy() - 1e10, expected, atol=1e-3)

@@ -59,7 +59,8 @@ def sound(result, batch):
     assert result.points.shape == (frames, joints, 3)
     for field in ("points", "error", "covariance", "score"):
         assert torch.isfinite(getattr(result, field)).all(), field
-        assert getattr(result, field).dtype == torch.float32
+        expected = torch.float64 if field == "points" else torch.float32
+        assert getattr(result, field).dtype == expected
     assert torch.equal(result.frame, batch.sample)
     missing = ~result.placed
     for field in ("points", "error", "covariance"):
@@ -92,7 +93,7 @@ def test_the_learned_prediction_is_that_of_the_view_weights():
     batch = random_scene(2, frames=3, views=5).noisy(4, 0).batch()
     predictor = learned()
     weighed, result = predictor.view_weights.weigh(batch), predictor(batch)
-    assert torch.equal(result.points, weighed.triangulation.points.float())
+    assert torch.equal(result.points, weighed.triangulation.points)
     assert torch.equal(result.views, weighed.views)
     torch.testing.assert_close(result.score, (weighed.weights * weighed.logits).sum(-1), rtol=0, atol=1e-6)
     found = QUALITY(batch, weighed.triangulation.points, weighed.views)

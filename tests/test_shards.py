@@ -1,8 +1,9 @@
 """Shards: what is listed is whole, what is not is made anew, whatever was done to the folder."""
 
+import hashlib
 import json
 import os
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import pytest
 import torch
@@ -155,3 +156,93 @@ def test_the_manifest_lists_a_shard_after_it_is_there(tmp_path, whole, monkeypat
         opened.write(0, part(whole, 0, 10))
     assert opened.path(0).is_file()
     assert len([json.loads(line) for line in (tmp_path / MANIFEST).read_text().splitlines()]) == 1
+
+
+def lines_of(folder) -> list[dict]:
+    return [json.loads(line) for line in (folder / MANIFEST).read_text().splitlines()]
+
+
+def test_the_manifest_says_what_its_shards_are_of_and_their_digests(tmp_path, whole):
+    """What is on the disk, which another version must be able to tell from its own."""
+    folder = tmp_path / "not" / "there"
+    filled(folder, whole).close()
+    header, *entries = lines_of(folder)
+    assert header == {"version": 2, "key": "key", "frames": 25, "shard_frames": 10}
+    for shard, entry in enumerate(entries):
+        data = (folder / f"{shard:06d}.npz").read_bytes()
+        digest = hashlib.sha256(data).hexdigest()
+        assert entry == {"shard": shard, "bytes": len(data), "sha256": digest}
+    assert len(entries) == 3
+
+
+def test_another_version_s_shards_start_anew(tmp_path, whole):
+    filled(tmp_path, whole).close()
+    header, *entries = lines_of(tmp_path)
+    changed = [header | {"version": 1}, *entries]
+    (tmp_path / MANIFEST).write_text("".join(json.dumps(line) + "\n" for line in changed))
+    assert shards(tmp_path).missing() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("content", ["", "\n\n", "[]\nnull\n{"])
+def test_a_manifest_without_an_entry_is_none(tmp_path, whole, content):
+    filled(tmp_path, whole).close()
+    (tmp_path / MANIFEST).write_text(content)
+    assert shards(tmp_path).missing() == [0, 1, 2]
+
+
+@pytest.mark.parametrize("number", [-1, 3])
+def test_a_shard_beyond_the_recording_is_none_even_if_it_is_whole(tmp_path, whole, number):
+    opened = filled(tmp_path, whole)
+    opened.close()
+    opened.path(number).write_bytes(opened.path(0).read_bytes())
+    line = lines_of(tmp_path)[1] | {"shard": number}
+    with open(tmp_path / MANIFEST, "a") as handle:
+        handle.write(json.dumps(line) + "\n")
+    again = shards(tmp_path)
+    assert sorted(again.kept) == [0, 1, 2]
+    assert not again.path(number).exists()
+
+
+def test_looking_takes_in_only_what_is_whole_and_keeps_what_it_knows(tmp_path, whole):
+    opened = shards(tmp_path)
+    opened.write(0, part(whole, 0, 10))
+    beside = shards(tmp_path, clean=False)
+    for shard in (1, 2):
+        beside.write(shard, part(whole, 10 * shard, min(10 * shard + 10, 25)))
+    cut = opened.path(2).read_bytes()[:-1]
+    opened.path(2).write_bytes(cut)
+    opened.path(0).unlink()
+    opened.look()
+    assert sorted(opened.kept) == [0, 1]
+
+
+def test_a_line_that_the_disk_cuts_off_is_an_error(tmp_path, whole, monkeypatch):
+    opened = shards(tmp_path)
+    real = os.write
+    monkeypatch.setattr(os, "write", lambda handle, data: real(handle, data[:5]))
+    with pytest.raises(OSError, match="No space left") as caught:
+        opened.write(0, part(whole, 0, 10))
+    assert caught.value.filename == str(tmp_path / MANIFEST)
+    monkeypatch.undo()
+    opened.close()
+    assert shards(tmp_path).missing() == [0, 1, 2]
+
+
+@pytest.mark.parametrize(("frames", "sizes"), [(1, [1]), (10, [10]), (11, [10, 1]), (20, [10, 10])])
+def test_the_last_shard_has_the_rest(tmp_path, frames, sizes):
+    opened = shards(tmp_path, frames=frames)
+    assert [len(opened.rows(shard)) for shard in range(len(opened))] == sizes
+    assert [row for shard in range(len(opened)) for row in opened.rows(shard)] == [*range(frames)]
+
+
+def test_positions_keep_their_digits_far_from_the_zero(tmp_path, whole):
+    far = replace(whole, points=whole.points + 1e10)
+    opened = shards(tmp_path, size=25)
+    opened.write(0, far)
+    assert torch.equal(opened.read(0).points, far.points)
+
+
+def test_an_opened_folder_keeps_other_people_s_files(tmp_path, whole):
+    (tmp_path / "notes.txt").write_text("mine")
+    filled(tmp_path, whole)
+    assert (tmp_path / "notes.txt").read_text() == "mine"

@@ -4,6 +4,7 @@ A reader therefore never sees half a file, and a crash at any instant leaves the
 was. Within the output folder of a command, `ghpt.outputs` guards what may be replaced or removed.
 """
 
+import errno
 import hashlib
 import os
 import platform
@@ -63,6 +64,9 @@ def _guard_of(path: Path) -> Guard | None:
         return None
     parents = (path.parent.resolve() / path.name).parents
     return next((_guards[folder] for folder in parents if folder in _guards), None)
+
+_ZEROS = 1 << 20
+"""Bytes that are written at a time where a disk cannot reserve them."""
 
 
 def _temporary(path: Path) -> Path:
@@ -150,6 +154,38 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
     _sync_folder(path.parent)
+
+
+def allocate(handle: IO[bytes], size: int, name: str | Path) -> None:
+    """Make an open file ``size`` bytes long, and take all of them from the disk at once.
+
+    A file that is only declared to be long has holes; where the disk is full when a memory map fills
+    one, SIGBUS ends the process without a word. Here that is an OSError which names ``name``. What the
+    file holds stays, and new bytes are 0.
+    """
+    try:
+        if not _reserved(handle, size):
+            # Past the handle's buffer, which would try, and fail, once more when it is closed.
+            missing = size - os.lseek(handle.fileno(), 0, os.SEEK_END)
+            while missing > 0:
+                missing -= os.write(handle.fileno(), bytes(min(_ZEROS, missing)))
+        handle.truncate(size)
+    except OSError as error:
+        error.filename = str(name)
+        raise
+
+
+def _reserved(handle: IO[bytes], size: int) -> bool:
+    """Whether the operating system takes the bytes itself; Windows, macOS and some disks do not."""
+    if not hasattr(os, "posix_fallocate"):
+        return False
+    try:
+        os.posix_fallocate(handle.fileno(), 0, size)
+    except OSError as error:
+        if error.errno in (errno.EINVAL, errno.EOPNOTSUPP):
+            return False
+        raise
+    return True
 
 
 def sweep_temporaries(folder: str | Path) -> list[Path]:

@@ -19,6 +19,7 @@ from ghpt.data.key_points import read_people
 from ghpt.data.views import look_through
 from ghpt.errors import GhptCheckpointError, check
 from ghpt.export import WRITERS, Scene
+from ghpt.export.scene import origin_note
 from ghpt.files import atomic_write, sweep_temporaries
 from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
@@ -117,8 +118,10 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
         rate_hz=frames.rate_hz, smoothed=config["smooth"] is not None,
         provenance=origin | {"estimator": chosen.text, "settings": chosen.identity, "fill_frames": gaps.longest,
                              "interpolation": gaps.interpolation, "smooth_hz": gaps.cut_off_hz},
+        origin=tuple(frames.origin.tolist()),
     )  # fmt: skip
     formats = _formats(config, frames)
+    _tell_origin(about, formats)
     _log.info("%s: %d frames, %d views, by %s.", frames.title, len(frames), len(frames.camera_names), chosen.text)
     sweep_temporaries(output)
     predictor = chosen.predictor.fitted(frames.batch(frames.spread(config["fitted_frames"])))
@@ -224,6 +227,14 @@ def _formats(config: dict[str, Any], frames: Frames) -> list[str]:
     if config["formats"] is None:
         _log.warning("The files do not tell the frame rate: no %s. Give rate_hz=60, say.", " and ".join(_TIMED))
     return config["formats"] or [name for name in _ALL if name not in _TIMED]
+
+
+def _tell_origin(about: About, formats: list[str]) -> None:
+    """Say which files are not in the world's own millimetres, and from where they count."""
+    files = [WRITERS[name].file for name in formats if WRITERS[name].single]
+    if files and any(about.origin):
+        text = "The rig is far from its world's zero: in %s, which have single precision, %s."
+        _log.warning(text, ", ".join(files), origin_note(about))
 
 
 def _check(config: dict[str, Any]) -> None:

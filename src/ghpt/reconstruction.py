@@ -43,6 +43,9 @@ class About:
     rate_hz: float | None
     smoothed: bool
     provenance: dict[str, Any]
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The point of the world (mm) that formats of single precision take for their zero: near the
+    rig where that is far away."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class Reconstruction:
     frame: Int[Tensor, " T"]
     """The recording's own frame numbers, rising; a number that is left out has no frame."""
     points: Float[Tensor, "T J 3"]
-    """World, mm, float32; finite and meaningless where missing (NaN in files)."""
+    """World, mm, float64; finite and meaningless where missing (NaN in files)."""
     state: Int8[Tensor, "T J"]
     """Values of ``State``."""
     error: Float[Tensor, "T J"]

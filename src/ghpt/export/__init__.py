@@ -28,6 +28,8 @@ class Writer:
     file: str
     """Its name in the output folder."""
     write: Callable[..., None]
+    single: bool = False
+    """Whether its positions have single precision, and so are relative to ``About.origin``."""
 
 
 WRITERS = {
@@ -35,7 +37,7 @@ WRITERS = {
     "csv": Writer("poses.csv", write_csv),
     "parquet": Writer("poses.parquet", write_parquet),
     "trc": Writer("poses.trc", write_trc),
-    "c3d": Writer("poses.c3d", write_c3d),
-    "html": Writer("poses.html", write_html),
-    "rerun": Writer("poses.rrd", write_rerun),
+    "c3d": Writer("poses.c3d", write_c3d, single=True),
+    "html": Writer("poses.html", write_html, single=True),
+    "rerun": Writer("poses.rrd", write_rerun, single=True),
 }

@@ -10,7 +10,15 @@ import numpy as np
 import torch
 
 from ghpt.errors import GhptDataError
-from ghpt.export.stream import Chunks, extent_without_gaps, plain, plain_names, required_rate, without_gaps
+from ghpt.export.stream import (
+    Chunks,
+    extent_without_gaps,
+    plain,
+    plain_names,
+    points_of_origin,
+    required_rate,
+    without_gaps,
+)
 from ghpt.files import atomic_write
 from ghpt.reconstruction import About, Reconstruction, State
 
@@ -30,8 +38,12 @@ def write_c3d(path: Path, about: About, chunks: Chunks) -> None:
 
     A missing joint is (0, 0, 0) with residual -1, a filled one has residual 0 and no camera, as the format prescribes;
     else the residual is the reprojection error in pixels (0.25 to 63.75) and the mask the first seven views that made
-    it. Above 65,535 frames the count is in TRIAL:ACTUAL_END_FIELD and POINT:LONG_FRAMES. Raises GhptConfigError where
-    the rate is unknown and GhptDataError for names that the format cannot hold.
+    it. Above 65,535 frames the count is in TRIAL:ACTUAL_END_FIELD and POINT:LONG_FRAMES.
+
+    The format's coordinates have single precision, so positions are relative to ``about.origin``. Where that is not
+    the world's own zero, GHPT:ORIGIN is it: x, y and z in mm, as text, because a number has too few digits.
+
+    Raises GhptConfigError where the rate is unknown and GhptDataError for names that the format cannot hold.
     """
     rate, whole = required_rate(about, "C3D"), extent_without_gaps(path, about, chunks)
     frames, joints = whole.last - whole.first + 1, len(about.joints)
@@ -44,25 +56,26 @@ def write_c3d(path: Path, about: About, chunks: Chunks) -> None:
         handle.write(header.ljust(_BLOCK, b"\0") + parameters)
         written = 0
         for piece in without_gaps(path, about, chunks, whole):
-            written += handle.write(_points(piece).tobytes())
+            written += handle.write(_points(about, piece).tobytes())
         if frames < _MOST:  # from there on readers take all that follows for frames, up to the file's end
             handle.write(bytes(-written % _BLOCK))
 
 
-def _points(piece: Reconstruction) -> np.ndarray:
+def _points(about: About, piece: Reconstruction) -> np.ndarray:
     """x, y, z and the word with the mask in the high byte and the residual in the low one, float32 [T, J, 4]."""
     placed, observed = piece.placed, piece.state == State.OBSERVED
     bits = 2 ** torch.arange(min(_CAMERAS, piece.views.shape[1]))
     mask = (piece.views[:, :_CAMERAS] * bits[:, None]).sum(1)
     residual = (piece.error / RESIDUAL_STEP).round().nan_to_num(255.0).clamp(1, 255).long()
     word = torch.where(observed, 256 * mask + residual, torch.where(placed, 0, -1))
-    points = torch.where(placed[..., None], piece.points, 0.0)
-    return torch.cat([points, word[..., None].float()], dim=-1).numpy().astype("<f4")
+    points = torch.where(placed[..., None], points_of_origin(about, piece), 0.0)
+    return torch.cat([points, word[..., None].double()], dim=-1).numpy().astype("<f4")
 
 
 def _parameters(path: Path, about: About, rate: float, frames: int, first: int) -> bytes:
     names = plain_names(path, "joints", about.joints)
     long = {"LONG_FRAMES": _floats([frames])} if frames >= _MOST else {}
+    origin = {"ORIGIN": _texts([f"{x:.15g}" for x in about.origin])} if any(about.origin) else {}
     groups = {
         "POINT": {
             "USED": _words([len(names)]), "SCALE": _floats([-RESIDUAL_STEP]), "RATE": _floats([rate]),
@@ -75,6 +88,7 @@ def _parameters(path: Path, about: About, rate: float, frames: int, first: int) 
             "NAME": _text(about.name), "SOURCE": _text(about.source), "ESTIMATOR": _text(about.estimator),
             "SMOOTHED": _text("yes" if about.smoothed else "no"), "FIRST_FRAME": _text(str(first)),
             "RESIDUAL_UNIT": _text("px"), "CAMERAS": _texts([_cut(plain(name)) for name in about.camera_names]),
+            **origin,
         },
     }  # fmt: skip
     groups["POINT"]["DATA_START"] = _words([0])

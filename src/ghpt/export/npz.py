@@ -19,17 +19,28 @@ from ghpt.files import atomic_write
 from ghpt.reconstruction import About, Reconstruction, State
 from ghpt.report.stored_npz import Member, add_member, members_of, read_rows, text_table
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
+_POINTS = {1: "<f4", 2: "<f8"}
+"""How each version that is read stores positions; the first had few digits far from the zero."""
 _MEND = "Predict this recording again, or copy the file again"
 _TEXTS = ("meta", "joints", "camera_names")
 
 
-def _layout(views: int, joints: int) -> dict[str, tuple[str, tuple[int, ...]]]:
+_Layout = dict[str, tuple[str, tuple[int, ...]]]
+
+
+def _layout(views: int, joints: int, version: int = FORMAT_VERSION) -> _Layout:
+    """The type of each array and the shape of its rows."""
     return {
-        "frame": ("<i8", ()), "points": ("<f4", (joints, 3)), "state": ("|i1", (joints,)), "error": ("<f4", (joints,)),
-        "views": ("|b1", (views, joints)), "covariance": ("<f4", (joints, 6)), "score": ("<f4", ()),
+        "frame": ("<i8", ()),
+        "points": (_POINTS[version], (joints, 3)),
+        "state": ("|i1", (joints,)),
+        "error": ("<f4", (joints,)),
+        "views": ("|b1", (views, joints)),
+        "covariance": ("<f4", (joints, 6)),
+        "score": ("<f4", ()),
         "swapped": ("|b1", (views,)),
-    }  # fmt: skip
+    }
 
 
 def write_npz(path: Path, about: About, chunks: Chunks) -> None:
@@ -60,7 +71,7 @@ def write_npz(path: Path, about: About, chunks: Chunks) -> None:
 
 
 def _meta(about: About) -> dict[str, Any]:
-    plain = ("name", "source", "estimator", "rate_hz", "smoothed", "provenance")
+    plain = ("name", "source", "estimator", "rate_hz", "smoothed", "provenance", "origin")
     meta = {"format": "ghpt reconstruction", "format_version": FORMAT_VERSION, "unit": "mm"}
     return (
         meta | {field: getattr(about, field) for field in plain} | {"states": {s.name.lower(): int(s) for s in State}}
@@ -86,15 +97,25 @@ def read_reconstruction(path: str | Path, size: int = PIECE) -> tuple[About, Ite
     members, texts, meta = _open(path)
     joints, cameras = texts["joints"], texts["camera_names"]
     frames = members["frame"].shape[0] if "frame" in members and members["frame"].shape else 0
-    for name, (dtype, shape) in _layout(len(cameras), len(joints)).items():
+    layout = _layout(len(cameras), len(joints), meta["format_version"])
+    for name, (dtype, shape) in layout.items():
         if name not in members or members[name][1:] != (np.dtype(dtype), (frames, *shape)):
             raise GhptDataError(path, name, f"is not {dtype} of shape {(frames, *shape)}", _MEND)
     about = About(
         name=meta["name"], source=meta["source"], estimator=meta["estimator"], joints=joints, camera_names=cameras,
         rate_hz=meta["rate_hz"], smoothed=meta["smoothed"], provenance=meta["provenance"],
+        origin=_origin(path, meta),
     )  # fmt: skip
     starts = range(0, frames, size)
     return about, (_read(path, members, start, min(start + size, frames)) for start in starts)
+
+
+def _origin(path: Path, meta: dict[str, Any]) -> tuple[float, float, float]:
+    origin = meta.get("origin", [0.0, 0.0, 0.0])
+    numbers = isinstance(origin, list) and [type(x) for x in origin] == [float] * 3
+    if not numbers or not np.isfinite(origin).all():
+        raise GhptDataError(path, "meta.origin", f"is {origin!r}", _MEND)
+    return tuple(origin)
 
 
 def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], dict[str, Any]]:
@@ -107,8 +128,11 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
     except (OSError, ValueError, TypeError, EOFError, IndexError, RuntimeError, zipfile.BadZipFile) as error:
         raise GhptDataError(path, "", f"is not a readable reconstruction ({error})", _MEND) from error
     version = meta.get("format_version") if isinstance(meta, dict) else None
-    if version != FORMAT_VERSION or meta.get("format") != "ghpt reconstruction":
-        raise GhptDataError(path, "meta.format_version", f"is {version!r}; this ghpt reads {FORMAT_VERSION}", _MEND)
+    readable = type(version) is int and version in _POINTS
+    if not readable or meta.get("format") != "ghpt reconstruction":
+        known = " and ".join(map(str, _POINTS))
+        problem = f"is {version!r}; this ghpt reads {known}"
+        raise GhptDataError(path, "meta.format_version", problem, _MEND)
     forms = {"name": str, "source": str, "estimator": str, "rate_hz": (float, int, type(None)), "smoothed": bool,
              "provenance": dict}  # fmt: skip
     for field, form in forms.items():
@@ -127,4 +151,5 @@ def _read(path: Path, members: dict[str, Member], start: int, stop: int) -> Reco
         raise GhptDataError(path, "points", "a joint that is not missing has no position", _MEND)
     for name in ("points", "error", "covariance"):
         rows[name] = rows[name].nan_to_num(0.0, 0.0, 0.0)
+    rows["points"] = rows["points"].double()
     return Reconstruction(**rows)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,8 @@ import numpy as np
 import torch
 
 from ghpt.errors import GhptConfigError
-from ghpt.export.scene import Evidence, Scene, bones_of, side_of, title
-from ghpt.export.stream import Chunks, extent, part
+from ghpt.export.scene import Evidence, Scene, bones_of, origin_note, side_of, title
+from ghpt.export.stream import Chunks, extent, part, points_of_origin
 from ghpt.files import atomic_write
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.reconstruction import About, Reconstruction, State
@@ -27,26 +28,33 @@ _GREY = 0x99999966
 def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = None) -> None:
     """Timelines ``frame`` and, with a known rate, ``time``; mm. Missing joints are absent, filled ones pale.
 
-    ``scene`` adds cameras and rays, and with evidence key points, reprojections and hypotheses. Raises GhptConfigError
-    without the package.
+    ``scene`` adds cameras and rays, and with evidence key points, reprojections and hypotheses. The viewer has
+    float32, so all is relative to ``about.origin``, which the recording's name tells.
+
+    Raises GhptConfigError without the package.
     """
     try:
         import rerun as rr
     except ImportError as error:
         raise GhptConfigError("rerun", "needs rerun-sdk", "pip install 'ghpt[viz]', or leave rerun out") from error
     extent(path, about, chunks)
+    if scene is not None:
+        origin = torch.tensor(about.origin, dtype=torch.float64)
+        scene = replace(scene, cameras=scene.cameras.relative_to(origin))
     evidence = scene.evidence() if scene is not None and scene.evidence is not None else repeat(None)
     with atomic_write(path) as handle:
         recording = rr.RecordingStream("ghpt")
         recording.save(handle.name)
-        recording.send_recording_name(title(about))
+        recording.send_recording_name(" · ".join(filter(None, (title(about), origin_note(about)))))
         if scene is not None:
             _log_cameras(rr, recording, about, scene.cameras)
         for chunk, made_of in zip(chunks(), evidence, strict=False):
             for start in range(0, len(chunk), _PIECE):
                 stop = start + _PIECE
                 there = None if made_of is None else Evidence(*(None if x is None else x[start:stop] for x in made_of))
-                _Piece(rr, recording, about, part(chunk, start, stop)).log(scene, there)
+                piece = part(chunk, start, stop)
+                near = replace(piece, points=points_of_origin(about, piece))
+                _Piece(rr, recording, about, near).log(scene, there)
         recording.flush()
         recording.disconnect()
 
@@ -90,6 +98,7 @@ class _Piece:
             self._views(scene.cameras, evidence)
         if evidence is not None and evidence.hypotheses is not None:
             pool = evidence.hypotheses.flatten(1, 2)
+            pool = pool.double() - torch.tensor(self.about.origin, dtype=torch.float64)
             self._points(rr.Points3D, "world/hypotheses", pool, pool.isfinite().all(-1), pool[..., 0] * 0 + _GREY, 4.0)
 
     def _views(self, cameras: Cameras, evidence: Evidence | None) -> None:

@@ -40,6 +40,12 @@ def title(about: About) -> str:
     return f"{about.name}: 3D poses from {'embedded (synthetic) data' if about.source == 'embedded' else about.source}"
 
 
+def origin_note(about: About) -> str:
+    """Where a picture's zero is, in words; nothing where it is the world's own."""
+    place = ", ".join(f"{x:.15g}" for x in about.origin)
+    return f"zero is at ({place}) mm of the cameras' world" if any(about.origin) else ""
+
+
 def bones_of(joints: tuple[str, ...]) -> list[tuple[int, int]]:
     """The skeleton's bones whose ends are among these joints."""
     named = ((JOINTS[a], JOINTS[b]) for a, b in BONES)

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.reconstruction import About, Reconstruction, State
@@ -126,6 +128,12 @@ def plain_names(path: Path, field: str, names: tuple[str, ...]) -> list[str]:
         twice = next(name for name in found if found.count(name) > 1)
         raise GhptDataError(path, field, f"{twice!r} is the name of two", "Give each a name of its own")
     return found
+
+
+def points_of_origin(about: About, piece: Reconstruction) -> Float[Tensor, "T J 3"]:
+    """Positions in a world whose zero is ``about.origin``, float64: small enough for float32."""
+    points = piece.points.double()
+    return points - points.new_tensor(about.origin)
 
 
 def text_rows(cells: np.ndarray, numbers: np.ndarray, separator: str, ending: str) -> str:

@@ -14,7 +14,7 @@ from ghpt.reconstruction import About
 
 _KEYS = "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames"
 _UNITS = {"mm": (1.0, "%.5f"), "m": (1e-3, "%.8f")}
-"""Factor from mm, and decimals far below a float32's."""
+"""Factor from mm, and decimals: 10 nm, at any distance from the world's zero."""
 _TO_Y_UP = {
     "x": ((1, -1), (0, 1), (2, 1)), "y": ((0, 1), (1, 1), (2, 1)), "z": ((0, 1), (2, 1), (1, -1)),
     "-x": ((1, 1), (0, -1), (2, 1)), "-y": ((0, 1), (1, -1), (2, -1)), "-z": ((0, 1), (2, -1), (1, 1)),

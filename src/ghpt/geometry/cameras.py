@@ -26,6 +26,12 @@ class Cameras:
         """Camera centres in the world, ``-R^T t``."""
         return -(self.R.mT @ self.t[..., None])[..., 0]
 
+    def relative_to(self, origin: Float[Tensor, " 3"]) -> Cameras:
+        """The same cameras in a world whose zero is ``origin`` (mm) of theirs; float64."""
+        double = self.to(torch.float64)
+        shift = double.R @ origin.to(double.R)[:, None]
+        return Cameras(double.K, double.R, double.t + shift[..., 0])
+
     def index(self, item: Any) -> Cameras:
         """Index the leading dimensions."""
         return Cameras(self.K[item], self.R[item], self.t[item])

@@ -141,7 +141,7 @@ def _reconstruction(
     swapped: Bool[Tensor, "B V"],
 ) -> Reconstruction:
     placed = state == State.OBSERVED
-    points = torch.where(placed[..., None], points, 0.0).float()
+    points = torch.where(placed[..., None], points, 0.0).double()
     error, covariance = found.error.float(), found.covariance.float()
     fields = (batch.sample, points, state, error, views, covariance, score.float(), swapped)
     return Reconstruction(*(x.cpu() for x in fields))

@@ -5,21 +5,33 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.views import Views
 from ghpt.errors import GhptDataError
 from ghpt.export import Evidence
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.normal_equations import local_cameras
 from ghpt.prediction.shards import Shards
+from ghpt.reconstruction import Reconstruction
 from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import JOINTS
 
+_NEAR = 1e5
+"""Distance (mm, along an axis) from the world's zero up to which a rig stays where it is.
+
+float32, in which hypotheses are scored and estimators compared, has steps of 0.008 mm there; farther
+away they pass 0.01 mm, and reach half a metre in national grids (5,000 km). Nearer rigs are left alone
+because their scores would change in the last digit, for nothing."""
+_WHOLE = 1000.0
+"""The origin of a rig farther away has whole metres, so that people can read it and add it."""
 _STAMPED = 4096
 """Frames that are read at a time for the stamp."""
 _MEND = "Calibrate first (python calibrate.py keypoints=... cameras=...), and give the rig.toml that it writes."
@@ -47,10 +59,26 @@ class Frames:
     def __len__(self) -> int:
         return len(self.frame)
 
+    @cached_property
+    def origin(self) -> Float[Tensor, " 3"]:
+        """The zero of the batches' world, mm in the cameras' world, float64: (0, 0, 0), or near the
+        rig's centre if that is far away."""
+        _, centre = local_cameras(self.cameras)
+        if float(centre.abs().max()) <= _NEAR:
+            return torch.zeros_like(centre)
+        return (centre / _WHOLE).round() * _WHOLE + 0.0  # no -0
+
+    def to_world(self, part: Reconstruction) -> Reconstruction:
+        """What was reconstructed of a batch, in the cameras' world."""
+        return replace(part, points=part.points.double() + self.origin)
+
     def batch(self, rows: Int[np.ndarray, " N"]) -> KeyPointBatch:
-        """Some rows; a frame's ``sample`` is its own number, so its random draws are the same in any batch."""
+        """Some rows, before cameras in a world whose zero is ``origin``.
+
+        A frame's ``sample`` is its own number, so its random draws are the same in any batch.
+        """
         key_points, confidence, seen = (torch.from_numpy(values) for values in self.read(rows))
-        count, rig = len(rows), self.cameras
+        count, rig = len(rows), self.cameras.relative_to(self.origin)
         return KeyPointBatch(
             sample=torch.from_numpy(self.frame[rows]), recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tempfile
 from collections.abc import Callable, Iterator
@@ -16,6 +17,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.signal import butter, sosfiltfilt
 
 from ghpt.errors import GhptConfigError, check
+from ghpt.files import allocate
 from ghpt.prediction.shards import Shards
 from ghpt.reconstruction import Reconstruction, State
 
@@ -43,8 +45,7 @@ class Gaps:
         check(self.interpolation in known, "interpolation", f"is {self.interpolation!r}", f"Existing: {known}.")
         if self.cut_off_hz is None:
             return
-        rate = self.rate_hz or np.nan
-        check(rate > 0, "smooth", "needs the frame rate, which the files do not tell", "Give rate_hz=60, say.")
+        rate = _known("smooth", self.rate_hz, "Give rate_hz=60, say.")
         mend = f"Give more than 0 and less than half the frame rate of {rate:g} Hz."
         check(0 < self.cut_off_hz < rate / 2, "smooth", f"is {self.cut_off_hz:g} Hz", mend)
 
@@ -70,8 +71,6 @@ class Gaps:
         after = np.searchsorted(known, np.arange(len(frame)))
         inside = (state != State.OBSERVED) & (after > 0) & (after < len(known))
         rows = np.flatnonzero(inside)
-        if not len(rows):
-            return points, state
         left, right = known[after[rows] - 1], known[after[rows]]
         rows = rows[frame[right] - frame[left] <= (self.longest + 1) * step]
         x, y = frame[known].astype(np.float64), points[known].astype(np.float64)
@@ -102,16 +101,22 @@ def gap_frames(fill: int | str | None, rate_hz: float | None) -> int | None:
     seconds = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?s", str(fill))
     if seconds is None:
         raise GhptConfigError("fill", f"is {fill!r}", mend)
-    check(bool(rate_hz and rate_hz > 0), "fill", "needs the frame rate, which the files do not tell",
-          "Give rate_hz=60, say, or frames: fill=6.")  # fmt: skip
-    frames = int(float(seconds[1]) * float(rate_hz or 0) + 1e-9)
-    check(frames >= 1, "fill", f"is less than a frame at {rate_hz:g} Hz", mend)
+    rate = _known("fill", rate_hz, "Give rate_hz=60, say, or frames: fill=6.")
+    frames = int(float(seconds[1]) * rate + 1e-9)
+    check(frames >= 1, "fill", f"is less than a frame at {rate:g} Hz", mend)
     return frames
+
+
+def _known(key: str, rate_hz: float | None, mend: str) -> float:
+    """The frame rate. Raises GhptConfigError for ``key`` unless it is one."""
+    rate = rate_hz or math.nan
+    check(0 < rate < math.inf, key, "needs the frame rate, which the files do not tell", mend)
+    return rate
 
 
 def frame_step(frame: Int[np.ndarray, " T"]) -> int:
     """How far the numbers of successive frames are apart: the median."""
-    return max(int(np.median(np.diff(frame))), 1) if len(frame) > 1 else 1
+    return int(np.median(np.diff(frame))) if len(frame) > 1 else 1
 
 
 def runs(frame: Int[np.ndarray, " T"], placed: Bool[np.ndarray, " T"], step: int) -> list[Int[np.ndarray, " N"]]:
@@ -123,8 +128,17 @@ def runs(frame: Int[np.ndarray, " T"], placed: Bool[np.ndarray, " T"], step: int
 
 def _interpolated(x: np.ndarray, y: np.ndarray, at: np.ndarray, kind: str) -> np.ndarray:
     if kind == "pchip":
-        return PchipInterpolator(x, y, axis=0, extrapolate=False)(at)
+        return PchipInterpolator(x, y, axis=0)(at)
     return np.stack([np.interp(at, x, y[:, i]) for i in range(3)], axis=-1)
+
+
+@contextmanager
+def _scratch(folder: Path, dtype: str, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
+    """An array of zeros in a nameless file of ``folder``. Raises OSError if the disk lacks the space."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    with tempfile.TemporaryFile(dir=folder) as handle:
+        allocate(handle, size, folder)
+        yield np.memmap(handle, dtype, "r+", shape=shape)
 
 
 @contextmanager
@@ -132,15 +146,14 @@ def after(gaps: Gaps, shards: Shards, joints: int, folder: Path) -> Iterator[Chu
     """The shards as they are to be written: as they are, or filled and smoothed.
 
     Joint by joint, each over all frames, so that no border between chunks shows: memory holds one joint's path, the
-    others are in a nameless temporary file in ``folder``.
+    others are in a nameless temporary file in ``folder``. Raises OSError if the disk lacks the space for it.
     """
     if gaps.nothing:
         yield shards.chunks
         return
     frames = shards.frames
-    with tempfile.TemporaryFile(dir=folder) as one, tempfile.TemporaryFile(dir=folder) as other:
-        points = np.memmap(one, "<f4", "w+", shape=(joints, frames, 3))
-        state = np.memmap(other, "|i1", "w+", shape=(joints, frames))
+    paths, states = (joints, frames, 3), (joints, frames)
+    with _scratch(folder, "<f8", paths) as points, _scratch(folder, "|i1", states) as state:
         frame = np.zeros(frames, np.int64)
         for shard, part in enumerate(shards.chunks()):
             rows = slice(shards.rows(shard).start, shards.rows(shard).stop)

@@ -53,7 +53,7 @@ class ShardPrediction(L.LightningModule):
         parts = []
         for start in range(0, len(rows), self.size):
             batch = self.frames.batch(rows[start : start + self.size]).to(self.device)
-            parts.append(to_cpu(self.predictor(batch)))
+            parts.append(self.frames.to_world(to_cpu(self.predictor(batch))))
             self.tick(len(batch))
         self.shards.write(int(shard), joined(parts))
         return int(shard)

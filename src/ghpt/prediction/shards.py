@@ -23,10 +23,10 @@ from ghpt.files import acquire, atomic_write, sweep_temporaries
 from ghpt.reconstruction import Reconstruction
 from ghpt.report.stored_npz import add_member, members_of, read_rows
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 MANIFEST = "manifest.jsonl"
 _DTYPES = {
-    "frame": "<i8", "points": "<f4", "state": "|i1", "error": "<f4", "views": "|b1", "covariance": "<f4",
+    "frame": "<i8", "points": "<f8", "state": "|i1", "error": "<f4", "views": "|b1", "covariance": "<f4",
     "score": "<f4", "swapped": "|b1",
 }  # fmt: skip
 _MEND = "Run the prediction again: what is damaged is made anew"
@@ -134,7 +134,7 @@ class Shards:
         if not entries or entries[0] != self._header:
             _log.info("%s is of other key points, cameras or settings: starting anew.", self.folder)
             return {}
-        return {e["shard"]: e for e in entries[1:] if type(e.get("shard")) is int and 0 <= e["shard"] < len(self)}
+        return {e["shard"]: e for e in entries if type(e.get("shard")) is int and 0 <= e["shard"] < len(self)}
 
     def _vouched(self, shard: int, entry: dict[str, Any]) -> bool:
         path = self.path(shard)
@@ -155,7 +155,7 @@ class Shards:
 
 
 def _line(entry: dict[str, Any]) -> bytes:
-    return json.dumps(entry, sort_keys=True).encode() + b"\n"
+    return json.dumps(entry).encode() + b"\n"
 
 
 def _parsed(line: bytes) -> Any:

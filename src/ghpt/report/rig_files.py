@@ -74,7 +74,7 @@ def write_poses(
     numbers: dict[str, Any],
 ) -> None:  # fmt: skip
     """The recording's 3D joints: mm, NaN where not estimated."""
-    values = torch.where(estimated[..., None], points, torch.nan).float().numpy()
+    values = torch.where(estimated[..., None], points, torch.nan).double().numpy()
     meta = {key: numbers[key] for key in ("data", "source", "scale", "world", "triangulation", "usable", "provenance")}
     with atomic_write(path) as handle:
         np.savez_compressed(

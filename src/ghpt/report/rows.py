@@ -15,7 +15,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from ghpt.errors import GhptDataError, GhptError
-from ghpt.files import atomic_write
+from ghpt.files import allocate, atomic_write
 from ghpt.report.stored_npz import Member, add_member, members_of, text_table
 
 FORMAT_VERSION = 1
@@ -41,8 +41,10 @@ class RowWriter:
         self.layout = layout | {f"weights_{summary}": ("<f4", ()) for summary in WEIGHTS}
         self.folder.mkdir(parents=True, exist_ok=True)
         for name, (dtype, shape) in (self.layout | {"written": ("|b1", ())}).items():
-            with open(self.folder / name, "ab") as handle:  # a second process finds it at its full size
-                handle.truncate(count * np.dtype(dtype).itemsize * int(np.prod(shape)))
+            size = count * np.dtype(dtype).itemsize * int(np.prod(shape))
+            with open(self.folder / name, "ab") as handle:
+                # Appending: a second process finds it at its full size and changes nothing.
+                allocate(handle, size, self.folder / name)
 
     def check(self, estimates: Mapping[str, Any], weights: Mapping[str, Any]) -> None:
         """Raise GhptError unless each name has its estimate and each summary its values."""
