@@ -35,15 +35,23 @@ def _sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def atomic_write(path: str | Path, mode: str = "wb", verify: Callable[[Path], Any] | None = None) -> Iterator[IO[Any]]:
+def atomic_write(
+    path: str | Path,
+    mode: str = "wb",
+    verify: Callable[[Path], Any] | None = None,
+    previous: Path | None = None,
+) -> Iterator[IO[Any]]:
     """Yield a file open for writing that takes ``path``'s place when the block ends without an error.
 
     ``verify`` gets the finished temporary file and raises if it is not right. On any failure (the block's,
     the disk's, the check's) the temporary file is removed, ``path`` is untouched and the error is passed on.
+    ``previous``: what stood at ``path`` is kept under this name, in the same folder. A kill at any instant
+    leaves two files, both whole and not the same.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _temporary(path)
+    second = _temporary(path)
     try:
         with open(temporary, mode, **({} if "b" in mode else {"encoding": "utf-8", "newline": "\n"})) as handle:
             yield handle
@@ -51,14 +59,29 @@ def atomic_write(path: str | Path, mode: str = "wb", verify: Callable[[Path], An
             os.fsync(handle.fileno())
         if verify is not None:
             verify(temporary)
+        if previous is not None and path.exists():
+            _second_name(path, second)
         os.replace(temporary, path)
+        if second.exists():
+            os.replace(second, previous)
     except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
+        for leftover in (temporary, second):
+            with suppress(OSError):
+                leftover.unlink()
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             error.filename = str(path)
         raise
     _sync_folder(path.parent)
+
+
+def _second_name(path: Path, second: Path) -> None:
+    """Give a file a second name; where the file system has no hard links, to a copy of it."""
+    try:
+        os.link(path, second)
+    except OSError:
+        shutil.copyfile(path, second)
+        with open(second, "rb+") as handle:
+            os.fsync(handle.fileno())
 
 
 @contextmanager

@@ -3,7 +3,7 @@
 import logging
 import shutil
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, NotRequired, TypedDict
 
 from ghpt.config import build, check_type
 from ghpt.errors import GhptCheckpointError
@@ -27,6 +27,7 @@ class Settings(TypedDict):
     """What `test` needs of the configuration, whatever the problem; see also ``Report.settings``."""
 
     ckpt: str | None
+    trust: NotRequired[list[str]]
     hypotheses: int | None
     data: dict[str, Any]
     trainer: dict[str, Any]
@@ -60,7 +61,7 @@ def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str
     if not config["ckpt"]:
         raise GhptCheckpointError("ckpt", "is missing", "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m")
     changes = {"hypotheses": config["hypotheses"], "seed": config["seed"], "problem.frames": config.get("frames")}
-    model, trained = load_model(config["ckpt"], **changes)
+    model, trained = load_model(config["ckpt"], config.get("trust") or (), **changes)
     report = REPORTS.get(type(model.problem))
     if report is None:
         raise GhptCheckpointError(config["ckpt"], f"is of a {type(model.problem).__name__}", "It has no report.")

@@ -20,6 +20,9 @@ from ghpt.models.selection import SELECTIONS, limit_spread, selection_weights, s
 STATISTICS_HYPOTHESES = 16
 """Hypotheses of each training sample that the feature statistics are taken from: enough for a mean and deviation."""
 
+MOST_HYPOTHESES = 100_000
+"""In a pool: of more, the poses of one batch alone are gigabytes."""
+
 
 @dataclass(frozen=True)
 class Pool:
@@ -54,7 +57,12 @@ class StochasticEstimator(L.LightningModule):
         seed: int,
     ) -> None:
         super().__init__()
-        check(hypotheses >= 1, "model.hypotheses", f"is {hypotheses}", "Draw at least 1 (the paper: 200).")
+        check(
+            1 <= hypotheses <= MOST_HYPOTHESES,
+            "model.hypotheses",
+            f"is {hypotheses}",
+            f"Draw at least 1 and at most {MOST_HYPOTHESES} (the paper: 200).",
+        )
         check(temperature > 0, "model.temperature", f"is {temperature}", "It must be > 0 (the paper: 1.5).")
         check(spread is None or spread > 0, "model.spread", f"is {spread}", "It must be > 0, or null for no limit.")
         check(
