@@ -26,7 +26,7 @@ from ghpt.models.checkpoint import (
     check_fit,
     read_checkpoint,
 )
-from ghpt.models.registry import packages_to_trust
+from ghpt.models.registry import check_registered, packages_to_trust
 from ghpt.provenance import provenance
 from ghpt.report.logger import ForgivingTensorBoard
 from ghpt.report.tables import words
@@ -70,6 +70,7 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
     data = build(config["data"], "data")
     model = build(config["model"], "model")
     _check_optimizer(model)
+    _warn_of_classes(config["model"])
     data.serve(model.problem)
     identity = {
         "format_version": FORMAT_VERSION,
@@ -164,6 +165,14 @@ def _check_optimizer(model: Any) -> None:
         model.configure_optimizers()
     except (TypeError, ValueError) as error:
         raise GhptConfigError("model.optimizer", str(error), "Change this setting.") from error
+
+
+def _warn_of_classes(model: dict[str, Any]) -> None:
+    """Say before the training, not after it, that its checkpoint will not be taken."""
+    try:
+        check_registered(model)
+    except GhptConfigError as error:
+        _log.warning("test.py and predict.py will not take this model: %s", error)
 
 
 def resumable(output: Path, config: dict[str, Any], model: Any) -> tuple[Path, str]:

@@ -7,12 +7,12 @@ from typing import Any
 import lightning as L
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from ghpt import randomness
 from ghpt.errors import GhptError, check
-from ghpt.models.loss import LossTerms, StochasticLoss, mean_over_all
+from ghpt.models.loss import LossTerms, mean_over_all
 from ghpt.models.problem import Problem
 from ghpt.models.scorer import Scorer
 from ghpt.models.selection import SELECTIONS, limit_spread, selection_weights, softmax_weights
@@ -38,7 +38,7 @@ class Pool:
 class StochasticEstimator(L.LightningModule):
     """Hypothesis generator, scorer and loss (paper, section 3), for any ``Problem``.
 
-    ``spread`` limits how much a pool's logits differ (``limit_spread``). ``selection``: the hypothesis of the
+    ``loss`` gives LossTerms, as ``StochasticLoss`` does. ``spread`` limits how much a pool's logits differ (``limit_spread``). ``selection``: the hypothesis of the
     estimation loss, ``weight`` or ``stochastic`` (straight through).
     All randomness is a function of (seed, optimiser step, sample): see ``ghpt.randomness``.
     """
@@ -47,7 +47,7 @@ class StochasticEstimator(L.LightningModule):
         self,
         problem: Problem,
         scorer: Callable[[int], Scorer],
-        loss: StochasticLoss,
+        loss: nn.Module,
         optimizer: Callable[..., torch.optim.Optimizer],
         hypotheses: int,
         temperature: float,

@@ -91,9 +91,13 @@ def build_registered(config: Any, trust: Sequence[str] = ()) -> Any:
             f"needs classes of {', '.join(untrusted)}, which are not ghpt's",
             f"To let it run that code, which can do anything, add to the command: 'trust=[{words}]'.",
         )
-    nodes = _nodes(config, "model")
-    found = {node["_target_"]: _class(node, path, inside, trust) for path, node, inside in nodes}
+    found = _classes(config, trust)
     return build(config, "model", lambda node, path: found[node["_target_"]])
+
+
+def check_registered(config: Mapping[str, Any]) -> None:
+    """Raise GhptConfigError if a checkpoint with this configuration could not be built, whatever the user trusts."""
+    _classes(config, packages_to_trust(config))
 
 
 def check_trust(trust: Sequence[str]) -> None:
@@ -121,6 +125,12 @@ def _nodes(config: Any, path: str, inside: bool = False) -> Iterator[tuple[str, 
     elif isinstance(config, list | tuple):
         for number, value in enumerate(config):
             yield from _nodes(value, f"{path}[{number}]", inside)
+
+
+def _classes(config: Mapping[str, Any], trust: Sequence[str]) -> dict[str, type]:
+    """The class of every name in a model's configuration."""
+    nodes = _nodes(config, "model")
+    return {node["_target_"]: _class(node, path, inside, trust) for path, node, inside in nodes}
 
 
 def _is_users(target: Any) -> bool:
