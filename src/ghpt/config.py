@@ -1,8 +1,8 @@
 """From plain configuration to objects: ``_target_`` names a class, the other keys are its arguments.
 
 Hydra composes the yaml; this builds it, because a checkpoint carries its configuration too, and what comes out of
-a file must not be able to name arbitrary callables or read the environment through interpolations. What a checkpoint
-may name is in ``ghpt.models.registry``.
+a file must not be able to name arbitrary callables or read the environment through interpolations.
+What a checkpoint may name is in ``ghpt.models.registry``.
 """
 
 import difflib
@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from ghpt.errors import GhptConfigError
 
 Find = Callable[[Mapping[str, Any], str], Callable[..., Any]]
-"""What a node with ``_target_`` is built with; the second argument is the key that the node stands under."""
+"""Gives what a node with ``_target_`` is built with, of the node and the key it stands under."""
 _DEPTH = 32
 """Of the groups in a configuration from a file."""
 _NODES = 100_000
@@ -39,7 +39,7 @@ def suggest(word: str, existing: Iterable[object]) -> str:
 
 
 def locate(node: Mapping[str, Any], path: str) -> Callable[..., Any]:
-    """Import what ``node["_target_"]`` names: for configurations that the user typed, never for one from a file.
+    """Import what ``node["_target_"]`` names: for what the user typed, never for what a file holds.
 
     Raises GhptConfigError if there is no such callable.
     """
@@ -56,7 +56,8 @@ def locate(node: Mapping[str, Any], path: str) -> Callable[..., Any]:
     except (StopIteration, AttributeError):
         found = None
     if not callable(found):
-        raise GhptConfigError(f"{path}._target_", f"no class {target!r}", "Check the spelling of the full name.")
+        mend = "Check the spelling of the full name."
+        raise GhptConfigError(f"{path}._target_", f"no class {target!r}", mend)
     return found
 
 

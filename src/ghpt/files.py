@@ -45,8 +45,8 @@ def atomic_write(
 
     ``verify`` gets the finished temporary file and raises if it is not right. On any failure (the block's,
     the disk's, the check's) the temporary file is removed, ``path`` is untouched and the error is passed on.
-    ``previous``: what stood at ``path`` is kept under this name, in the same folder. A kill at any instant
-    leaves two files, both whole and not the same.
+    ``previous``: what stood at ``path`` is kept under this name, in the same folder. A kill at any
+    instant leaves two files, both whole and not the same.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,10 +59,11 @@ def atomic_write(
             os.fsync(handle.fileno())
         if verify is not None:
             verify(temporary)
-        if previous is not None and path.exists():
+        keep = previous is not None and path.exists()
+        if keep:
             _second_name(path, second)
         os.replace(temporary, path)
-        if second.exists():
+        if keep:
             os.replace(second, previous)
     except BaseException as error:
         for leftover in (temporary, second):

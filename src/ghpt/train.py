@@ -60,9 +60,9 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
     """Train ``config["model"]`` on ``config["data"]``; returns the validation errors (mm).
 
     Writes ``last.ckpt``, ``previous.ckpt``, ``best.ckpt`` and TensorBoard events into ``output``.
-    With ``resume`` it goes on from ``last.ckpt`` there, or from ``previous.ckpt`` if that is damaged,
-    to the same numbers as an uninterrupted run. Exits with 130 on SIGINT, and with 143 on SIGTERM and
-    SIGHUP.
+    With ``resume`` it goes on from ``last.ckpt`` there, or from ``previous.ckpt`` if that is
+    damaged, to the same numbers as an uninterrupted run. Exits with 130 on SIGINT, and with 143 on
+    SIGTERM and SIGHUP.
     """
     check_type(config, Settings, "")
     torch.set_float32_matmul_precision("high")
@@ -176,7 +176,7 @@ def _warn_of_classes(model: dict[str, Any]) -> None:
 
 
 def resumable(output: Path, config: dict[str, Any], model: Any) -> tuple[Path, str]:
-    """The checkpoint in ``output`` that a training goes on from, and a warning if it is not the last.
+    """The checkpoint in ``output`` to go on from, and a warning if it is not the last.
 
     Raises GhptCheckpointError if neither the last nor the previous one can be used, and if the one
     that can was made with other settings.
@@ -207,7 +207,7 @@ class OtherSettings(GhptCheckpointError):
 
 
 def _check_resumable(path: Path, config: dict[str, Any], model: Any) -> int:
-    """Raise GhptCheckpointError unless this training can go on from it; the training step that it holds."""
+    """A checkpoint's training step. Raises GhptCheckpointError if it cannot be gone on from."""
     checkpoint = read_checkpoint(path)
     saved = checkpoint[FIELD].get("config")
     mend = "Give one that train.py wrote."
@@ -215,9 +215,11 @@ def _check_resumable(path: Path, config: dict[str, Any], model: Any) -> int:
         raise GhptCheckpointError(path, "does not say what it is of", mend)
     for part in ("model", "data", "seed"):
         if part not in saved or saved[part] != config[part]:
-            raise OtherSettings(path, f"was made with other settings of {part!r}", "Resume with the same ones.")
+            problem = f"was made with other settings of {part!r}"
+            raise OtherSettings(path, problem, "Resume with the same ones.")
     for name, kind in _STATE.items():
-        if type(checkpoint.get(name)) is not kind or (name == "optimizer_states" and not checkpoint[name]):
+        state = checkpoint.get(name)
+        if type(state) is not kind or (name == "optimizer_states" and not state):
             raise GhptCheckpointError(path, f"holds no state of a training ({name})", mend)
     try:
         check_fit(model, checkpoint["state_dict"])
@@ -235,7 +237,13 @@ def _flat(config: Any, above: str) -> dict[str, Any]:
     }
 
 
-def _say_finished(last: Path, data: Any, model: dict[str, Any], measures: str, errors: dict[str, float]) -> None:
+def _say_finished(
+    last: Path,
+    data: Any,
+    model: dict[str, Any],
+    measures: str,
+    errors: dict[str, float],
+) -> None:
     _log.info("Validation on %s, %s:", words(data.name, data.source), measures)
     _log.info("  %s", summary(errors))
     _log.info("Checkpoint: %s", shown(last))

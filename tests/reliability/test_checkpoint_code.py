@@ -365,6 +365,25 @@ def test_a_deep_configuration_is_refused(tmp_path: Path, model: bytes) -> None:
         load_model(path)
 
 
+def test_no_memory_is_taken_for_weights_that_are_not_there(
+    tmp_path: Path, trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The layers that a checkpoint speaks of, beside those that it holds."""
+    devices: list[str] = []
+    fill = torch.nn.Linear.reset_parameters
+
+    def filled(layer: torch.nn.Linear) -> None:
+        devices.append(layer.weight.device.type)
+        fill(layer)
+
+    monkeypatch.setattr(torch.nn.Linear, "reset_parameters", filled)
+    path = tmp_path / "evil.ckpt"
+    save_with(trained, path, scorer=SCORER | {"layers": [33, 16]})
+    with pytest.raises(GhptCheckpointError, match="does not fit its own model"):
+        load_model(path)
+    assert devices == ["meta"] * 3
+
+
 def test_a_good_one_loads(trained: Path) -> None:
     model, ours = load_model(trained, hypotheses=5)
     assert model.hypotheses == 5

@@ -23,14 +23,20 @@ class SaveLast(Callback):
     What it held before is ``previous.ckpt``, so that there is a way back if the disk damages it.
     ``resumed``: ``last.ckpt`` is there and whole, because this run goes on from it. (Otherwise what
     stands there is damaged or of another run, and does not become the previous one.)
-    SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal is closed) take effect after the running step, so
-    that what is saved is whole, and in all processes at the same one; a second signal takes effect at
-    once. (Lightning's own handler of SIGTERM has the processes wait for each other where they are,
-    which with two or more is for ever.)
+    SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal is closed) take effect after the running step,
+    so that what is saved is whole, and in all processes at the same one; a second signal takes
+    effect at once. (Lightning's own handler of SIGTERM has the processes wait for each other where
+    they are, which with two or more is for ever.)
     ``identity`` is what every checkpoint says of itself.
     """
 
-    def __init__(self, path: Path, every: int, identity: dict[str, Any], resumed: bool = False) -> None:
+    def __init__(
+        self,
+        path: Path,
+        every: int,
+        identity: dict[str, Any],
+        resumed: bool = False,
+    ) -> None:
         check(every >= 1, "save_every", f"is {every}", "It must be >= 1 step.")
         self.path, self.every, self.identity = path, every, identity
         self.resumed = resumed
@@ -45,7 +51,8 @@ class SaveLast(Callback):
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         numbers = [signal.SIGINT, signal.SIGTERM]
-        if _HANG_UP is not None and signal.getsignal(_HANG_UP) != signal.SIG_IGN:  # nohup ignores it
+        # Under nohup that signal is ignored already, and stays so.
+        if _HANG_UP is not None and signal.getsignal(_HANG_UP) != signal.SIG_IGN:
             numbers.append(_HANG_UP)
         for number in numbers:
             with suppress(ValueError):  # not in the main thread: then nobody sends us signals either

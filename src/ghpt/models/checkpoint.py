@@ -1,7 +1,8 @@
 """Checkpoints: written whole or not at all, read without running code, and refused with a reason.
 
-A checkpoint is a zip file as ``torch.save`` writes it, and its SHA-256 is the zip's comment, at the very end. So
-``torch.load`` reads it as any other, while here nothing is unpickled before the digest has been compared.
+A checkpoint is a zip file as ``torch.save`` writes it, and its SHA-256 is the zip's comment, at the
+very end. So ``torch.load`` reads it as any other, while here nothing is unpickled before the digest
+has been compared.
 """
 
 import hashlib
@@ -29,8 +30,10 @@ PREVIOUS = "previous.ckpt"
 _TITLE = b"ghpt sha256 "
 _TRAILER = len(_TITLE) + 2 * hashlib.sha256().digest_size
 _END = b"PK\x05\x06"
-"""With it begin the last 22 bytes of a zip file without a comment; the last two are the comment's length."""
 _END_SIZE = 22
+"""The last bytes of a zip file without a comment: they begin with ``_END``, and end with two bytes
+that are the length of the comment."""
+_OURS = "Give one that train.py wrote."
 _MEND = "It is damaged or not a ghpt checkpoint; use another one."
 
 
@@ -58,7 +61,7 @@ class AtomicCheckpointIO(CheckpointIO):
 
 
 def _sign(content: io.BytesIO) -> None:
-    """Append the digest of all that is before it, as the comment of the zip file that ``content`` is."""
+    """Append the digest of what is before, as the comment of the zip file that ``content`` is."""
     view = content.getbuffer()
     if view[-_END_SIZE : 4 - _END_SIZE] != _END or view[-2:] != bytes(2):
         raise RuntimeError("torch.save has written no zip file without a comment")
@@ -70,7 +73,10 @@ def _sign(content: io.BytesIO) -> None:
 
 
 def _check_digest(path: Path, handle: IO[bytes]) -> None:
-    """Raise GhptCheckpointError unless the file ends in the digest of what is before; leaves it at its begin."""
+    """Raise GhptCheckpointError unless a file ends in the digest of what is before.
+
+    The handle is left at the file's begin.
+    """
     size = handle.seek(0, io.SEEK_END)
     handle.seek(max(size - _TRAILER, 0))
     trailer = handle.read()
@@ -88,7 +94,8 @@ def _check_digest(path: Path, handle: IO[bytes]) -> None:
         digest.update(block)
         left -= len(block)
     if trailer != _TITLE + digest.hexdigest().encode():
-        raise GhptCheckpointError(path, "cannot be read (its content does not have its digest)", _MEND)
+        problem = "cannot be read (its content does not have its digest)"
+        raise GhptCheckpointError(path, problem, _MEND)
     handle.seek(0)
 
 
@@ -99,9 +106,9 @@ def _read(path: Path, map_location: Any = "cpu") -> Any:
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """The checkpoint as a dict. Raises GhptCheckpointError if it is missing, damaged, foreign or of another version.
+    """The checkpoint as a dict, in which ``FIELD`` is plain data and the weights are tensors.
 
-    What is ours in it (``FIELD``) is then plain data, and its weights are tensors with names.
+    Raises GhptCheckpointError if it is missing, damaged, foreign or of another version.
     """
     try:
         if Path(path).is_dir():
@@ -118,15 +125,17 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
         raise GhptCheckpointError(path, f"cannot be read ({_one_line(error)})", _MEND) from None
     ours = checkpoint.get(FIELD) if isinstance(checkpoint, dict) else None
     if not isinstance(ours, dict) or not _are_weights(checkpoint.get("state_dict")):
-        raise GhptCheckpointError(path, "is not a checkpoint of ghpt", "Give one that train.py wrote.")
+        raise GhptCheckpointError(path, "is not a checkpoint of ghpt", _OURS)
     try:
         check_plain(ours, FIELD)
     except GhptConfigError as error:
-        raise GhptCheckpointError(path, f"is not a checkpoint of ghpt ({_one_line(error)})", _MEND) from None
+        problem = f"is not a checkpoint of ghpt ({_one_line(error)})"
+        raise GhptCheckpointError(path, problem, _MEND) from None
     found = ours.get("format_version")
     if type(found) is not int or found != FORMAT_VERSION:
+        problem = f"has format version {str(found)[:20]}; this is {FORMAT_VERSION}"
         mend = "Use the version of ghpt that wrote it, or train again."
-        raise GhptCheckpointError(path, f"has format version {str(found)[:20]}; this is {FORMAT_VERSION}", mend)
+        raise GhptCheckpointError(path, problem, mend)
     return checkpoint
 
 
@@ -136,16 +145,16 @@ def load_model(
     """The model that a checkpoint describes, with its weights, and what the checkpoint says of itself.
 
     ``changes`` replace settings of the model (such as ``hypotheses``, or ``problem.frames``); None
-    leaves one as it is. A checkpoint can only name the classes of ``ghpt.models.registry``, and those
-    of the packages that ``trust`` names. Raises GhptCheckpointError, and GhptConfigError for a
-    change, or a ``trust``, that cannot work.
+    leaves one as it is. A checkpoint can only name the classes of ``ghpt.models.registry``, and
+    those of the packages that ``trust`` names. Raises GhptCheckpointError, and GhptConfigError for
+    a change, or a ``trust``, that cannot work.
     """
     check_trust(trust)
     checkpoint = read_checkpoint(path)
     ours = checkpoint[FIELD]
     weights = checkpoint["state_dict"]
     if not isinstance(ours.get("config"), dict) or not isinstance(ours.get("provenance"), dict):
-        raise GhptCheckpointError(path, "does not say what it is of", "Give one that train.py wrote.")
+        raise GhptCheckpointError(path, "does not say what it is of", _OURS)
     try:
         config = ours["config"]["model"]
         for name, value in changes.items():
@@ -156,7 +165,7 @@ def load_model(
                 check_fit(build_registered(config), weights)
         model = build_registered(config, trust)
         if not isinstance(model, StochasticEstimator):
-            raise GhptCheckpointError(path, f"holds a {type(model).__name__}", "Give one that train.py wrote.")
+            raise GhptCheckpointError(path, f"holds a {type(model).__name__}", _OURS)
         check_fit(model, weights)
         model.load_state_dict(weights, strict=True)
     except GhptCheckpointError:
@@ -167,29 +176,35 @@ def load_model(
         if isinstance(error, GhptConfigError) and error.key.removeprefix("model.") in changes:
             raise
         problem = f"does not fit its own model ({_one_line(error)})"
-        raise GhptCheckpointError(path, problem, "It is of another model or version; train again.") from None
+        mend = "It is of another model or version; train again."
+        raise GhptCheckpointError(path, problem, mend) from None
     return model, ours
 
 
 def check_fit(model: Any, weights: Mapping[str, Tensor]) -> None:
-    """Raise ValueError unless these are the model's weights, in its shapes and types, all finite."""
+    """Raise ValueError unless these are a model's weights, in its shapes and types, all finite."""
     wanted = model.state_dict()
     if wanted.keys() != weights.keys():
         raise ValueError(f"weights {', '.join(sorted(wanted.keys() ^ weights.keys()))}")
     for name, value in weights.items():
-        if value.shape != wanted[name].shape or value.dtype != wanted[name].dtype:
-            shape = tuple(wanted[name].shape)
-            raise ValueError(f"{name} is {value.dtype} {tuple(value.shape)}, not {wanted[name].dtype} {shape}")
+        form = value.dtype, tuple(value.shape)
+        wanted_form = wanted[name].dtype, tuple(wanted[name].shape)
+        if form != wanted_form:
+            raise ValueError(f"{name} is {form}, not {wanted_form}")
         if not torch.isfinite(value).all():
             raise ValueError(f"{name} holds NaN or inf")
 
 
 def _are_weights(values: Any) -> bool:
     """Whether this is a dict of names and plain tensors."""
-    return isinstance(values, dict) and all(
-        isinstance(name, str) and isinstance(value, Tensor) and value.layout == torch.strided and not value.is_meta
-        for name, value in values.items()
-    )
+    if not isinstance(values, dict):
+        return False
+    for name, value in values.items():
+        if not (isinstance(name, str) and isinstance(value, Tensor)):
+            return False
+        if value.layout != torch.strided or value.is_meta:
+            return False
+    return True
 
 
 def _one_line(error: Exception) -> str:

@@ -38,9 +38,10 @@ class Pool:
 class StochasticEstimator(L.LightningModule):
     """Hypothesis generator, scorer and loss (paper, section 3), for any ``Problem``.
 
-    ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like ``StochasticLoss``.
-    ``spread`` limits how much a pool's logits differ (``limit_spread``). ``selection``: the hypothesis of the
-    estimation loss, ``weight`` or ``stochastic`` (straight through).
+    ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like
+    ``StochasticLoss``. ``spread`` limits how much a pool's logits differ (``limit_spread``).
+    ``selection``: the hypothesis of the estimation loss, ``weight`` or ``stochastic`` (straight
+    through).
     All randomness is a function of (seed, optimiser step, sample): see ``ghpt.randomness``.
     """
 

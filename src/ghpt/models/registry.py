@@ -1,8 +1,8 @@
 """What a checkpoint may build: the classes that the parts of a model can have.
 
-What comes out of a file must not choose what is run. A name in a checkpoint is therefore looked up in
-``PARTS`` and never imported. Only where the user names a package on the command line (``trust``) are
-the classes that it defines imported by the names that the checkpoint gives.
+What comes out of a file must not choose what is run. A name in a checkpoint is therefore looked up
+in ``PARTS`` and never imported. Only where the user names a package on the command line (``trust``)
+are the classes that it defines imported by the names that the checkpoint gives.
 """
 
 from __future__ import annotations
@@ -58,7 +58,10 @@ PARTS = {
 
 
 def register(part: str, *classes: type) -> None:
-    """Let a checkpoint build these classes as this part of a model. Their constructors must be harmless."""
+    """Let a checkpoint build these classes as this part of a model.
+
+    Their constructors must do nothing but keep their arguments and make weights.
+    """
     for one in classes:
         PARTS[part].classes[f"{one.__module__}.{one.__qualname__}"] = one
 
@@ -78,8 +81,9 @@ def build_registered(config: Any, trust: Sequence[str] = ()) -> Any:
     """Build a model from the plain configuration that a checkpoint holds.
 
     ``trust``: modules and packages of the user's own whose classes the checkpoint may name too.
-    Every class is looked up before the first is built. Raises GhptConfigError for a class that may
-    not stand where it stands and for what `build` raises it, Untrusted for a package not in ``trust``.
+    Every class is looked up before the first is built. Raises Untrusted for a package not in
+    ``trust``, GhptConfigError for a class that may not stand where it stands and for what `build`
+    raises it.
     """
     if not isinstance(config, Mapping) or "_target_" not in config:
         raise GhptConfigError("model", "names no class", "Give a checkpoint that train.py wrote.")
@@ -89,14 +93,14 @@ def build_registered(config: Any, trust: Sequence[str] = ()) -> Any:
         raise Untrusted(
             "model",
             f"needs classes of {', '.join(untrusted)}, which are not ghpt's",
-            f"To let it run that code, which can do anything, add to the command: 'trust=[{words}]'.",
+            f"To run their code, which can do anything, add to the command: 'trust=[{words}]'.",
         )
     found = _classes(config, trust)
     return build(config, "model", lambda node, path: found[node["_target_"]])
 
 
 def check_registered(config: Mapping[str, Any]) -> None:
-    """Raise GhptConfigError if a checkpoint with this configuration could not be built, whatever the user trusts."""
+    """Raise GhptConfigError if no checkpoint with this configuration can be built."""
     _classes(config, packages_to_trust(config))
 
 
@@ -105,7 +109,8 @@ def check_trust(trust: Sequence[str]) -> None:
     for name in trust:
         if not _NAME.fullmatch(name) or name.split(".")[0] in _NEVER_TRUSTED:
             mend = "Name the module of your classes, as in trust=[mypackage.scorers]."
-            raise GhptConfigError("trust", f"{name!r} is no module of your own", mend)
+            problem = f"{name!r} is no module of your own (Python, ghpt and torch are not)"
+            raise GhptConfigError("trust", problem, mend)
 
 
 def packages_to_trust(config: Mapping[str, Any]) -> list[str]:
@@ -114,8 +119,12 @@ def packages_to_trust(config: Mapping[str, Any]) -> list[str]:
     return sorted({target.rpartition(".")[0] for target in targets if _is_users(target)})
 
 
-def _nodes(config: Any, path: str, inside: bool = False) -> Iterator[tuple[str, Mapping[str, Any], bool]]:
-    """Each node with ``_target_``: its path, itself, and whether it is inside a user's own class."""
+def _nodes(
+    config: Any,
+    path: str,
+    inside: bool = False,
+) -> Iterator[tuple[str, Mapping[str, Any], bool]]:
+    """Each node with ``_target_``: its path, itself, whether it is inside a class of the user's."""
     if isinstance(config, Mapping):
         if "_target_" in config:
             yield path, config, inside
@@ -145,15 +154,20 @@ def _is_within(module: str, packages: Sequence[str]) -> bool:
 
 
 def _class(node: Mapping[str, Any], path: str, inside: bool, trust: Sequence[str]) -> type:
-    """The class of a node. What is inside a user's own class is that class's business: it may be
-    any registered class, and any of the trusted packages."""
+    """The class of a node.
+
+    What is ``inside`` a class of the user's is that class's business: it may be any registered
+    class, and any of the trusted packages.
+    """
     target = node["_target_"]
     part = None if inside else PARTS.get(path)
     if part is None and not inside:
         raise GhptConfigError(path, "is no place for a class", f"Existing: {', '.join(PARTS)}.")
     if part is not None and node.get("_partial_", False) is not part.partial:
         raise GhptConfigError(f"{path}._partial_", f"is not {part.partial}", "Train again.")
-    registered = part.classes if part else {k: c for p in PARTS.values() for k, c in p.classes.items()}
+    registered: dict[str, type] = {}
+    for one in PARTS.values() if part is None else (part,):
+        registered |= one.classes
     if isinstance(target, str) and target in registered:
         return registered[target]
     if not _is_users(target):
