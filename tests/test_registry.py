@@ -36,6 +36,7 @@ import torch
 from torch import nn
 
 from ghpt.models.loss import LossTerms
+from ghpt.models.pose import PoseTriangulation
 from ghpt.models.scorer import Scorer, Standardise
 
 IMPORTED = []
@@ -76,6 +77,17 @@ class Wrapped(nn.Module):
 
 class NoModule:
     """Not of the kind that a scorer is."""
+
+
+class Wide(PoseTriangulation):
+    """A problem derived from one of ours."""
+
+    def __init__(self, factor, **settings):
+        super().__init__(**settings)
+        self.factor = factor
+
+    def describe(self, hypotheses):
+        return self.factor * super().describe(hypotheses)
 
 
 def function(size, clip, slope):
@@ -148,6 +160,7 @@ INNER = toys.MODEL["scorer"]
 OWN = {
     "scorer": {"scorer": SCORER},
     "loss": {"loss": {"_target_": "mine.scorers.Expected"}},
+    "problem": {"problem": toys.MODEL["problem"] | {"_target_": "mine.scorers.Wide", "factor": 2.0}},
     "ours within one's own": {"scorer": {"_target_": "mine.scorers.Wrapped", "_partial_": True, "inner": INNER}},
 }
 
