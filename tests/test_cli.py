@@ -19,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import ghpt.test as testing
 import toys
+from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
 from ghpt.train import COMMAND, train, typed
@@ -282,6 +283,54 @@ def test_a_second_interrupt_takes_effect_at_once(tmp_path, monkeypatch):
         train(toys.TRAIN, tmp_path)
     assert (stop.value.code, reached) == (130, ["between"])
     assert not [name for name in files(tmp_path) if "tfevents" not in name]
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="a signal of POSIX")
+@pytest.mark.parametrize(
+    ("numbers", "reached", "saved"),
+    [
+        (["SIGHUP"], ["within"], True),
+        (["SIGHUP", "SIGHUP"], ["within", "within"], True),  # a closed terminal and its shell both send it
+        (["SIGHUP", "SIGTERM"], ["within"], False),
+        (["SIGTERM", "SIGHUP"], ["within", "within"], True),
+    ],
+)
+def test_a_closed_terminal_stops_a_training_as_sigterm_does(tmp_path, monkeypatch, numbers, reached, saved):
+    found = []
+    step = StochasticEstimator.training_step
+
+    def signalled(self, batch, batch_idx):
+        for name in numbers:
+            os.kill(os.getpid(), getattr(signal, name))
+            found.append("within")
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(StochasticEstimator, "training_step", signalled)
+    with restored(signal.SIGTERM), restored(signal.SIGHUP), pytest.raises(SystemExit) as stop:
+        train(toys.TRAIN, tmp_path)
+    assert (stop.value.code, found) == (143, reached)
+    assert (tmp_path / "last.ckpt").exists() == saved
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="a signal of POSIX")
+def test_under_nohup_a_closed_terminal_is_ignored(tmp_path, monkeypatch):
+    step = StochasticEstimator.training_step
+
+    def signalled(self, batch, batch_idx):
+        os.kill(os.getpid(), signal.SIGHUP)
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(StochasticEstimator, "training_step", signalled)
+    with restored(signal.SIGHUP):
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)
+        assert train(toys.TRAIN, tmp_path)
+    assert read_checkpoint(tmp_path / "last.ckpt")["epoch"] == 1
+
+
+def test_a_system_without_that_signal_trains(tmp_path, monkeypatch):
+    """As Windows is."""
+    monkeypatch.setattr(callbacks, "_HANG_UP", None)
+    assert train(toys.TRAIN, tmp_path)
 
 
 def test_an_interrupt_while_the_data_are_prepared_leaves_nothing(tmp_path, monkeypatch):

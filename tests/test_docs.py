@@ -1,6 +1,7 @@
 """Every command and every piece of code in the documentation runs."""
 
 import argparse
+import copy
 import importlib.util
 import re
 import runpy
@@ -18,6 +19,7 @@ import ghpt.test as testing
 from documented import PAGES, ROOT, Block, Command
 from ghpt import calibrate, doctor, predict, train
 from ghpt.data import embedded
+from ghpt.models import registry
 from ghpt.overrides import check_overrides
 
 MAINS = {
@@ -233,6 +235,7 @@ def lay_out(runner: Page, models: Path) -> None:
 def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, typed, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(testing, "REPORTS", dict(testing.REPORTS))
+    monkeypatch.setattr(registry, "PARTS", copy.deepcopy(registry.PARTS))
     runner = Page(tmp_path, typed, monkeypatch)
     for block in documented.blocks(page):
         assert block.language or not re.search(r"^python ", block.text, re.MULTILINE), f"{page}:{block.line}: bash?"

@@ -18,6 +18,7 @@ from ghpt.data.key_points import KeyPoints, write_key_points
 from ghpt.data.rigs import Rig, human36m_rig
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import Cameras, project
+from ghpt.models.checkpoint import FORMAT_VERSION, AtomicCheckpointIO
 from ghpt.predict import COMMAND, predict
 from ghpt.reconstruction import State
 from ghpt.skeleton import JOINTS
@@ -62,8 +63,9 @@ def checkpoint(folder: Path, model: str) -> Path:
         settings = plain(hydra.compose("train", overrides=small))["model"]
     built = build(settings, "model")
     built.scorer.standardise.fit(torch.randn(100, built.problem.feature_size))
-    ours = {"format_version": 1, "config": {"model": settings}, "provenance": {"data": "toys"}}
-    torch.save({"ghpt": ours, "state_dict": built.state_dict()}, folder / f"{model}.ckpt")
+    ours = {"format_version": FORMAT_VERSION, "config": {"model": settings}, "provenance": {"data": "toys"}}
+    content = {"ghpt": ours, "state_dict": built.state_dict()}
+    AtomicCheckpointIO().save_checkpoint(content, folder / f"{model}.ckpt")
     return folder / f"{model}.ckpt"
 
 

@@ -2,6 +2,7 @@
 
 Hydra composes the yaml; this builds it, because a checkpoint carries its configuration too, and what comes out of
 a file must not be able to name arbitrary callables or read the environment through interpolations.
+What a checkpoint may name is in ``ghpt.models.registry``.
 """
 
 import difflib
@@ -17,8 +18,12 @@ from omegaconf import OmegaConf
 
 from ghpt.errors import GhptConfigError
 
-TRUSTED = ("ghpt", "torch.optim", "torch.nn")
-"""The packages whose classes a checkpoint may name."""
+Find = Callable[[Mapping[str, Any], str], Callable[..., Any]]
+"""Gives what a node with ``_target_`` is built with, of the node and the key it stands under."""
+_DEPTH = 32
+"""Of the groups in a configuration from a file."""
+_NODES = 100_000
+"""Of the values in a configuration from a file."""
 
 
 def plain(config: Any) -> Any:
@@ -33,56 +38,86 @@ def suggest(word: str, existing: Iterable[object]) -> str:
     return (f"Did you mean {near[0]!r}? " if near else "") + f"Existing: {', '.join(names) or 'none'}."
 
 
-def build(config: Any, path: str = "config", packages: Sequence[str] | None = None) -> Any:
-    """Build what a plain configuration describes, inner parts first.
+def locate(node: Mapping[str, Any], path: str) -> Callable[..., Any]:
+    """Import what ``node["_target_"]`` names: for what the user typed, never for what a file holds.
 
-    ``packages`` limits what ``_target_`` may name to objects defined in these packages (None: any).
-    ``_partial_: true`` gives the class with these arguments bound, not yet called.
-    Raises GhptConfigError, naming the key's path, for an unknown target or argument, a missing argument, and a value
-    that is not of its parameter's type.
+    Raises GhptConfigError if there is no such callable.
     """
-    if isinstance(config, Mapping):
-        values = {k: build(v, f"{path}.{k}", packages) for k, v in config.items() if k not in ("_target_", "_partial_")}
-        if "_target_" not in config:
-            return values
-        target = _locate(config["_target_"], path, packages)
-        partial = bool(config.get("_partial_"))
-        check_arguments(target, values, path, partial)
-        if partial:
-            return functools.partial(target, **values)
-        try:
-            return target(**values)
-        except GhptConfigError as error:
-            if error.key not in values:
-                raise
-            raise GhptConfigError(f"{path}.{error.key}", error.problem, error.mend) from error
-    if isinstance(config, list | tuple):
-        return [build(v, f"{path}[{i}]", packages) for i, v in enumerate(config)]
-    return config
-
-
-def _locate(target: Any, path: str, packages: Sequence[str] | None) -> Any:
-    key = f"{path}._target_"
+    target = node["_target_"]
     parts = str(target).split(".")
-    if packages is not None and not any(str(target).startswith(f"{p}.") for p in packages):
-        raise GhptConfigError(key, f"{target!r} is outside {', '.join(packages)}", "Name a class of these packages.")
     try:
-        module, found = next(
+        found, depth = next(
             (importlib.import_module(".".join(parts[:n])), n)
             for n in range(len(parts) - 1, 0, -1)
             if _is_module(".".join(parts[:n]))
         )
-        for name in parts[found:]:
-            module = getattr(module, name)
+        for name in parts[depth:]:
+            found = getattr(found, name)
     except (StopIteration, AttributeError):
-        raise GhptConfigError(key, f"no class {target!r}", "Check the spelling of the full name.") from None
-    # An alias such as ghpt.files.os.system must not pass for one of ours.
-    home = getattr(module, "__module__", None) or ""
-    if not callable(module) or (
-        packages is not None and not any(home == p or home.startswith(f"{p}.") for p in packages)
-    ):
-        raise GhptConfigError(key, f"{target!r} is not a class of ours", "Name a class of this project.")
-    return module
+        found = None
+    if not callable(found):
+        mend = "Check the spelling of the full name."
+        raise GhptConfigError(f"{path}._target_", f"no class {target!r}", mend)
+    return found
+
+
+def build(config: Any, path: str = "config", find: Find = locate) -> Any:
+    """Build what a plain configuration describes, inner parts first.
+
+    ``find`` gives the class of a node with ``_target_``; by default whatever Python can import.
+    ``_partial_: true`` gives the class with these arguments bound, not yet called.
+    Raises GhptConfigError, naming the key's path, for an unknown target or argument, a missing
+    argument, and a value that is not of its parameter's type.
+    """
+    if isinstance(config, list | tuple):
+        return [build(v, f"{path}[{i}]", find) for i, v in enumerate(config)]
+    if not isinstance(config, Mapping):
+        return config
+    # The outer class is looked up first: an error names it, and nothing in it has been built.
+    target = find(config, path) if "_target_" in config else None
+    settings = {k: v for k, v in config.items() if k not in ("_target_", "_partial_")}
+    values = {k: build(v, f"{path}.{k}", find) for k, v in settings.items()}
+    if target is None:
+        return values
+    partial = bool(config.get("_partial_"))
+    check_arguments(target, values, path, partial)
+    if partial:
+        return functools.partial(target, **values)
+    try:
+        return target(**values)
+    except GhptConfigError as error:
+        if error.key not in values:
+            raise
+        raise GhptConfigError(f"{path}.{error.key}", error.problem, error.mend) from error
+
+
+def check_plain(config: Any, path: str) -> None:
+    """Raise GhptConfigError unless a configuration is plain data.
+
+    Plain data is numbers, text, true, false and null, in lists and in dicts whose keys are text.
+    What is deeper or larger than any configuration is refused too, so that all else may walk,
+    compare and show what was checked without a bound of its own.
+    """
+    waiting = [(config, path, 0)]
+    count = 0
+    while waiting:
+        value, where, depth = waiting.pop()
+        kind = type(value)
+        inner: list[tuple[str, Any]] = []
+        if kind is dict:
+            if not all(type(key) is str for key in value):
+                raise GhptConfigError(where, "has a key that is no text", _PLAIN)
+            inner = [(f"{where}.{key}", part) for key, part in value.items()]
+        elif kind in (list, tuple):
+            inner = [(f"{where}[{i}]", part) for i, part in enumerate(value[: _NODES + 1])]
+        elif kind is int and value.bit_length() > 64:
+            raise GhptConfigError(where, "is a number of more than 64 bits", _PLAIN)
+        elif kind not in _SCALARS:
+            raise GhptConfigError(where, f"is a {kind.__name__}", _PLAIN)
+        count += len(inner)
+        if depth > _DEPTH or count > _NODES:
+            raise GhptConfigError(path, "is larger than any configuration", _PLAIN)
+        waiting += [(part, name, depth + 1) for name, part in inner]
 
 
 def _is_module(name: str) -> bool:
@@ -148,6 +183,7 @@ def _parameters(target: Any) -> tuple[dict[str, tuple[Any, bool]], bool]:
     return found, True
 
 
+_PLAIN = "A configuration is numbers, text, true, false and null, in lists and groups."
 _SCALARS = {int: "an integer", float: "a finite number", bool: "true or false", str: "text", types.NoneType: "null"}
 
 
@@ -167,7 +203,7 @@ def _fits(value: Any, wanted: Any) -> bool:
         return isinstance(value, list | tuple) and (len(inner) != 1 or all(_fits(one, inner[0]) for one in value))
     if origin in (dict, Mapping) or is_typeddict(wanted):
         return isinstance(value, Mapping)
-    return not isinstance(wanted, type) or wanted is object or type(value) not in _SCALARS
+    return not isinstance(wanted, type) or wanted in (object, Any) or type(value) not in _SCALARS
 
 
 def _words(wanted: Any) -> str:

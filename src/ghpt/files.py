@@ -6,6 +6,7 @@ was. Within the output folder of a command, `ghpt.outputs` guards what may be re
 
 import errno
 import hashlib
+import itertools
 import os
 import platform
 import re
@@ -39,6 +40,9 @@ class Guard(Protocol):
     def before_remove(self, path: Path) -> None:
         """``path`` exists and is about to be removed. Raises GhptDataError if it must not be."""
 
+    def adopt(self, path: Path) -> None:
+        """``path`` has proved that ghpt wrote it."""
+
 
 _guards: dict[Path, Guard] = {}
 
@@ -65,6 +69,7 @@ def _guard_of(path: Path) -> Guard | None:
     parents = (path.parent.resolve() / path.name).parents
     return next((_guards[folder] for folder in parents if folder in _guards), None)
 
+
 _ZEROS = 1 << 20
 """Bytes that are written at a time where a disk cannot reserve them."""
 
@@ -88,15 +93,23 @@ def _sync_folder(folder: Path) -> None:
 
 
 @contextmanager
-def atomic_write(path: str | Path, mode: str = "wb", verify: Callable[[Path], Any] | None = None) -> Iterator[IO[Any]]:
+def atomic_write(
+    path: str | Path,
+    mode: str = "wb",
+    verify: Callable[[Path], Any] | None = None,
+    previous: Path | None = None,
+) -> Iterator[IO[Any]]:
     """Yield a file open for writing that takes ``path``'s place when the block ends without an error.
 
     ``verify`` gets the finished temporary file and raises if it is not right. On any failure (the block's,
     the disk's, the check's) the temporary file is removed, ``path`` is untouched and the error is passed on.
+    ``previous``: what stood at ``path`` is kept under this name, in the same folder. A kill at any
+    instant leaves two files, both whole and not the same.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _temporary(path)
+    second = _temporary(path)
     try:
         with open(temporary, mode, **({} if "b" in mode else {"encoding": "utf-8", "newline": "\n"})) as handle:
             yield handle
@@ -104,13 +117,21 @@ def atomic_write(path: str | Path, mode: str = "wb", verify: Callable[[Path], An
             os.fsync(handle.fileno())
         if verify is not None:
             verify(temporary)
+        keep = previous is not None and path.exists()
+        if keep:
+            _second_name(path, second)
         guard = _guard_of(path)
         if guard is not None:
             guard.before_replace(path, temporary)
+            if keep:
+                guard.before_replace(previous, second)
         os.replace(temporary, path)
+        if keep:
+            os.replace(second, previous)
     except BaseException as error:
-        with suppress(OSError):
-            temporary.unlink()
+        for leftover in (temporary, second):
+            with suppress(OSError):
+                leftover.unlink()
         if isinstance(error, OSError) and error.filename in (None, str(temporary)):
             error.filename = str(path)
         raise
@@ -126,6 +147,31 @@ def remove(path: str | Path) -> None:
     if guard is not None:
         guard.before_remove(path)
     path.unlink(missing_ok=True)
+
+
+def adopt(path: Path) -> None:
+    """Let a file be replaced that has proved, by a digest of its own, that ghpt wrote it."""
+    guard = _guard_of(path)
+    if guard is not None:
+        guard.adopt(path)
+
+
+def set_aside(path: Path) -> None:
+    """Give a damaged file, if it is there, a name that is free, so that nothing of it is lost."""
+    if not path.exists():
+        return
+    names = (path.with_name(f"{path.name}.damaged{number or ''}") for number in itertools.count())
+    os.rename(path, next(name for name in names if not name.exists()))
+
+
+def _second_name(path: Path, second: Path) -> None:
+    """Give a file a second name; where the file system has no hard links, to a copy of it."""
+    try:
+        os.link(path, second)
+    except OSError:
+        shutil.copyfile(path, second)
+        with open(second, "rb+") as handle:
+            os.fsync(handle.fileno())
 
 
 @contextmanager

@@ -110,6 +110,14 @@ class OutputFolder:
         if not self._is_work(name) and not self.overwrite and not self._owns(name):
             raise _foreign(path)
 
+    def adopt(self, path: Path) -> None:
+        """Take ``path``, which has proved that ghpt wrote it, into the manifest."""
+        name = self._name(path)
+        if path.is_file() and not self._owns(name):
+            self._digests[name] = [digest(path)]
+            self._stats[name] = _signature(path)
+            self._write()
+
     def finished(self, settings: Mapping[str, Any]) -> str | None:
         """What a finished run with these settings and inputs said here, if its files are all there."""
         try:

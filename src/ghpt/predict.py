@@ -7,7 +7,7 @@ import json
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NotRequired
 
 import torch
 
@@ -51,6 +51,7 @@ class Settings(InputSettings):
 
     person: int
     ckpt: str | None
+    trust: NotRequired[list[str]]
     hypotheses: int | None
     triangulation: str
     fill: int | str | None
@@ -173,7 +174,8 @@ def choose(config: dict[str, Any]) -> Chosen:
         estimator = config["baselines"][name]
         predictor = build(settings, "estimator.classical")(estimator=build(estimator, f"baselines.{name}"))
         return Chosen(name, text, predictor, predictor.swaps, None, settings | {"estimator": estimator})
-    model, trained = load_model(config["ckpt"], hypotheses=config["hypotheses"], seed=config["seed"])
+    changes = {"hypotheses": config["hypotheses"], "seed": config["seed"]}
+    model, trained = load_model(config["ckpt"], config.get("trust") or (), **changes)
     if not isinstance(model.problem, PoseTriangulation):
         problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
         raise GhptCheckpointError(config["ckpt"], problem, "Give one that train.py model=pose wrote.")

@@ -11,21 +11,35 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressB
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from ghpt.errors import check
-from ghpt.models.checkpoint import FIELD
+from ghpt.models.checkpoint import FIELD, PREVIOUS
+
+_HANG_UP = getattr(signal, "SIGHUP", None)
+"""Windows has none."""
 
 
 class SaveLast(Callback):
     """Keep ``last.ckpt`` up to date: every ``every`` steps, after each epoch, and when stopped.
 
-    SIGINT (Ctrl-C) and SIGTERM take effect after the running step, so that what is saved is whole, and in all processes
-    at the same one; a second signal takes effect at once. (Lightning's own handler of SIGTERM has the processes wait
-    for each other where they are, which with two or more is for ever.)
+    What it held before is ``previous.ckpt``, so that there is a way back if the disk damages it.
+    ``resumed``: ``last.ckpt`` is there and whole, because this run goes on from it. (Otherwise what
+    stands there is damaged or of another run, and does not become the previous one.)
+    SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal is closed) take effect after the running step,
+    so that what is saved is whole, and in all processes at the same one; a second signal takes
+    effect at once. (Lightning's own handler of SIGTERM has the processes wait for each other where
+    they are, which with two or more is for ever.)
     ``identity`` is what every checkpoint says of itself.
     """
 
-    def __init__(self, path: Path, every: int, identity: dict[str, Any]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        every: int,
+        identity: dict[str, Any],
+        resumed: bool = False,
+    ) -> None:
         check(every >= 1, "save_every", f"is {every}", "It must be >= 1 step.")
         self.path, self.every, self.identity = path, every, identity
+        self.resumed = resumed
         self.interrupted = False
         self.saved: int | None = None
         """The optimiser step that ``last.ckpt`` holds, if this run wrote it."""
@@ -36,13 +50,18 @@ class SaveLast(Callback):
         checkpoint[FIELD] = self.identity
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        numbers = [signal.SIGINT, signal.SIGTERM]
+        # Under nohup that signal is ignored already, and stays so.
+        if _HANG_UP is not None and signal.getsignal(_HANG_UP) != signal.SIG_IGN:
+            numbers.append(_HANG_UP)
+        for number in numbers:
             with suppress(ValueError):  # not in the main thread: then nobody sends us signals either
                 self._previous[number] = signal.signal(number, self._interrupt)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
-        self._stop = SIGTERMException if number == signal.SIGTERM else KeyboardInterrupt
-        if self.interrupted:
+        self._stop = KeyboardInterrupt if number == signal.SIGINT else SIGTERMException
+        # A terminal that is closed sends SIGHUP, and its shell once more: that is one signal.
+        if self.interrupted and number != _HANG_UP:
             raise self._stop
         self.interrupted = True
 
@@ -58,7 +77,9 @@ class SaveLast(Callback):
 
     def _save(self, trainer: L.Trainer, due: bool) -> None:
         if due or self.interrupted:
-            trainer.save_checkpoint(self.path, weights_only=False)
+            whole = self.resumed or self.saved is not None
+            options = {"previous": self.path.with_name(PREVIOUS)} if whole else None
+            trainer.save_checkpoint(self.path, weights_only=False, storage_options=options)
             self.saved = trainer.global_step
         if self.interrupted:
             raise self._stop

@@ -7,18 +7,21 @@ from typing import Any
 import lightning as L
 import torch
 from jaxtyping import Float, Int
-from torch import Tensor
+from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from ghpt import randomness
 from ghpt.errors import GhptError, check
-from ghpt.models.loss import LossTerms, StochasticLoss, mean_over_all
+from ghpt.models.loss import LossTerms, mean_over_all
 from ghpt.models.problem import Problem
 from ghpt.models.scorer import Scorer
 from ghpt.models.selection import SELECTIONS, limit_spread, selection_weights, softmax_weights
 
 STATISTICS_HYPOTHESES = 16
 """Hypotheses of each training sample that the feature statistics are taken from: enough for a mean and deviation."""
+
+MOST_HYPOTHESES = 100_000
+"""In a pool: of more, the poses of one batch alone are gigabytes."""
 
 
 @dataclass(frozen=True)
@@ -35,8 +38,10 @@ class Pool:
 class StochasticEstimator(L.LightningModule):
     """Hypothesis generator, scorer and loss (paper, section 3), for any ``Problem``.
 
-    ``spread`` limits how much a pool's logits differ (``limit_spread``). ``selection``: the hypothesis of the
-    estimation loss, ``weight`` or ``stochastic`` (straight through).
+    ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like
+    ``StochasticLoss``. ``spread`` limits how much a pool's logits differ (``limit_spread``).
+    ``selection``: the hypothesis of the estimation loss, ``weight`` or ``stochastic`` (straight
+    through).
     All randomness is a function of (seed, optimiser step, sample): see ``ghpt.randomness``.
     """
 
@@ -44,7 +49,7 @@ class StochasticEstimator(L.LightningModule):
         self,
         problem: Problem,
         scorer: Callable[[int], Scorer],
-        loss: StochasticLoss,
+        loss: nn.Module,
         optimizer: Callable[..., torch.optim.Optimizer],
         hypotheses: int,
         temperature: float,
@@ -54,7 +59,12 @@ class StochasticEstimator(L.LightningModule):
         seed: int,
     ) -> None:
         super().__init__()
-        check(hypotheses >= 1, "model.hypotheses", f"is {hypotheses}", "Draw at least 1 (the paper: 200).")
+        check(
+            1 <= hypotheses <= MOST_HYPOTHESES,
+            "model.hypotheses",
+            f"is {hypotheses}",
+            f"Draw at least 1 and at most {MOST_HYPOTHESES} (the paper: 200).",
+        )
         check(temperature > 0, "model.temperature", f"is {temperature}", "It must be > 0 (the paper: 1.5).")
         check(spread is None or spread > 0, "model.spread", f"is {spread}", "It must be > 0, or null for no limit.")
         check(

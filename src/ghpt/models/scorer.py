@@ -13,6 +13,8 @@ ROWS = 400
 """Feature vectors that the network takes at a time on a CPU where no gradient is wanted: what lies between two layers
 stays in the cache, which is a fifth faster."""
 
+MOST_LAYERS = 100
+
 
 class Standardise(nn.Module):
     """Subtract the training mean and divide by the training deviation, feature by feature; clip what is left.
@@ -55,10 +57,10 @@ class Scorer(nn.Module):
         super().__init__()
         self.bfloat16 = bfloat16
         check(
-            len(layers) > 0 and all(n > 0 for n in layers),
+            0 < len(layers) <= MOST_LAYERS and all(n > 0 for n in layers),
             "model.scorer.layers",
             f"is {list(layers)}",
-            "Give the width of each hidden layer, all > 0.",
+            f"Give the width of each hidden layer, all > 0, of at most {MOST_LAYERS}.",
         )
         self.standardise = Standardise(size, clip)
         widths = [size, *layers]

@@ -4,13 +4,13 @@ from pathlib import Path
 from typing import Any
 
 from ghpt.config import build
-from ghpt.models.checkpoint import AtomicCheckpointIO, read_checkpoint
+from ghpt.models.checkpoint import LAST, PREVIOUS, AtomicCheckpointIO, read_checkpoint
 from ghpt.reproduction.cells import write_json
 from ghpt.test import measure
 from ghpt.train import train
 
 QUIET = {"progress_bar": False}
-CHECKPOINT = "last.ckpt"
+CHECKPOINT = LAST
 
 
 def prepare_split(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
@@ -25,7 +25,8 @@ def train_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) ->
     result.json: the validation errors (mm).
     """
     errors = train(config | QUIET | {"save_every": 1_000_000, "resume": False}, folder)
-    (folder / "best.ckpt").unlink(missing_ok=True)
+    for name in ("best.ckpt", PREVIOUS):
+        (folder / name).unlink(missing_ok=True)
     checkpoint = read_checkpoint(folder / CHECKPOINT)
     AtomicCheckpointIO().save_checkpoint(checkpoint | {"optimizer_states": []}, folder / CHECKPOINT)
     write_json(folder / "result.json", errors)
