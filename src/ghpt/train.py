@@ -3,19 +3,17 @@
 import logging
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypedDict
 
 import lightning as L
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from ghpt.config import build, check_arguments, check_type
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.files import sweep_temporaries
+from ghpt.lost import OwnSignals, told
 from ghpt.models.callbacks import LogHyperparameters, Progress, SaveLast, best_checkpoint
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO, read_checkpoint
 from ghpt.provenance import provenance
@@ -76,10 +74,10 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
     if config["resume"]:
         _check_resumable(last, config)
     try:
-        with shell_status():
+        with told(trainer):
             trainer.fit(model, datamodule=data, ckpt_path=str(last) if config["resume"] else None, weights_only=True)
-    except SystemExit:
-        if trainer.is_global_zero:
+    except (SystemExit, Exception) as stop:
+        if trainer.is_global_zero and (saver.saved is not None or isinstance(stop, SystemExit)):
             _say_stopped(last, saver.saved)
         raise
     errors = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("validation/")}
@@ -97,6 +95,7 @@ def summary(errors: dict[str, float]) -> str:
 def make_trainer(settings: dict[str, Any], **ours: Any) -> L.Trainer:
     """Lightning's Trainer of the yaml's settings and ``ours``. Raises GhptConfigError for what it does not take."""
     settings = build(settings, "trainer")
+    ours["callbacks"] = [*ours.get("callbacks", ()), OwnSignals()]
     for key in set(settings) & set(ours):
         raise GhptConfigError(f"trainer.{key}", "is not for the configuration: ghpt sets it", "Leave it out.")
     check_arguments(L.Trainer, settings, "trainer")
@@ -108,19 +107,6 @@ def make_trainer(settings: dict[str, Any], **ours: Any) -> L.Trainer:
 
 def progress(config: dict[str, Any]) -> list[L.Callback]:
     return [Progress()] if config["progress_bar"] else []
-
-
-@contextmanager
-def shell_status() -> Iterator[None]:
-    """An interrupt exits with 130 and SIGTERM with 143, as shells expect (Lightning's statuses are 1 and 0)."""
-    try:
-        yield
-    except SIGTERMException as stop:
-        raise SystemExit(143) from stop
-    except SystemExit as stop:
-        if isinstance(stop.__context__, KeyboardInterrupt):
-            raise SystemExit(130) from stop
-        raise
 
 
 def shown(path: Path) -> str:

@@ -22,6 +22,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 from ghpt.errors import GhptError
 from ghpt.files import sweep_temporaries
 from ghpt.reproduction.cells import Cell, perform, with_needs
+from ghpt.signals import stopped_by_signals
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +38,7 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
     missing = {key: cell for key, cell in with_needs(wanted).items() if not cell.done(cells)}
     number, chain = len(missing), _chains(missing)
     with (
-        _terminable(),
+        stopped_by_signals(),
         _progress(list(missing.values()), show) as tell,
         _executor(min(jobs, len(missing))) as submit,
     ):
@@ -86,21 +87,6 @@ def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[None]]]:
         raise
     finally:
         executor.shutdown()
-
-
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends the block as an interrupt does, with status 143."""
-
-    def stop(*_: object) -> None:
-        raise SystemExit(143)
-
-    previous = signal.signal(signal.SIGTERM, stop) if threading.current_thread() is threading.main_thread() else None
-    try:
-        yield
-    finally:
-        if previous is not None:
-            signal.signal(signal.SIGTERM, previous)
 
 
 def _here(cell: Cell, cells: Path) -> Future[None]:
