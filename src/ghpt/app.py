@@ -21,6 +21,7 @@ from ghpt.config import plain
 from ghpt.errors import GhptConfigError, GhptError
 from ghpt.jobs import Job, awaited, chosen_launcher, first_of_several_ends, own_command, take_signals
 from ghpt.overrides import check_overrides
+from ghpt.signals import stopped_by_signals
 
 USERS_ERRORS = (GhptError, HydraException, OmegaConfBaseException, OSError)
 """What a user can cause and mend: said in one line. Anything else is a fault of the program, with its trace."""
@@ -28,6 +29,7 @@ _FULL = "HYDRA_FULL_ERROR"
 _log = logging.getLogger(__name__)
 
 
+@stopped_by_signals()
 def run(
     conf: Path,
     config_name: str,
@@ -100,7 +102,8 @@ class _Job:
         try:
             with own_command(self.script) if self.sweep else nullcontext():
                 settings = plain(config)
-                result = self.task(settings, output)
+                with stopped_by_signals():
+                    result = self.task(settings, output)
             said, failed = self.summary(result) if self.sweep else "", False
         except Exception as error:
             if first_of_several_ends():
