@@ -22,6 +22,17 @@ def _temporary(path: Path) -> Path:
     return path.parent / f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
 
 
+@contextmanager
+def errors_name(path: str | Path) -> Iterator[None]:
+    """Have an OSError of the block that names no file name this one, such as that the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+
+
 def _sync_folder(folder: Path) -> None:
     try:
         handle = os.open(folder, os.O_RDONLY)
@@ -72,7 +83,8 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     temporary = _temporary(path)
     temporary.mkdir()
     try:
-        yield temporary
+        with errors_name(path):
+            yield temporary
         for file in temporary.rglob("*"):
             if file.is_file():
                 with open(file, "rb") as handle:

@@ -82,7 +82,7 @@ def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str
         enable_progress_bar=config["progress_bar"],
     )
     sweep_temporaries(output)
-    shutil.rmtree(output / ".predictions", ignore_errors=True)  # what an interrupted test left
+    shutil.rmtree(output / ".predictions", ignore_errors=True)  # what a killed test left
     with told(trainer):
         trainer.test(model, datamodule=data, verbose=False)
     if not trainer.is_global_zero:
