@@ -20,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 from ghpt.config import plain
 from ghpt.errors import GhptConfigError, GhptError
 from ghpt.jobs import Job, awaited, chosen_launcher, first_of_several_ends, own_command, take_signals
+from ghpt.lost import out_of_memory
 from ghpt.overrides import check_overrides
 from ghpt.signals import stopped_by_signals
 
@@ -105,9 +106,10 @@ class _Job:
                 with stopped_by_signals():
                     result = self.task(settings, output)
             said, failed = self.summary(result) if self.sweep else "", False
-        except Exception as error:
+        except Exception as caught:
             if first_of_several_ends():
                 sys.exit(1)
+            error = out_of_memory(caught) or caught
             users = isinstance(error, USERS_ERRORS)
             if users or elsewhere:
                 said = f"error: {_one_line(error)}" if users else f"error: {type(error).__name__}: {_one_line(error)}"

@@ -79,7 +79,7 @@ def _lost(trainer: L.Trainer, text: str) -> GhptConfigError | None:
         problem = f"a process that loads batches was killed; {_WHY}"
         return GhptConfigError("data.workers", problem, "Give fewer (data.workers=0 needs none).")
     processes = getattr(trainer.strategy.launcher, "procs", None) or []
-    if trainer.world_size == 1 or not (_DEAD_PEER.search(text) or _ended(processes, 0)):
+    if trainer.world_size == 1 or not (_DEAD_PEER.search(text) or _ended(processes, 0.0)):
         return None
     return _lost_process(_ended(processes, _WAIT), trainer.world_size)
 
@@ -112,7 +112,7 @@ def _say_and_end(observer: Any) -> None:
     """What Lightning's thread does when it finds a process dead; its own kills this one without a word."""
     time.sleep(_WAIT)  # the main thread may be about to say it, and ends this thread with the process
     processes = observer._child_processes
-    error = _lost_process(_ended(processes, 0), len(processes) + 1)
+    error = _lost_process(_ended(processes, 0.0), len(processes) + 1)
     for process in processes:
         process.kill()
     print(f"error: {error}", file=sys.stderr, flush=True)

@@ -132,8 +132,13 @@ def _check_optimizer(model: Any) -> None:
 def _check_resumable(last: Path, config: dict[str, Any]) -> None:
     saved = read_checkpoint(last)[FIELD]["config"]
     for part in ("model", "data", "seed"):
-        if saved[part] != config[part]:
+        if _what(saved[part]) != _what(config[part]):
             raise GhptCheckpointError(last, f"was made with other settings of {part!r}", "Resume with the same ones.")
+
+
+def _what(settings: Any) -> Any:
+    """What decides the numbers: not how the batches are loaded, which one may have to change to go on."""
+    return {k: v for k, v in settings.items() if k != "workers"} if isinstance(settings, dict) else settings
 
 
 def _flat(config: Any, above: str) -> dict[str, Any]:

@@ -13,13 +13,14 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ghpt.errors import GhptError
+from ghpt.errors import GhptConfigError, GhptError
 from ghpt.files import sweep_temporaries
 from ghpt.reproduction.cells import Cell, perform, with_needs
 from ghpt.signals import stopped_by_signals
@@ -49,15 +50,23 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
                 running[submit(cell, cells)] = waiting.pop(cell.key)
                 tell(running.values(), None)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                cell = running.pop(future)
                 try:
                     future.result()
                 except GhptError as error:
-                    error.args = (f"{cell.name}: {error}",)
+                    error.args = (f"{running[future].name}: {error}",)
                     raise
+                except BrokenProcessPool as error:
+                    raise _killed(running.values()) from error
+                cell = running.pop(future)
                 del missing[cell.key]
                 tell(running.values(), cell)
     return number
+
+
+def _killed(running: Iterable[Cell]) -> GhptConfigError:
+    made = ", ".join(cell.name for cell in running)
+    problem = f"a process was killed while these were made: {made}; the system does so where memory is short"
+    return GhptConfigError("jobs", problem, "Give fewer (jobs=1, say); the same command goes on.")
 
 
 def _chains(cells: dict[str, Cell]) -> dict[str, float]:
