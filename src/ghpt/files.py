@@ -85,10 +85,12 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     try:
         with errors_name(path):
             yield temporary
-        for file in temporary.rglob("*"):
-            if file.is_file():
-                with open(file, "rb") as handle:
+        for path_within in (temporary, *temporary.rglob("*")):
+            if path_within.is_file():
+                with open(path_within, "rb") as handle:
                     os.fsync(handle.fileno())
+            else:  # the names of its files
+                _sync_folder(path_within)
         try:
             os.rename(temporary, path)
         except OSError:
