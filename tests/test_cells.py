@@ -94,10 +94,7 @@ from pathlib import Path
 from test_cells import slow
 from ghpt.reproduction.pool import perform_all
 if __name__ == "__main__":
-    try:
-        perform_all(slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
-    except KeyboardInterrupt:  # as ghpt.app.run does
-        sys.exit(130)
+    perform_all(slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
 """
 
 

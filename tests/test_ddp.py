@@ -19,6 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import ghpt.test as testing
 import toys
 from ghpt.config import plain
+from ghpt.models.checkpoint import read_checkpoint
 from ghpt.train import train
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -47,7 +48,8 @@ def project(tmp_path_factory):
 @pytest.fixture(scope="module")
 def typed_for_two(project):
     """``typed_for_two("train", *words)`` starts train.py on two processes."""
-    environment = os.environ | {"PYTHONPATH": str(ROOT / "tests"), "OMP_NUM_THREADS": "1"}
+    path = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     environment.pop("HYDRA_FULL_ERROR", None)
     return lambda name, *words: subprocess.Popen(
         [sys.executable, str(project / f"{name}.py"), *SMALL, *TWO, *words],
@@ -79,6 +81,24 @@ def scalars(folder):
     (file,) = folder.glob("*tfevents*")
     log = EventAccumulator(str(file)).Reload()
     return {tag: [event.value for event in log.Scalars(tag)] for tag in log.Tags()["scalars"]}
+
+
+def children_of(pid):
+    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True).stdout
+    return [int(word) for word in listed.split()]
+
+
+def alive(pid):
+    status = Path(f"/proc/{pid}/status")
+    return status.exists() and "State:\tZ" not in status.read_text()
+
+
+def until_saved(child, folder):
+    end = time.monotonic() + 300
+    while not (folder / "last.ckpt").exists():
+        assert child.poll() is None, child.communicate()
+        assert time.monotonic() < end, "training did not begin"
+        time.sleep(0.05)
 
 
 def written(folder):
@@ -133,17 +153,36 @@ def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
 
 def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
     child = typed_for_two("train", *MODELS["pose"], "trainer.max_epochs=5000", "save_every=2", f"output={tmp_path}")
-    end = time.monotonic() + 300
-    while not (tmp_path / "last.ckpt").exists():
-        assert time.monotonic() < end, "training did not begin"
-        time.sleep(0.05)
-    others = subprocess.run(["ps", "-o", "pid=", "--ppid", str(child.pid)], capture_output=True, text=True).stdout
+    until_saved(child, tmp_path)
+    others = children_of(child.pid)
     child.send_signal(signal.SIGINT)
     _, errors = child.communicate(timeout=300)
     assert child.returncode == 130
     assert re.match(r"Stopped\. .*last\.ckpt holds training step \d+\.\nGo on with the same command and", errors)
     assert errors.count("\n") == 2
-    assert others.split()
-    for pid in others.split():
-        status = Path(f"/proc/{pid}/status")
-        assert not status.exists() or "State:\tZ" in status.read_text()
+    assert others
+    assert not any(alive(pid) for pid in others)
+
+
+@pytest.mark.parametrize("dies", ["the second", "the first"])
+def test_a_killed_process_ends_both_in_a_line_and_the_training_goes_on(typed_for_two, tmp_path, dies):
+    """E6: not in a hang, and in less than a minute."""
+    words = (*MODELS["pose"], "save_every=2", f"output={tmp_path}")
+    child = typed_for_two("train", *words, "trainer.max_epochs=5000")
+    until_saved(child, tmp_path)
+    (second,) = (int(pid) for pid in children_of(child.pid))
+    killed = time.monotonic()
+    os.kill(second if dies == "the second" else child.pid, signal.SIGKILL)
+    _, errors = child.communicate(timeout=300)
+    while alive(second):
+        assert time.monotonic() < killed + 60, "the other process hangs"
+        time.sleep(0.05)
+    assert time.monotonic() < killed + 60
+    if dies == "the second":
+        *how, error = errors.splitlines()
+        assert child.returncode == 1
+        assert [line.split()[0] for line in how] == ["Stopped.", "Go"]
+        assert error.startswith("error: trainer.devices: process 2 of 2 was killed by signal 9")
+    else:
+        assert (child.returncode, errors) == (-signal.SIGKILL, "")
+    assert read_checkpoint(tmp_path / "last.ckpt")["global_step"] > 0

@@ -30,8 +30,10 @@ from ghpt.jobs import (
     own_command,
     take_signals,
 )
+from ghpt.lost import out_of_memory
 from ghpt.outputs import Files, OutputFolder, SweepFolder
 from ghpt.overrides import check_overrides
+from ghpt.signals import stopped_by_signals
 
 USERS_ERRORS = (GhptError, HydraException, OmegaConfBaseException, OSError)
 """What a user can cause and mend: said in one line. Anything else is a fault of the program, with its trace."""
@@ -57,6 +59,7 @@ class Command:
     """Called after a sweep with all of its jobs, the failed ones included."""
 
 
+@stopped_by_signals()
 def run(conf: Path, command: Command) -> None:
     """Compose ``<conf>/<command.name>.yaml`` with the command line and call ``command.task``.
 
@@ -133,13 +136,15 @@ class _Job:
                 else:
                     stack.enter_context(self._records(config, output))
                     stack.enter_context(self._as_command(settings))
-                    result = self.command.task(settings, output)
+                    with stopped_by_signals():
+                        result = self.command.task(settings, output)
                     said, failed = self.command.summary(result) if self.sweep else "", False
                     if folder is not None:
                         folder.finish(settings, said)
-            except Exception as error:
+            except Exception as caught:
                 if first_of_several_ends():
                     sys.exit(1)
+                error = out_of_memory(caught) or caught
                 users = isinstance(error, USERS_ERRORS)
                 if users or elsewhere:
                     kind = "" if users else f"{type(error).__name__}: "

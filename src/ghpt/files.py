@@ -78,6 +78,17 @@ def _temporary(path: Path) -> Path:
     return path.parent / f".{path.name}.{_HOST}-{os.getpid()}-{secrets.token_hex(4)}.tmp"
 
 
+@contextmanager
+def errors_name(path: str | Path) -> Iterator[None]:
+    """Have an OSError of the block that names no file name this one, such as that the disk is full."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
+
+
 def _sync_folder(folder: Path) -> None:
     if _WINDOWS:  # a folder cannot be opened there, and a rename is durable without it
         return
@@ -185,11 +196,14 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
     temporary = _temporary(path)
     temporary.mkdir()
     try:
-        yield temporary
-        for file in temporary.rglob("*"):
-            if file.is_file():
-                with open(file, "rb+") as handle:  # Windows syncs only what is open for writing
+        with errors_name(path):
+            yield temporary
+        for path_within in (temporary, *temporary.rglob("*")):
+            if path_within.is_file():
+                with open(path_within, "rb+") as handle:  # Windows syncs only what is open for writing
                     os.fsync(handle.fileno())
+            else:  # the names of its files
+                _sync_folder(path_within)
         try:
             os.rename(temporary, path)
         except OSError:

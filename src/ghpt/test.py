@@ -9,6 +9,7 @@ from ghpt.app import Command
 from ghpt.config import build, check_type
 from ghpt.errors import GhptCheckpointError
 from ghpt.files import sweep_temporaries
+from ghpt.lost import told
 from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
 from ghpt.models.relative_pose import RelativePose
@@ -19,7 +20,7 @@ from ghpt.report.pairs import PAIRS
 from ghpt.report.poses import POSES
 from ghpt.report.report import Report
 from ghpt.report.tables import title
-from ghpt.train import make_trainer, progress, shell_status, shown
+from ghpt.train import make_trainer, progress, shown
 
 REPORTS: dict[type, Report] = {PoseTriangulation: POSES, RelativePose: PAIRS}
 _log = logging.getLogger(__name__)
@@ -92,8 +93,8 @@ def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str
         enable_progress_bar=config["progress_bar"],
     )
     sweep_temporaries(output)
-    shutil.rmtree(output / ".predictions", ignore_errors=True)  # what an interrupted test left
-    with shell_status():
+    shutil.rmtree(output / ".predictions", ignore_errors=True)  # what a killed test left
+    with told(trainer):
         trainer.test(model, datamodule=data, verbose=False)
     if not trainer.is_global_zero:
         return None

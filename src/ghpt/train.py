@@ -3,20 +3,18 @@
 import logging
 import os
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal, TypedDict
 
 import lightning as L
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from ghpt.app import Command
 from ghpt.config import build, check_arguments, check_plain, check_type
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.files import adopt, set_aside, sweep_temporaries
+from ghpt.lost import OwnSignals, told
 from ghpt.models.callbacks import LogHyperparameters, Progress, SaveLast, best_checkpoint
 from ghpt.models.checkpoint import (
     FIELD,
@@ -119,10 +117,10 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
     if warning and trainer.is_global_zero:
         _log.warning(warning)
     try:
-        with shell_status():
+        with told(trainer):
             trainer.fit(model, datamodule=data, ckpt_path=start and str(start), weights_only=True)
-    except SystemExit:
-        if trainer.is_global_zero:
+    except (SystemExit, Exception) as stop:
+        if trainer.is_global_zero and (saver.saved is not None or isinstance(stop, SystemExit)):
             _say_stopped(last, saver.saved)
         raise
     errors = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("validation/")}
@@ -140,6 +138,7 @@ def summary(errors: dict[str, float]) -> str:
 def make_trainer(settings: dict[str, Any], **ours: Any) -> L.Trainer:
     """Lightning's Trainer of the yaml's settings and ``ours``. Raises GhptConfigError for what it does not take."""
     settings = build(settings, "trainer")
+    ours["callbacks"] = [*ours.get("callbacks", ()), OwnSignals()]
     for key in set(settings) & set(ours):
         raise GhptConfigError(f"trainer.{key}", "is not for the configuration: ghpt sets it", "Leave it out.")
     check_arguments(L.Trainer, settings, "trainer")
@@ -151,19 +150,6 @@ def make_trainer(settings: dict[str, Any], **ours: Any) -> L.Trainer:
 
 def progress(config: dict[str, Any]) -> list[L.Callback]:
     return [Progress()] if config["progress_bar"] else []
-
-
-@contextmanager
-def shell_status() -> Iterator[None]:
-    """An interrupt exits with 130 and SIGTERM with 143, as shells expect (Lightning's statuses are 1 and 0)."""
-    try:
-        yield
-    except SIGTERMException as stop:
-        raise SystemExit(143) from stop
-    except SystemExit as stop:
-        if isinstance(stop.__context__, KeyboardInterrupt):
-            raise SystemExit(130) from stop
-        raise
 
 
 def shown(path: Path) -> str:
@@ -233,7 +219,7 @@ def _check_resumable(path: Path, config: dict[str, Any], model: Any) -> int:
     if not isinstance(saved, dict):
         raise GhptCheckpointError(path, "does not say what it is of", mend)
     for part in ("model", "data", "seed"):
-        if part not in saved or saved[part] != config[part]:
+        if part not in saved or _what(saved[part]) != _what(config[part]):
             problem = f"was made with other settings of {part!r}"
             raise OtherSettings(path, problem, "Resume with the same ones.")
     for name, kind in _STATE.items():
@@ -245,6 +231,11 @@ def _check_resumable(path: Path, config: dict[str, Any], model: Any) -> int:
     except ValueError as error:
         raise GhptCheckpointError(path, f"does not fit its own model ({error})", mend) from None
     return checkpoint["global_step"]
+
+
+def _what(settings: Any) -> Any:
+    """What decides the numbers: not how the batches are loaded, which one may have to change to go on."""
+    return {k: v for k, v in settings.items() if k != "workers"} if isinstance(settings, dict) else settings
 
 
 def _flat(config: Any, above: str) -> dict[str, Any]:

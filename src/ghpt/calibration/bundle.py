@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pycolmap
 import torch
 from jaxtyping import Bool
 from torch import Tensor
@@ -13,6 +12,7 @@ from torch import Tensor
 from ghpt.calibration.normal_matrix import Linearised, linearise
 from ghpt.calibration.observations import Observations
 from ghpt.calibration.resection import Rig
+from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
 
 

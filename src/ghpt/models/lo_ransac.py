@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
 from ghpt.geometry.normal_equations import usable_views
 from ghpt.geometry.triangulation import Triangulation, triangulate

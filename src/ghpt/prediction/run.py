@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import fields
 from pathlib import Path
 from typing import Any
@@ -15,13 +16,15 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.data import DataLoader
 
+from ghpt.lost import told
 from ghpt.prediction.frames import Frames
 from ghpt.prediction.shards import Shards
 from ghpt.reconstruction import Reconstruction
 from ghpt.recording import KeyPointBatch
-from ghpt.train import make_trainer, shell_status
+from ghpt.train import make_trainer, shown
 
 Predictor = Callable[[KeyPointBatch], Reconstruction]
+_log = logging.getLogger(__name__)
 
 
 class ShardPrediction(L.LightningModule):
@@ -42,6 +45,8 @@ class ShardPrediction(L.LightningModule):
         self.shards, self.size, self.bar = shards, batch, bar
         self.pending = shards.missing()
         self.tick: Callable[[int], None] = lambda frames: None
+        self.shown = ExitStack()
+        """To be closed however the prediction ends: a bar left open hides the terminal's cursor."""
 
     def predict_dataloader(self) -> DataLoader[int]:
         mine = self.pending[self.trainer.global_rank :: self.trainer.world_size]
@@ -60,11 +65,11 @@ class ShardPrediction(L.LightningModule):
 
     def on_predict_start(self) -> None:
         mine = self.pending[self.trainer.global_rank :: self.trainer.world_size]
-        self._bar = _bar(sum(len(self.shards.rows(s)) for s in mine), self.bar and self.trainer.is_global_zero)
-        self.tick = self._bar.__enter__()
+        frames = sum(len(self.shards.rows(shard)) for shard in mine)
+        self.tick = self.shown.enter_context(_bar(frames, self.bar and self.trainer.is_global_zero))
 
     def on_predict_end(self) -> None:
-        self._bar.__exit__(None, None, None)
+        self.shown.close()
 
 
 @contextmanager
@@ -81,13 +86,27 @@ def predicted(
     trainer = make_trainer(settings["trainer"], **ours)
     shards = Shards(folder, key, len(frames), settings["shard_frames"], clean=trainer.is_global_zero)
     module = ShardPrediction(frames, predictor, weights, shards, settings["batch"], settings["progress_bar"])
-    with closing(shards):
+    with closing(shards), _stop_told(shards, trainer.is_global_zero):
         if module.pending:
-            with shell_status():
+            with module.shown, told(trainer):
                 trainer.predict(module, return_predictions=False)
-            trainer.strategy.barrier()
+                trainer.strategy.barrier()
             shards.look()
         yield shards if trainer.is_global_zero else None
+
+
+@contextmanager
+def _stop_told(shards: Shards, first: bool) -> Iterator[None]:
+    """Say what there is to go on from, if the block ends early."""
+    try:
+        yield
+    except BaseException:
+        if first:
+            shards.look()
+            done = len(shards) - len(shards.missing())
+            _log.warning("Stopped. %d of %d shards are in %s.", done, len(shards), shown(shards.folder))
+            _log.warning("The same command goes on with them.")
+        raise
 
 
 def to_cpu(part: Reconstruction) -> Reconstruction:
@@ -101,9 +120,9 @@ def joined(parts: list[Reconstruction]) -> Reconstruction:
 
 
 @contextmanager
-def _bar(frames: int, shown: bool) -> Iterator[Callable[[int], None]]:
+def _bar(frames: int, visible: bool) -> Iterator[Callable[[int], None]]:
     """What is to be called with the number of frames done."""
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not shown) as bar:
+    with Progress(*columns, console=Console(stderr=True), disable=not visible) as bar:
         task = bar.add_task("Frames", total=frames)
         yield lambda done: bar.advance(task, done)

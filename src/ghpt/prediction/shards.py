@@ -19,7 +19,7 @@ import torch
 from filelock import BaseFileLock
 
 from ghpt.errors import GhptDataError
-from ghpt.files import acquire, atomic_write, sweep_temporaries
+from ghpt.files import acquire, atomic_write, errors_name, sweep_temporaries
 from ghpt.reconstruction import Reconstruction
 from ghpt.report.stored_npz import add_member, members_of, read_rows
 
@@ -89,11 +89,14 @@ class Shards:
         with atomic_write(self.path(shard)) as handle:
             handle.write(data)
         self.kept[shard] = {"shard": shard, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        with errors_name(self.folder / MANIFEST):
+            self._list(_line(self.kept[shard]))
+
+    def _list(self, line: bytes) -> None:
         manifest = os.open(self.folder / MANIFEST, os.O_WRONLY | os.O_APPEND)
         try:
-            line = _line(self.kept[shard])
             if os.write(manifest, line) != len(line):
-                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.folder / MANIFEST))
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             os.fsync(manifest)
         finally:
             os.close(manifest)

@@ -1,5 +1,6 @@
 """From test steps to predictions.npz: the callbacks that run the other estimators and write every item's estimates."""
 
+import shutil
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -47,6 +48,10 @@ class Collect(Callback):
         self, trainer: L.Trainer, module: L.LightningModule, outputs: Any, batch: Any, *_: Any
     ) -> None:
         self.write(module, batch, *outputs)
+
+    def on_exception(self, trainer: L.Trainer, module: L.LightningModule, exception: BaseException) -> None:
+        if trainer.is_global_zero:  # nobody goes on with them
+            shutil.rmtree(self.rows, ignore_errors=True)
 
     def on_test_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         trainer.strategy.barrier("all predictions are written")

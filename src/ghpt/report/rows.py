@@ -7,6 +7,7 @@ import re
 import shutil
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from ghpt.errors import GhptDataError, GhptError
-from ghpt.files import allocate, atomic_write
+from ghpt.files import allocate, atomic_write, errors_name
 from ghpt.report.stored_npz import Member, add_member, members_of, text_table
 
 FORMAT_VERSION = 1
@@ -55,8 +56,8 @@ class RowWriter:
         """Write items to their row numbers: a value for each array of the layout."""
         index = rows.cpu().numpy()
         for name, value in (values | {f"weights_{summary}": value for summary, value in weights.items()}).items():
-            self._map(name)[index] = value.detach().cpu().numpy()
-        self._map("written")[index] = True
+            self._put(name, index, value.detach().cpu().numpy())
+        self._put("written", index, np.ones(len(index), bool))
 
     def finish(
         self,
@@ -81,6 +82,18 @@ class RowWriter:
             for name, table in tables.items():
                 add_member(archive, name, table.dtype, table.shape, table.tobytes())
         shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _put(self, name: str, index: Int[np.ndarray, " B"], values: np.ndarray) -> None:
+        # Not through a memory map: where the disk is full that ends the process without a word (SIGBUS).
+        dtype, shape = (self.layout | {"written": ("|b1", ())})[name]
+        rows = np.empty((len(index), *shape), dtype)
+        rows[:] = values
+        starts = np.flatnonzero(np.diff(index, prepend=-2) != 1)
+        size = rows.nbytes // max(len(index), 1)
+        with errors_name(self.folder / name), open(self.folder / name, "r+b") as handle:
+            for start, stop in pairwise([*starts, len(index)]):
+                handle.seek(int(index[start]) * size)
+                handle.write(rows[start:stop].tobytes())
 
     def _map(self, name: str) -> np.memmap:
         # Mapped anew for each use: what a map has touched counts as the process's memory while it is open.

@@ -13,15 +13,17 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import torch
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from ghpt.errors import GhptError
+from ghpt.errors import GhptConfigError, GhptError
 from ghpt.files import sweep_temporaries
 from ghpt.reproduction.cells import Cell, perform, with_needs
+from ghpt.signals import stopped_by_signals
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +39,7 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
     missing = {key: cell for key, cell in with_needs(wanted).items() if not cell.done(cells)}
     number, chain = len(missing), _chains(missing)
     with (
-        _terminable(),
+        stopped_by_signals(),
         _progress(list(missing.values()), show) as tell,
         _executor(min(jobs, len(missing))) as submit,
     ):
@@ -48,15 +50,23 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
                 running[submit(cell, cells)] = waiting.pop(cell.key)
                 tell(running.values(), None)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                cell = running.pop(future)
                 try:
                     future.result()
                 except GhptError as error:
-                    error.args = (f"{cell.name}: {error}",)
+                    error.args = (f"{running[future].name}: {error}",)
                     raise
+                except BrokenProcessPool as error:
+                    raise _killed(running.values()) from error
+                cell = running.pop(future)
                 del missing[cell.key]
                 tell(running.values(), cell)
     return number
+
+
+def _killed(running: Iterable[Cell]) -> GhptConfigError:
+    made = ", ".join(cell.name for cell in running)
+    problem = f"a process was killed while these were made: {made}; the system does so where memory is short"
+    return GhptConfigError("jobs", problem, "Give fewer (jobs=1, say); the same command goes on.")
 
 
 def _chains(cells: dict[str, Cell]) -> dict[str, float]:
@@ -86,21 +96,6 @@ def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[None]]]:
         raise
     finally:
         executor.shutdown()
-
-
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """SIGTERM ends the block as an interrupt does, with status 143."""
-
-    def stop(*_: object) -> None:
-        raise SystemExit(143)
-
-    previous = signal.signal(signal.SIGTERM, stop) if threading.current_thread() is threading.main_thread() else None
-    try:
-        yield
-    finally:
-        if previous is not None:
-            signal.signal(signal.SIGTERM, previous)
 
 
 def _here(cell: Cell, cells: Path) -> Future[None]:

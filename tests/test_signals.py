@@ -1,0 +1,170 @@
+"""B7: a signal stops every command in order, with the status that shells expect."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import ghpt
+import ghpt.test as testing
+import toys
+from ghpt import predict as prediction
+from ghpt.models.baselines import Linear
+from ghpt.prediction.frames import Frames
+from ghpt.prediction.shards import MANIFEST, Shards
+from ghpt.signals import stopped_by_signals
+from ghpt.train import train
+from predicting import config, frames_of
+
+CONF = Path(__file__).resolve().parents[1] / "conf"
+STATUS = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 143}
+pytestmark = pytest.mark.skipif(os.name == "nt", reason="sends itself signals")
+
+
+def send(name: str) -> None:
+    os.kill(os.getpid(), getattr(signal, name))
+
+
+@pytest.fixture(autouse=True)
+def same_handlers():
+    """A block leaves the handlers as it found them."""
+    numbers = [getattr(signal, name) for name in STATUS]
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    assert [signal.getsignal(number) for number in numbers] == before
+
+
+@pytest.mark.parametrize("name", STATUS)
+def test_a_signal_ends_a_command_with_its_status_and_no_word(typed, tmp_path, name):
+    def task(settings, output):
+        send(name)
+        time.sleep(60)
+
+    status, said, errors = typed(CONF, "cameras", [f"output={tmp_path}"], task, str)
+    assert (status, said, errors) == (STATUS[name], "", "")
+
+
+@pytest.mark.parametrize("name", STATUS)
+@pytest.mark.parametrize("error", [ValueError, SystemExit, OSError])
+def test_the_status_is_the_signal_s_whatever_the_interrupted_code_makes_of_it(name, error):
+    with pytest.raises(SystemExit) as stop, stopped_by_signals():
+        try:
+            send(name)
+        finally:
+            raise error(1)
+    assert stop.value.code == STATUS[name]
+
+
+@pytest.mark.parametrize("name", STATUS)
+def test_an_ignored_signal_stays_ignored(name):
+    """So `nohup` has it, and a script's background job."""
+    before = signal.signal(getattr(signal, name), signal.SIG_IGN)
+    try:
+        with stopped_by_signals():
+            send(name)
+    finally:
+        signal.signal(getattr(signal, name), before)
+
+
+def test_an_error_after_a_command_that_was_stopped_is_an_error():
+    with pytest.raises(SystemExit), stopped_by_signals():
+        send("SIGTERM")
+    with pytest.raises(ValueError, match="own"), stopped_by_signals():
+        raise ValueError("own")
+
+
+@pytest.mark.parametrize(("first", "second", "ended"), [
+    ("SIGTERM", "SIGTERM", -signal.SIGTERM), ("SIGINT", "SIGINT", -signal.SIGINT), ("SIGHUP", "SIGHUP", 143),
+])  # fmt: skip
+def test_a_second_signal_ends_the_process_at_once(first, second, ended):
+    """But for SIGHUP, which a closed terminal and its shell both send."""
+    child = os.fork()
+    if child == 0:
+        try:
+            with stopped_by_signals():
+                try:
+                    send(first)
+                finally:
+                    send(second)
+        except SystemExit as stop:
+            os._exit(stop.code)
+        os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == ended
+
+
+def test_pycolmap_s_handler_of_sigterm_is_not_there():
+    program = "import os, signal\nfrom ghpt.colmap import pycolmap\nos.kill(os.getpid(), signal.SIGTERM)"
+    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
+
+
+def test_pycolmap_is_imported_in_one_place():
+    package = Path(ghpt.__file__).parent
+    importing = re.compile(r"^\s*(import|from) pycolmap\b", re.MULTILINE)
+    found = [path.name for path in package.rglob("*.py") if importing.search(path.read_text(encoding="utf-8"))]
+    assert found == ["colmap.py"]
+
+
+@pytest.fixture
+def predict(tmp_path, monkeypatch):
+    """``predict(folder)`` predicts 500 frames in 5 shards into it."""
+    monkeypatch.setattr(sys, "argv", ["predict.py"])
+    monkeypatch.setattr(prediction, "_from_data", lambda _: frames_of(500))
+    settings = config("triangulation=linear", "shard_frames=100", "batch=50", "formats=[npz,csv]")
+    monkeypatch.setattr(prediction, "provenance", lambda seed: {"ghpt": "0", "commit": "", "seed": seed, "command": ""})
+    return lambda folder: prediction.predict(settings, tmp_path / folder)
+
+
+def outputs(folder: Path) -> dict[str, bytes]:
+    names = ("poses.npz", "poses.csv", "prediction.json", "report.md")
+    return {name: (folder / name).read_bytes() for name in names}
+
+
+WHERE = {
+    "between the frames": (Frames, "batch", 4, 1),
+    "before a shard is written": (Shards, "write", 3, 2),
+    "while a format is written": (Shards, "read", 3, 5),
+    "while another is written": (Shards, "read", 8, 5),
+    "while it is evaluated": (prediction, "evaluate", 1, 5),
+}
+"""What the signal interrupts: an object's function, at which call of it, and how many shards there are then."""
+
+
+@pytest.mark.parametrize("where", WHERE)
+def test_a_stopped_prediction_goes_on_to_the_same_bytes(predict, tmp_path, monkeypatch, caplog, where):
+    owner, function, at, shards = WHERE[where]
+    original, calls = getattr(owner, function), []
+
+    def interrupted(*args, **kwargs):
+        calls.append(function)
+        if len(calls) == at:
+            send("SIGTERM")
+        return original(*args, **kwargs)
+
+    with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
+        patch.setattr(owner, function, interrupted)
+        with stopped_by_signals():
+            predict("stopped")
+    assert (stop.value.code, len(calls)) == (143, at)
+    manifest = tmp_path / "stopped" / prediction.SHARDS / MANIFEST
+    assert manifest.read_bytes().count(b"\n") == 1 + shards
+    assert not list((tmp_path / "stopped").rglob("*.tmp"))
+    predict("stopped")
+    predict("whole")
+    assert outputs(tmp_path / "stopped") == outputs(tmp_path / "whole")
+
+
+def test_a_stopped_test_leaves_no_rows(tmp_path, monkeypatch):
+    train(toys.TRAIN, tmp_path / "model")
+    baselines = {"linear": {"_target_": "ghpt.models.baselines.Linear"}}
+    settings = toys.TRAIN | {"ckpt": str(tmp_path / "model" / "last.ckpt"), "hypotheses": None, "baselines": baselines}
+    monkeypatch.setattr(Linear, "__call__", lambda self, batch: send("SIGTERM"))
+    with pytest.raises(SystemExit) as stop:
+        testing.test(settings, tmp_path / "test")
+    assert stop.value.code == 143
+    assert not {".predictions", "predictions.npz", "metrics.json"} & set(os.listdir(tmp_path / "test"))
