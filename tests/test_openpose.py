@@ -124,7 +124,7 @@ def test_bad_folders_are_named(tmp_path):
         ("9.json", '{"people": [{"pose_keypoints_2d": [NaN, 2, 3]}]}', "NaN is no JSON number"),
         ("9.json", '{"people": [{"pose_keypoints_2d": [1e300, 2, 3]}]}', "holds a number beyond 1e6"),
         ("9.json", '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}', "people of 1 joints, the files before of 25"),
-        ("9.json", '{"people": [' + ",".join(['{"pose_keypoints_2d": []}'] * 65) + "]}", "65 are listed"),
+        ("9.json", '{"people": [' + ",".join(['{"pose_keypoints_2d": []}'] * 65) + "]}", "65 people are in a frame"),
     ],
 )
 def test_a_bad_file_is_named(name, content, says, tmp_path):
