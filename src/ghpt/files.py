@@ -3,6 +3,8 @@
 A reader therefore never sees half a file, and a crash at any instant leaves the previous file as it was.
 """
 
+import json
+import math
 import os
 import platform
 import re
@@ -59,6 +61,22 @@ def atomic_write(path: str | Path, mode: str = "wb", verify: Callable[[Path], An
             error.filename = str(path)
         raise
     _sync_folder(path.parent)
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write plain data as JSON, indented; a number that is not finite, for which JSON has no word, as null."""
+    with atomic_write(path, "w") as handle:
+        json.dump(finite(content), handle, indent=1, allow_nan=False)
+        handle.write("\n")
+
+
+def finite(content: Any) -> Any:
+    """Plain data with None in place of every number that is not finite."""
+    if isinstance(content, dict):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 @contextmanager

@@ -25,7 +25,7 @@ def chosen_name(value: Name, existing: Iterable[str]) -> str:
     return same[0] if len(same) == 1 else text
 
 
-def _read_as(name: str, value: float | bool | None) -> bool:
+def _read_as(name: str, value: int | float | bool | None) -> bool:
     """Whether the command line takes ``name`` for this value."""
     if value is None:
         return name.lower() == "null"
