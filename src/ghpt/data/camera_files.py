@@ -24,6 +24,7 @@ from ghpt.data.colmap import is_colmap, read_colmap
 from ghpt.data.names import Name, chosen_name
 from ghpt.data.opencv_yml import read_yml
 from ghpt.data.validate import (
+    MOST_VIEWS,
     SMALL_JSON,
     check_cameras,
     check_view_count,
@@ -40,6 +41,8 @@ from ghpt.geometry.rotations import vector_to_matrix
 _MM_PER_M, _MM_PER_CM = 1000.0, 10.0
 _LARGEST, _DEEPEST = 1 << 19, 100
 """Bytes of a TOML file; parts of a key in it, which cost their square to read."""
+_MOST_TABLES = 10 * MOST_VIEWS
+"""In a TOML file, with the rows of matrices that begin a line."""
 _LARGEST_NUMBER = 1e15
 """No focal length or distance; its square would still be one, though."""
 _FIELDS = ("matrix", "distortions", "rotation", "translation")
@@ -140,6 +143,8 @@ def _toml(path: Path) -> tuple[str, list[_Entry]]:
         data = handle.read(_LARGEST + 1)
     if len(data) > _LARGEST:
         raise GhptDataError(path, "", f"has more than {_LARGEST >> 10} KiB", "Check that this is the right file.")
+    if data.count(b"\n[") > _MOST_TABLES:
+        raise GhptDataError(path, "", f"has more than {_MOST_TABLES} tables", _FORMATS)
     if any(part.count(b".") > _DEEPEST for part in re.split(rb"[=,\n]", data)):
         raise GhptDataError(path, "", f"has a key of more than {_DEEPEST} parts", _FORMATS)
     try:

@@ -18,7 +18,7 @@ from ghpt.data.validate import open_input
 from ghpt.errors import GhptDataError
 
 Node = str | float | list[str] | Float[np.ndarray, "..."]
-_LARGEST, _DEEPEST = 1 << 19, 100
+_LARGEST, _DEEPEST = 1 << 18, 100
 """Bytes; lists in lists, by brackets or by indentation."""
 _INDENTED = re.compile(rb"^[ ?:-]{%d}" % (_DEEPEST + 1), re.MULTILINE)
 _Base: type = getattr(yaml, "CBaseLoader", yaml.BaseLoader)

@@ -31,7 +31,7 @@ _MAX_JSON = 64 << 20
 SMALL_JSON = 4 << 20
 """Bytes of a JSON file that holds a rig's cameras, or one frame."""
 _MOST_OBJECTS, _MOST_LISTS, _MOST_VALUES = 400_000, 1_500_000, 12_000_000
-"""In a JSON file: what each of them costs in memory is a hundred times what it costs in the file."""
+"""In a JSON file of ``_MAX_JSON`` bytes: each costs up to a hundred times as many bytes of memory as of the file."""
 _RATES = (1e-3, 1e5)
 """Frames per second, from a time lapse to the fastest camera."""
 MOST_VIEWS = 1000
@@ -208,7 +208,8 @@ def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
     if len(data) > largest:
         raise GhptDataError(path, "", f"has more than {largest >> 20} MiB", mend)
     # before they are made: a file of 64 MiB could ask for 2 GiB of memory
-    for sign, most in ((b"{", _MOST_OBJECTS), (b"[", _MOST_LISTS), (b",", _MOST_VALUES)):
+    for sign, of_largest in ((b"{", _MOST_OBJECTS), (b"[", _MOST_LISTS), (b",", _MOST_VALUES)):
+        most = of_largest * largest // _MAX_JSON
         if data.count(sign) > most:
             raise GhptDataError(path, "", f"holds more than {most} times {sign.decode()!r}", mend)
 
