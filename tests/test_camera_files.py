@@ -188,6 +188,7 @@ def test_intrinsics_alone_are_enough(tmp_path):
         ("900.0", "true", "camera a, matrix: is not 9 finite numbers"),
         ("900.0", '"900"', "camera a, matrix: is not 9 finite numbers"),
         ("900.0", "inf", "camera a, matrix: is not 9 finite numbers"),
+        ("900.0", "1.1e15", "camera a, matrix: is not 9 finite numbers"),
         ("[[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]", "[[[[900.0, 0, 640, 0, 900, 360, 0, 0, 1]]]]", "a, matrix"),
         ("[0.1, 0, 0, 0]", "[0.1, true, 0, 0]", "camera a, distortion: is not 4 or 5 finite numbers"),
         ("[0.1, 0, 0, 0]", "[[0.1, 0], [0, 0]]", "camera a, distortion: is not 4 or 5 finite numbers"),
