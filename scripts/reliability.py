@@ -12,7 +12,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from ghpt.files import atomic_write
+from ghpt.files import write_json
 from ghpt.provenance import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -32,8 +32,8 @@ def main() -> int:
     for row in sorted(rows, key=lambda r: r["row"]):
         bound = f"failure rate < {3 / row['total']:.3g} at 95 %" if row["passed"] == row["total"] > 1 else ""
         print(f"{row['row']:4} {row['passed']:>6}/{row['total']:<6} {row['figure']}  {bound}")
-    with atomic_write(options.output, "w") as handle:
-        json.dump({"nightly": options.nightly, "provenance": provenance(0), "rows": rows}, handle, indent=1)
+    content = {"nightly": options.nightly, "provenance": provenance(0), "rows": rows}
+    write_json(options.output, content)
     return status
 
 

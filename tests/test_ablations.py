@@ -8,11 +8,12 @@ import pytest
 import torch
 
 from ghpt.config import build
+from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import load_model
 from ghpt.reproduction.ablation_work import evaluate
 from ghpt.reproduction.ablations import ITEMS
-from ghpt.reproduction.cells import read_json, write_json
+from ghpt.reproduction.cells import read_json
 from ghpt.reproduction.item import Results, Section
 from ghpt.reproduction.setup import Setup
 from ghpt.train import train

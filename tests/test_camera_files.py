@@ -178,6 +178,25 @@ def test_intrinsics_alone_are_enough(tmp_path):
     ("old", "new", "says"),
     [
         ("distortions", "fisheye = true\ndistortions", r"a\.fisheye: is true.*Undistort"),
+        ("distortions", "fisheye = 1\ndistortions", r"a\.fisheye: is true.*Undistort"),
+        ("distortions", "fisheye = 2\ndistortions", r"c\.toml: a\.fisheye: is 2, not true or false"),
+        ("distortions", "fisheye = 1.0\ndistortions", r"a\.fisheye: is 1.0, not true or false"),
+        ("distortions", 'fisheye = "true"\ndistortions', r"a\.fisheye: is 'true', not true or false"),
+        ("distortions", 'ignore = "no"\ndistortions', r"a\.ignore: is 'no', not true or false"),
+        ('name = "a"', "name = true", r"a\.name: is True, not a name"),
+        ('name = "a"', 'name = " "', r"a\.name: is ' ', not a name"),
+        ("900.0", "true", "camera a, matrix: is not 9 finite numbers"),
+        ("900.0", '"900"', "camera a, matrix: is not 9 finite numbers"),
+        ("900.0", "inf", "camera a, matrix: is not 9 finite numbers"),
+        ("900.0", "1.1e15", "camera a, matrix: is not 9 finite numbers"),
+        ("[[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]", "[[[[900.0, 0, 640, 0, 900, 360, 0, 0, 1]]]]", "a, matrix"),
+        ("[0.1, 0, 0, 0]", "[0.1, true, 0, 0]", "camera a, distortion: is not 4 or 5 finite numbers"),
+        ("[0.1, 0, 0, 0]", "[[0.1, 0], [0, 0]]", "camera a, distortion: is not 4 or 5 finite numbers"),
+        ("[0, 0.5, 0]", "[0, true, 0]", "camera a, rotation: is not 3 or 9 finite numbers"),
+        ("[0, 0.5, 0]", '"0 0.5 0"', "camera a, rotation: is not 3 or 9 finite numbers"),
+        ("[0, 0, 3]", "[0, true, 3]", "camera a, translation: is not 3 finite numbers"),
+        ("[0, 0, 3]", "true", "camera a, translation: is not 3 finite numbers"),
+        ("[1280, 720]", "[true, 720]", "camera a, size: is not 2 finite numbers"),
         ("matrix", "matrices", r"a\.matrix: is missing"),
         ("[0.1, 0, 0, 0]", "[0.1, 0]", "camera a, distortion: is not 4 or 5 finite numbers"),
         ("[0.1, 0, 0, 0]", "[nan, 0, 0, 0]", "camera a, distortion: is not 4 or 5"),
@@ -219,6 +238,38 @@ def test_a_bad_file_is_named(content, says, tmp_path):
     (tmp_path / "cameras").write_bytes(content)
     with pytest.raises(GhptDataError, match=says):
         read_cameras(tmp_path / "cameras")
+
+
+@pytest.mark.parametrize("field", ["K", "distCoef", "R", "t", "resolution"])
+def test_true_in_json_is_no_number(field, tmp_path):
+    camera = {"type": "hd", "K": np.eye(3).tolist(), "distCoef": [0.0] * 5, "resolution": [1920, 1080]}
+    cameras = [camera | {"name": i, "R": np.eye(3).tolist(), "t": [[0], [0], [i]]} for i in (3, 4)]
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps({"cameras": cameras}))
+    assert read_cameras(path).names == ("3", "4")
+    inner = cameras[1][field] = json.loads(json.dumps(cameras[1][field]))
+    (inner if isinstance(inner[0], float | int) else inner[0])[0] = True
+    path.write_text(json.dumps({"cameras": cameras}))
+    with pytest.raises(GhptDataError, match=r"calibration\.json: camera 4, .* finite numbers"):
+        read_cameras(path)
+
+
+@pytest.mark.parametrize(("name", "content", "says"), [
+    ("c.json", '{"intrinsics": {"a": {}, "b": {}, "a": {}}}', "'a' is there twice"),
+    ("intri.yml", "%YAML:1.0\n---\nK_a: 1\nK_b: 2\nK_a: 3\n", "K_a is there twice"),
+    ("c.json", '{"cameras": [{"name": true, "K": 1, "distCoef": 1}]}', "name: is True, not a name"),
+    ("intri.yml", "%YAML:1.0\n---\nnames: [a, b]\nK_a: true\nK_b: true\n", "camera a, matrix: is not 9"),
+])  # fmt: skip
+def test_a_name_that_is_there_twice_or_is_none_is_named(name, content, says, tmp_path):
+    (tmp_path / name).write_text(content)
+    with pytest.raises(GhptDataError, match=says):
+        read_cameras(tmp_path / name)
+
+
+def test_a_camera_whose_flag_is_zero_is_read(tmp_path):
+    assert read_cameras(toml(tmp_path, old="distortions", new="fisheye = 0\ndistortions")).names == ("a", "b")
+    text = toml(tmp_path).read_text().replace("[a]", "[a]\nignore = 1") + CAMERA.format(key="c", turn=2)
+    assert read_cameras(toml(tmp_path, text)).names == ("b", "c")
 
 
 def test_yml_is_read_without_running_code(tmp_path):

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import real_layout as layout
+from ghpt.files import write_json
 from ghpt.reproduction.camera_tables import ITEMS
-from ghpt.reproduction.cells import Cell, perform, read_json, with_needs, write_json
+from ghpt.reproduction.cells import Cell, perform, read_json, with_needs
 from ghpt.reproduction.item import Item, Results, Section
 from ghpt.reproduction.setup import Setup
 

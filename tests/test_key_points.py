@@ -9,12 +9,13 @@ import torch
 
 from damage import damage
 from ghpt.data.camera_files import CameraFile
-from ghpt.data.key_points import KeyPoints, read_key_points, write_key_points
+from ghpt.data.key_points import KeyPoints, read_key_points, read_people, write_key_points
 from ghpt.data.lens import distort
 from ghpt.data.skeletons import SKELETONS
 from ghpt.data.views import look_through, matched, normal
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import project
+from ghpt.prediction.stored import open_stored
 from scenes import random_scene
 
 
@@ -53,6 +54,33 @@ def test_our_npz_comes_back_as_it_was(tmp_path):
     for name, value in vars(replace(points, path=str(tmp_path / "points.npz"))).items():
         assert np.array_equal(getattr(found, name), value), name
     assert read_key_points(tmp_path / "points.npz", rate_hz=30).rate_hz == 30
+
+
+@pytest.mark.parametrize("rate", [0.0, -50.0, np.inf, -np.inf, 1e6, 1e-9])
+def test_a_rate_that_no_camera_has_is_refused(rate, tmp_path):
+    """In the file, as a setting, and in a file that is read in parts."""
+    path = tmp_path / "points.npz"
+    write_key_points(path, key_points())
+    with pytest.raises(GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"):
+        read_people(path, rate_hz=rate)
+    write_key_points(path, replace(key_points(), rate_hz=rate))
+    with pytest.raises(GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"):
+        read_people(path)
+    with np.load(path) as arrays:
+        np.savez(path, **arrays)
+    with pytest.raises(GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"):
+        open_stored(path, None, None)
+    with pytest.raises(GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"):
+        open_stored(path, None, rate)
+
+
+def test_a_rate_that_is_not_a_number_is_unknown(tmp_path):
+    path = tmp_path / "points.npz"
+    write_key_points(path, replace(key_points(), rate_hz=np.nan))
+    assert read_people(path).rate_hz is None
+    with np.load(path) as arrays:
+        np.savez(path, **arrays)
+    assert open_stored(path, None, None).rate_hz is None
 
 
 def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from ghpt.data.key_points import read_key_points
+from ghpt.data.key_points import read_key_points, read_people
 from ghpt.data.openpose import follow, read_view
 from ghpt.data.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
@@ -86,6 +86,56 @@ def test_following_is_the_best_of_all_choices():
     assert tuple(follow(people)) == max(product(range(3), repeat=5), key=value)
 
 
+def test_a_confidence_of_nothing_is_not_seen_wherever_the_point_is(tmp_path):
+    one = person()
+    one[3:6, 2] = 0, -0.1, 1e-6
+    write(tmp_path / "cam1", [[one]])
+    write(tmp_path / "cam2", [[person()]])
+    found = read_key_points(tmp_path, **JOINTS)
+    assert found.seen[0, 0, 2:6].tolist() == [True, False, False, True]
+
+
+def test_missing_joints_make_nobody_large():
+    """They are at 0, 0: far from someone who is small and at the other side of the image."""
+    small = person(900, 0.3)
+    small[5] = 0
+    assert follow([np.stack([person(), small])]).tolist() == [0]
+    assert follow([np.stack([small, person()])] * 3).tolist() == [1] * 3
+
+
+def test_a_jump_costs_twice_its_distance_in_sizes():
+    """Of someone sure who is 0.35 sizes away: 0.7 of a quality."""
+    away = person(0.35 * np.linalg.norm(np.ptp(BODY, axis=0)), confidence=1)
+    for confidence, chosen in ((0.2, 1), (0.4, 0)):
+        frames = [person(confidence=1)[None], np.stack([person(confidence=confidence), away])]
+        assert follow(frames).tolist() == [0, chosen]
+
+
+def test_person_ids_count_where_everybody_has_one(tmp_path):
+    def write_ids(view, ids):
+        (tmp_path / view).mkdir(exist_ok=True)
+        people = [{"person_id": [i], "pose_keypoints_2d": person().ravel().tolist()} for i in ids]
+        (tmp_path / view / "1.json").write_text(json.dumps({"people": people}))
+
+    write_ids("a", [1, 0])
+    write_ids("b", [7])
+    assert read_people(tmp_path, **JOINTS).identity.tolist() == [1, 0, 7]
+    for other in (-1, True, 1 << 31, "1", 1.0):
+        write_ids("b", [other])
+        assert read_people(tmp_path, **JOINTS).identity.tolist() == [-1, -1, -1]
+
+
+def test_64_people_are_read_and_a_pixel_below_a_million(tmp_path):
+    one = person()
+    one[0, 0] = 999_999.5
+    write(tmp_path / "a", [[one] * 64])
+    assert read_view(tmp_path / "a").values.shape == (64, 25, 3)
+    one[0, 0] = -1e6
+    write(tmp_path / "a", [[one]])
+    with pytest.raises(GhptDataError, match="beyond 1e6"):
+        read_view(tmp_path / "a")
+
+
 def test_the_number_of_people_is_told(tmp_path):
     write(tmp_path / "a", [[person(), person(900)], [person()], []])
     write(tmp_path / "b", [[person()]] * 3)
@@ -124,7 +174,7 @@ def test_bad_folders_are_named(tmp_path):
         ("9.json", '{"people": [{"pose_keypoints_2d": [NaN, 2, 3]}]}', "NaN is no JSON number"),
         ("9.json", '{"people": [{"pose_keypoints_2d": [1e300, 2, 3]}]}', "holds a number beyond 1e6"),
         ("9.json", '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}', "people of 1 joints, the files before of 25"),
-        ("9.json", '{"people": [' + ",".join(['{"pose_keypoints_2d": []}'] * 65) + "]}", "65 are listed"),
+        ("9.json", '{"people": [' + ",".join(['{"pose_keypoints_2d": []}'] * 65) + "]}", "65 people are in a frame"),
     ],
 )
 def test_a_bad_file_is_named(name, content, says, tmp_path):

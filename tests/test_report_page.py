@@ -6,8 +6,10 @@ from dataclasses import replace
 from html.parser import HTMLParser
 
 import pytest
+from markdown_it import MarkdownIt
 from matplotlib.figure import Figure
 
+from ghpt.report.escape import code
 from ghpt.reproduction.item import Claim, Compared, Item, Section, Spread
 from ghpt.reproduction.page import Entry, Page, write_page
 
@@ -113,3 +115,34 @@ def test_numbers_and_claims_for_programs(page, tmp_path):
     assert items["first"]["numbers"][0] == {"what": "weight", "paper": 29.1, "ours": [26.0, 27.0], "miss": False}
     assert [claim["holds"] for claim in items["first"]["claims"]] == [True, False, None]
     assert items["second"] == {"data": "Human3.6M from /data", "numbers": [], "claims": []}
+
+
+def test_a_comparison_without_a_number_is_shown_as_a_dash(page, tmp_path):
+    """Whether the paper's or ours is missing: beside others, and alone."""
+    known = page.entries[0].section.compared
+    missing = [Compared("theirs", None, Spread((1.0,))), Compared("ours", 2.0, None)]
+    lines = []
+    for compared in ([*known, *missing], missing):
+        entry = Entry(page.entries[0].item, Section("x", "y", {}, compared), [])
+        changed = replace(page, entries=[entry, page.entries[1]])
+        write_page(changed, tmp_path)
+        text = (tmp_path / "report.md").read_text()
+        lines.append(next(line for line in text.splitlines() if line.startswith("| [first]")))
+        numbers = json.loads((tmp_path / "report.json").read_text())["items"]["first"]["numbers"]
+        assert [n["ours"] for n in numbers[-2:]] == [[1.0], None]
+    cells = [[cell.strip() for cell in line.split("|")[1:-1]] for line in lines]
+    assert cells[0][1:4] == ["4", "+11.8 %", "1"]
+    assert cells[1][1:4] == ["2", "–", "0"]
+
+
+def test_a_folder_s_name_is_shown_as_it_is(page, tmp_path):
+    name = "/d/a|b<c>[red]`x`"
+    section = replace(page.entries[0].section, data=f"Human3.6M from {name}")
+    entry = Entry(page.entries[0].item, section, [f"python train.py data.root='{name}\n```'"])
+    about = {"data": name, "command": code(f"a `b` {name}")}
+    write_page(replace(page, entries=[entry, page.entries[1]], about=about), tmp_path)
+    markdown = MarkdownIt("gfm-like", {"linkify": False, "html": False}).render((tmp_path / "report.md").read_text())
+    for text in (markdown, (tmp_path / "report.html").read_text()):
+        tags = Tags(text)
+        assert tags.text.count(name) == 4
+        assert "c" not in tags.tags

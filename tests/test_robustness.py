@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from ghpt.reproduction.cells import read_json, write_json
+from ghpt.files import write_json
+from ghpt.reproduction.cells import read_json
 from ghpt.reproduction.item import Results, Section
 from ghpt.reproduction.robustness import ITEMS
 from ghpt.reproduction.robustness_work import curve

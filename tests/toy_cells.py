@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ghpt.errors import GhptDataError
-from ghpt.reproduction.cells import Cell, read_json, write_json
+from ghpt.files import write_json
+from ghpt.reproduction.cells import Cell, read_json
 
 
 def add(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:

@@ -21,6 +21,7 @@ from ghpt.config import build, check_type, suggest
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.chosen import InputSettings, own_cameras, own_key_points, recording_of
 from ghpt.data.key_points import KeyPoints
+from ghpt.data.names import Name
 from ghpt.data.views import Views, look_through
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
@@ -42,7 +43,7 @@ class Scale(TypedDict):
 
     height: float | None
     segments: dict[str, Any] | None
-    baseline: list[str | int | float] | None
+    baseline: list[Name] | None
     assumed_height: float
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,6 +12,7 @@ import numpy as np
 import torch
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from ghpt.app import Command
 from ghpt.calibrate import people_note
@@ -28,10 +28,11 @@ from ghpt.data.key_points import KeyPoints
 from ghpt.data.lens import distort
 from ghpt.data.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
-from ghpt.files import atomic_write, remove, sweep_temporaries
+from ghpt.files import atomic_write, remove, sweep_temporaries, write_json
 from ghpt.outputs import Files, check_apart, input_paths
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
+from ghpt.report.escape import escaped, plain
 from ghpt.report.tables import markdown, words
 from ghpt.train import shown
 
@@ -86,8 +87,7 @@ def examine(config: dict[str, Any], output: Path) -> dict[str, Any]:
     mended = any(finding.mended for finding in checkup.findings)
     if mended:
         write_mended(output, patient.cameras, checkup, patient.points, patient.at)
-    with atomic_write(output / "checkup.json", "w") as handle:
-        json.dump(numbers, handle, indent=1)
+    write_json(output / "checkup.json", numbers)
     with atomic_write(output / "report.md", "w") as handle:
         handle.write(report(numbers))
     _print(numbers)
@@ -147,9 +147,9 @@ def from_recording(recording: Recording, data: Any, doctor: Doctor, frames: int)
 
 def report(numbers: dict[str, Any]) -> str:
     """The Markdown report."""
-    findings = "\n".join(f"- **{f['code']}**: {_sentence(f)}" for f in numbers["findings"])
+    findings = "\n".join(f"- **{f['code']}**: {escaped(_sentence(f))}" for f in numbers["findings"])
     return "\n\n".join([
-        f"# Check-up of {numbers['title']}",
+        f"# Check-up of {escaped(numbers['title'])}",
         f"{numbers['frames']} frames, {len(numbers['cameras'])} views. {_stature(numbers)}",
         "## Findings", findings or "Nothing is wrong.",
         "## Cameras", markdown(_HEADER, _rows(numbers)),
@@ -169,16 +169,18 @@ def _numbers(patient: Patient, checkup: Checkup) -> dict[str, Any]:
 
 def _print(numbers: dict[str, Any]) -> None:
     console = Console()
-    table = Table(title=f"Check-up of {numbers['title']}", caption="median error against the other views",
+    title = plain(f"Check-up of {numbers['title']}", "table.title")
+    table = Table(title=title, caption="median error against the other views",
                   title_justify="left", caption_justify="left")  # fmt: skip
     for i, column in enumerate(_HEADER):
         table.add_column(column, justify="right" if i else "left")
     for row in _rows(numbers):
-        table.add_row(*row)
+        table.add_row(*map(plain, row))
     console.print(table)
     console.print(_stature(numbers), highlight=False)
     for finding in numbers["findings"]:
-        console.print(f"[red]{finding['code']}[/red]: {_sentence(finding)}", highlight=False, soft_wrap=True)
+        line = Text.assemble((finding["code"], "red"), ": ", plain(_sentence(finding)))
+        console.print(line, soft_wrap=True)
     if not numbers["findings"]:
         console.print("Nothing is wrong.", highlight=False)
 

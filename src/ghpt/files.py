@@ -7,6 +7,8 @@ was. Within the output folder of a command, `ghpt.outputs` guards what may be re
 import errno
 import hashlib
 import itertools
+import json
+import math
 import os
 import platform
 import re
@@ -183,6 +185,22 @@ def _second_name(path: Path, second: Path) -> None:
         shutil.copyfile(path, second)
         with open(second, "rb+") as handle:
             os.fsync(handle.fileno())
+
+
+def write_json(path: str | Path, content: Any) -> None:
+    """Write plain data as JSON, indented; a number that is not finite, for which JSON has no word, as null."""
+    with atomic_write(path, "w") as handle:
+        json.dump(finite(content), handle, indent=1, allow_nan=False)
+        handle.write("\n")
+
+
+def finite(content: Any) -> Any:
+    """Plain data with None in place of every number that is not finite."""
+    if isinstance(content, dict):
+        return {key: finite(value) for key, value in content.items()}
+    if isinstance(content, list | tuple):
+        return [finite(value) for value in content]
+    return None if isinstance(content, float) and not math.isfinite(content) else content
 
 
 @contextmanager

@@ -20,7 +20,7 @@ from ghpt.data.views import look_through
 from ghpt.errors import GhptCheckpointError, check
 from ghpt.export import WRITERS, Scene
 from ghpt.export.scene import origin_note
-from ghpt.files import atomic_write, sweep_temporaries
+from ghpt.files import atomic_write, sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
 from ghpt.models.predictors import Classical, Learned
@@ -145,9 +145,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
         "evaluation": evaluate(frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"]),
         "formats": formats, "provenance": about.provenance,
     }  # fmt: skip
-    with atomic_write(output / "prediction.json", "w") as handle:
-        json.dump(numbers, handle, indent=1)
-        handle.write("\n")
+    write_json(output / "prediction.json", numbers)
     with atomic_write(output / "report.md", "w") as handle:
         handle.write(prediction_report(numbers))
     print_prediction(numbers)

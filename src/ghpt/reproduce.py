@@ -18,6 +18,7 @@ from ghpt.errors import GhptConfigError, check
 from ghpt.jobs import Job
 from ghpt.outputs import Files
 from ghpt.provenance import provenance
+from ghpt.report.escape import code
 from ghpt.report.tables import words
 from ghpt.reproduction import (
     ablations,
@@ -207,7 +208,7 @@ def _about(config: dict[str, Any], setups: Sequence[Setup], done: int, start: fl
         "seeds": f"{len(seeds)} ({', '.join(map(str, seeds))}), of training and hypotheses; the data are the same",
         "made by": f"ghpt {origin['ghpt']}, commit {origin['commit'] or 'unknown'}, torch {origin['torch']}, "
         f"numpy {origin['numpy']}, Python {origin['python']}",
-        "command": f"`{origin['command']}`",
+        "command": code(origin["command"]),
         "run time": f"{minutes:.1f} minutes on {processors()} processors, for {done} cells that were not there before",
     }  # fmt: skip
 

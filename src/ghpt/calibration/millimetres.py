@@ -10,6 +10,7 @@ import torch
 
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.rig import RigEstimate
+from ghpt.data.names import chosen_name
 from ghpt.errors import GhptConfigError, check
 from ghpt.models.scale import BodyHeight, SegmentLengths, body_scale
 
@@ -28,7 +29,7 @@ def check_scale(scale: Mapping[str, Any], names: Sequence[str]) -> None:
     if given == ["baseline"]:
         baseline = scale["baseline"]
         mend = f"Give two of {', '.join(names)} and their distance in mm: [{names[0]}, {names[-1]}, 3000]."
-        good = len(baseline) == 3 and len({*map(str, baseline[:2])} & set(names)) == 2
+        good = len(baseline) == 3 and len({chosen_name(name, names) for name in baseline[:2]} & set(names)) == 2
         check(good and type(baseline[2]) in (int, float) and 0 < baseline[2] < math.inf, "scale.baseline",
               f"is {baseline}", mend)  # fmt: skip
 
@@ -36,7 +37,7 @@ def check_scale(scale: Mapping[str, Any], names: Sequence[str]) -> None:
 def in_millimetres(estimate: RigEstimate, scale: Mapping[str, Any]) -> tuple[RigEstimate, dict[str, Any]]:
     """The rig in millimetres, and what its scale is from; as it was, in a unit of its own, if nothing gives one."""
     if scale["baseline"] is not None:
-        a, b = (estimate.names.index(str(name)) for name in scale["baseline"][:2])
+        a, b = (estimate.names.index(chosen_name(name, estimate.names)) for name in scale["baseline"][:2])
         centre, mm = estimate.cameras.centre, float(scale["baseline"][2])
         length = float((centre[a] - centre[b]).norm()) if bool(estimate.calibrated[[a, b]].all()) else 0.0
         factor = mm / length if length > 0 else 0.0

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.key_points import KeyPoints
+from ghpt.data.names import Name
 from ghpt.data.skeletons import joints17
 from ghpt.data.views import matched
 from ghpt.errors import GhptDataError
@@ -39,8 +40,8 @@ class Evidence:
 def gather(
     points: KeyPoints,
     cameras: CameraFile,
-    match: Mapping[str, str],
-    views: Sequence[str] | None,
+    match: Mapping[Name, Name],
+    views: Sequence[Name] | None,
     frames: int,
     reach: int,
 ) -> tuple[Evidence, CameraFile, tuple[int, ...]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ghpt.data.detections import in_image
 from ghpt.data.people import KeyPoints, joints_for
-from ghpt.data.validate import read_json, read_npy
+from ghpt.data.validate import check_view_count, read_json, read_npy
 from ghpt.errors import GhptDataError
 
 _LAYOUT = "A folder must hold all_2d_preds.npy and all_bboxes.npy, or all_2d_preds<n>.npy and all_bboxes<n>.npy."
@@ -27,6 +27,7 @@ def read_authors(path: Path, skeleton: str | None) -> KeyPoints:
     pixels, there = [], []
     for predictions, boxes in _chunks(folder, path):
         crop = read_npy(predictions, (None, None, None, 2), "f")
+        check_view_count(predictions, crop.shape[1])
         if not boxes.is_file():
             raise GhptDataError(boxes, "", "there is no such file: the predictions are in pixels of a crop", _LAYOUT)
         corners = read_npy(boxes, (*crop.shape[:2], 2, 2), "fiu").astype(np.float64)

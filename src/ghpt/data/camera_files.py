@@ -21,16 +21,28 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghpt.data.colmap import is_colmap, read_colmap
+from ghpt.data.names import Name, chosen_name
 from ghpt.data.opencv_yml import read_yml
-from ghpt.data.validate import check_cameras, open_input, read_json
+from ghpt.data.validate import (
+    MOST_VIEWS,
+    SMALL_JSON,
+    check_cameras,
+    check_view_count,
+    numbers_in,
+    open_input,
+    read_flag,
+    read_json,
+    read_name,
+)
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import vector_to_matrix
 
 _MM_PER_M, _MM_PER_CM = 1000.0, 10.0
-_LARGEST, _DEEPEST = 1 << 20, 100
+_LARGEST, _DEEPEST = 1 << 19, 100
 """Bytes of a TOML file; parts of a key in it, which cost their square to read."""
-_MOST_CAMERAS = 10_000
+_MOST_TABLES = 10 * MOST_VIEWS
+"""In a TOML file, with the rows of matrices that begin a line."""
 _LARGEST_NUMBER = 1e15
 """No focal length or distance; its square would still be one, though."""
 _FIELDS = ("matrix", "distortions", "rotation", "translation")
@@ -94,7 +106,7 @@ class _Entry:
     t: Any = None
 
 
-def read_cameras(path: str | Path, subject: str | None = None, unit_mm: int | float | None = None) -> CameraFile:
+def read_cameras(path: str | Path, subject: Name = None, unit_mm: int | float | None = None) -> CameraFile:
     """The cameras of a file, or of a folder with intri.yml or a COLMAP model; the format is recognised by content.
 
     ``subject`` chooses of a Human3.6M file, which has other extrinsics for each. ``unit_mm`` is the length of the
@@ -119,7 +131,7 @@ def read_cameras(path: str | Path, subject: str | None = None, unit_mm: int | fl
     if start.startswith(b"%YAML"):
         return _checked(path, "OpenCV", _opencv(path), given or _MM_PER_M)
     if start.startswith((b"{", b"\xff\xfe{", b"\xfe\xff\0{")):
-        content = read_json(path)
+        content = read_json(path, SMALL_JSON)
         if isinstance(content, dict) and "intrinsics" in content:
             return _checked(path, "Human3.6M", _human36m(path, content, subject), given or 1.0)
         return _checked(path, "Panoptic", _panoptic(path, content), given or _MM_PER_CM)
@@ -130,7 +142,9 @@ def _toml(path: Path) -> tuple[str, list[_Entry]]:
     with open_input(path) as handle:
         data = handle.read(_LARGEST + 1)
     if len(data) > _LARGEST:
-        raise GhptDataError(path, "", f"has more than {_LARGEST >> 20} MiB", "Check that this is the right file.")
+        raise GhptDataError(path, "", f"has more than {_LARGEST >> 10} KiB", "Check that this is the right file.")
+    if data.count(b"\n[") > _MOST_TABLES:
+        raise GhptDataError(path, "", f"has more than {_MOST_TABLES} tables", _FORMATS)
     if any(part.count(b".") > _DEEPEST for part in re.split(rb"[=,\n]", data)):
         raise GhptDataError(path, "", f"has a key of more than {_DEEPEST} parts", _FORMATS)
     try:
@@ -141,7 +155,9 @@ def _toml(path: Path) -> tuple[str, list[_Entry]]:
     tables = nested if isinstance(nested, dict) else content
     entries = []
     for key, table in tables.items():
-        if isinstance(table, dict) and any(field in table for field in _FIELDS) and table.get("ignore") is not True:
+        if not isinstance(table, dict) or not any(field in table for field in _FIELDS):
+            continue
+        if not read_flag(path, f"{key}.ignore", table.get("ignore", False)):
             entries.append(_toml_camera(path, key, table, nested is tables))
     known = "caliscope" if nested is tables else "Pose2Sim" if any("fisheye" in t for t in tables.values()
                                                                   if isinstance(t, dict)) else "aniposelib"  # fmt: skip
@@ -149,14 +165,15 @@ def _toml(path: Path) -> tuple[str, list[_Entry]]:
 
 
 def _toml_camera(path: Path, key: str, table: Mapping[str, Any], numbered: bool) -> _Entry:
-    if table.get("fisheye") is True:
+    if read_flag(path, f"{key}.fisheye", table.get("fisheye", False)):
         raise GhptDataError(path, f"{key}.fisheye", "is true: fisheye lenses are not supported",
                             "Undistort the images or the key points first, and give the pinhole camera.")  # fmt: skip
     for field in ("matrix", "distortions"):
         if field not in table:
             raise GhptDataError(path, f"{key}.{field}", "is missing", "Calibrate the intrinsics of this camera.")
     other = f"cam_{key}" if numbered and key.isdigit() else key
-    return _Entry(str(table.get("name", other)), other, table["matrix"], table["distortions"], table.get("size"),
+    name = read_name(path, f"{key}.name", table.get("name", other))
+    return _Entry(name, other, table["matrix"], table["distortions"], table.get("size"),
                   table.get("rotation"), table.get("translation"))  # fmt: skip
 
 
@@ -167,6 +184,7 @@ def _opencv(path: Path) -> list[_Entry]:
     names = intrinsic.get("names")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise GhptDataError(path, "names", "is not a list of the cameras' names", "Write it as EasyMocap does.")
+    check_view_count(path, len(names))
     entries = []
     for name in names:
         if f"K_{name}" not in intrinsic:
@@ -183,13 +201,15 @@ def _opencv(path: Path) -> list[_Entry]:
     return entries
 
 
-def _human36m(path: Path, content: Mapping[str, Any], subject: str | None) -> list[_Entry]:
+def _human36m(path: Path, content: Mapping[str, Any], subject: Name) -> list[_Entry]:
     """karfly's file: R and t take the world (mm) to the camera, unlike those of the data set's own XML."""
     intrinsics, extrinsics = content["intrinsics"], content.get("extrinsics", {})
     for field, value in (("intrinsics", intrinsics), ("extrinsics", extrinsics)):
         if not isinstance(value, dict) or not all(isinstance(part, dict) for part in value.values()):
             raise GhptDataError(path, field, "is not an object of objects", "Get the file again.")
-    if subject is None and len(extrinsics) == 1:
+    if subject is not None:
+        subject = chosen_name(subject, extrinsics)
+    elif len(extrinsics) == 1:
         subject = next(iter(extrinsics))
     if subject not in extrinsics and (extrinsics or subject is not None):
         problem = "the extrinsics are different for each subject" if subject is None else f"there is no {subject!r}"
@@ -212,18 +232,21 @@ def _panoptic(path: Path, content: Any) -> list[_Entry]:
     cameras = content.get("cameras") if isinstance(content, dict) else None
     if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
         raise GhptDataError(path, "cameras", "is not a list of cameras", _FORMATS)
+    check_view_count(path, len(cameras))
     high = [camera for camera in cameras if camera.get("type", "hd") == "hd"]
     for camera in high:
         for field in ("name", "K", "distCoef"):
             if field not in camera:
                 raise GhptDataError(path, f"camera {camera.get('name')}, {field}", "is missing", "Get the file again.")
-    return [_Entry(str(c["name"]), "", c["K"], c["distCoef"], c.get("resolution"), c.get("R"), c.get("t"))
-            for c in high]  # fmt: skip
+    names = [read_name(path, "name", camera["name"]) for camera in high]
+    return [_Entry(name, "", c["K"], c["distCoef"], c.get("resolution"), c.get("R"), c.get("t"))
+            for name, c in zip(names, high, strict=True)]  # fmt: skip
 
 
 def _checked(path: Path, form: str, entries: Sequence[_Entry], mm_per_unit: float) -> CameraFile:
-    if not entries or len(entries) > _MOST_CAMERAS:
-        raise GhptDataError(path, "", f"holds {len(entries)} cameras", _FORMATS)
+    if not entries:
+        raise GhptDataError(path, "", "holds 0 cameras", _FORMATS)
+    check_view_count(path, len(entries))
     names = tuple(entry.name for entry in entries)
     K = np.stack([_numbers(path, e.name, "matrix", e.K, (9,)).reshape(3, 3) for e in entries])
     lens = np.stack([np.resize(np.append(_numbers(path, e.name, "distortion", e.distortion, (4, 5)), 0), 5)
@@ -244,15 +267,17 @@ def _checked(path: Path, form: str, entries: Sequence[_Entry], mm_per_unit: floa
 
 
 def _pose(path: Path, entry: _Entry, mm_per_unit: float) -> tuple[np.ndarray, np.ndarray] | None:
-    if any(
-        value is None or isinstance(value, str) or (isinstance(value, list) and not value)
-        for value in (entry.R, entry.t)
-    ):
-        return None  # caliscope writes "null"
+    # caliscope writes "null" where there is none
+    if _absent(entry.R) or _absent(entry.t):
+        return None
     rotation = _numbers(path, entry.name, "rotation", entry.R, (3, 9))
     vector = torch.from_numpy(rotation) if rotation.size == 3 else None
     R = rotation.reshape(3, 3) if vector is None else vector_to_matrix(vector).numpy()
     return R, _numbers(path, entry.name, "translation", entry.t, (3,)) * mm_per_unit
+
+
+def _absent(value: object) -> bool:
+    return value is None or (isinstance(value, str | list) and value in ("null", "", []))
 
 
 def _size(path: Path, entry: _Entry) -> tuple[int, int] | None:
@@ -266,13 +291,15 @@ def _size(path: Path, entry: _Entry) -> tuple[int, int] | None:
 
 
 def _numbers(path: Path, name: str, field: str, value: Any, sizes: tuple[int, ...]) -> Float[np.ndarray, " N"]:
-    """A list (of lists, or an array) of as many finite, sane numbers as one of ``sizes``, flat."""
-    try:
-        array = np.array(value)
-        flat = array.astype(np.float64).ravel() if array.dtype.kind in "fiu" else np.empty(0)
-    except (ValueError, OverflowError):
-        flat = np.empty(0)
-    if flat.size not in sizes or not (np.abs(flat) < _LARGEST_NUMBER).all():
+    """As many finite, sane numbers as one of ``sizes``, flat: of a list, a row or a column; 9 also of 3 x 3.
+
+    Raises GhptDataError for another shape, and for what is no number: true, or a text.
+    """
+    array = numbers_in(value)
+    array = np.empty(0) if array is None else array.squeeze()
+    flat = array.ravel()
+    shaped = array.ndim == 1 or array.shape == (3, 3)
+    if not shaped or flat.size not in sizes or not (np.abs(flat) < _LARGEST_NUMBER).all():
         expected = " or ".join(map(str, sizes))
         problem = f"is not {expected} finite numbers"
         raise GhptDataError(path, f"camera {name}, {field}", problem, "Check how the file was written.")

@@ -9,6 +9,7 @@ from ghpt.config import build, suggest
 from ghpt.data.camera_files import CameraFile, read_cameras
 from ghpt.data.datamodule import KeyPointDataModule
 from ghpt.data.key_points import KeyPoints, read_key_points
+from ghpt.data.names import Name
 from ghpt.data.store import prepared
 from ghpt.errors import GhptConfigError
 from ghpt.recording import Recording
@@ -19,10 +20,10 @@ class InputSettings(TypedDict):
 
     keypoints: str | None
     cameras: str | None
-    subject: str | None
+    subject: Name
     unit_mm: float | None
-    views: list[str] | None
-    match: dict[str, str] | None
+    views: list[Name] | None
+    match: dict[Name, Name] | None
     skeleton: str | None
     format: str | None
     rate_hz: float | None

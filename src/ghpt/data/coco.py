@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from ghpt.data.json_views import json_files, view_name
-from ghpt.data.people import Detections, People, detections, gather, triples
+from ghpt.data.people import Detections, People, check_people, detections, gather, triples
 from ghpt.data.skeletons import SKELETONS
-from ghpt.data.validate import read_json
+from ghpt.data.validate import check_view_count, read_json
 from ghpt.errors import GhptDataError
 
 _MEND = 'It must be a list of {"image_id": 12, "keypoints": [x, y, score, ...], "score": 0.9}.'
@@ -44,12 +44,15 @@ def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[i
     for field, listed in (("images", images), ("annotations", people)):
         if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
             raise GhptDataError(file, field, "is not a list of objects", _MEND)
+    counts = Counter(_key(person.get("image_id")) for person in people)
+    check_people(file, "annotations", max(counts.values(), default=0))
     names = {_key(image.get("id")): image.get("file_name") for image in images}
     views: dict[str, _Found] = defaultdict(list)
     frames: dict[str, list[int]] = defaultdict(list)
     for image in names.items():
         view, frame = _image(file, image[1] if isinstance(image[1], str) else image[0], named)
         frames[view].append(frame)
+    check_view_count(file, len(frames))
     places: dict[Any, tuple[str, int]] = {}
     for index, person in enumerate(people):
         image_id = _key(person.get("image_id"))
@@ -57,6 +60,7 @@ def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[i
             name = names.get(image_id)
             places[image_id] = _image(file, name if isinstance(name, str) else image_id, named)
             frames[places[image_id][0]].append(places[image_id][1])
+            check_view_count(file, len(frames))
         joints = triples(file, f"[{index}].keypoints", person.get("keypoints"))
         if len(joints):
             view, frame = places[image_id]

@@ -5,10 +5,12 @@ Read without COLMAP's own library: what it does with a damaged file cannot be ca
 
 from __future__ import annotations
 
+import io
 import math
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
@@ -16,7 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from ghpt.data.validate import open_input
+from ghpt.data.validate import MOST_VIEWS, check_view_count, open_input
 from ghpt.errors import GhptDataError
 from ghpt.geometry.rotations import quaternion_to_matrix
 
@@ -68,22 +70,25 @@ def read_colmap(folder: Path) -> list[ColmapCamera]:
     camera_file, image_file = folder / f"cameras.{end}", folder / f"images.{end}"
     read_cameras, read_images = (_camera_bytes, _image_bytes) if end == "bin" else (_camera_lines, _image_lines)
     try:
-        cameras = {number: rest for number, *rest in read_cameras(_content(camera_file))}
+        found = list(islice(read_cameras(_content(camera_file)), MOST_VIEWS + 1))
     except (struct.error, ValueError, OverflowError) as error:
         raise GhptDataError(camera_file, "", f"is damaged ({error})", _MEND) from error
     try:
-        images = sorted(read_images(_content(image_file)))
+        images = sorted(islice(read_images(_content(image_file)), MOST_VIEWS + 1))
     except (struct.error, ValueError, OverflowError) as error:
         raise GhptDataError(image_file, "", f"is damaged ({error})", _MEND) from error
+    check_view_count(camera_file, len(found))
+    check_view_count(image_file, len(images))
+    cameras = {number: rest for number, *rest in found}
     names = _names(image_file, [PurePosixPath(image.name) for image in images])
-    found = []
+    rig = []
     for image, (name, other) in zip(images, names, strict=True):
         if image.camera not in cameras:
             raise GhptDataError(image_file, f"image {image.name}", f"there is no camera {image.camera}", _MEND)
         model, size, parameters = cameras[image.camera]
         K, lens = _intrinsics(camera_file, name, model, parameters)
-        found.append(ColmapCamera(name, other, K, lens, size, _rotation(image_file, image), np.array(image.t)))
-    return found
+        rig.append(ColmapCamera(name, other, K, lens, size, _rotation(image_file, image), np.array(image.t)))
+    return rig
 
 
 def _content(path: Path) -> bytes:
@@ -126,14 +131,15 @@ def _camera_lines(data: bytes) -> Iterator[tuple[int, int | str, tuple[int, int]
 
 def _image_lines(data: bytes) -> Iterator[Image]:
     # a line of the image, then one of its points, which may be empty
-    for line in list(_lines(data))[::2]:
+    for line in islice(_lines(data), 0, None, 2):
         if line:
             _, w, x, y, z, t1, t2, t3, camera, name = line.split(maxsplit=9)
             yield Image(name, (float(w), float(x), float(y), float(z)), (float(t1), float(t2), float(t3)), int(camera))
 
 
 def _lines(data: bytes) -> Iterator[str]:
-    return (line.strip() for line in data.decode("utf-8-sig").splitlines() if not line.startswith("#"))
+    text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig")
+    return (line.strip() for line in text if not line.startswith("#"))
 
 
 def _names(where: Path, paths: list[PurePosixPath]) -> list[tuple[str, str]]:

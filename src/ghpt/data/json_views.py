@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from ghpt.data.validate import check_view_count
 from ghpt.errors import GhptDataError
 
 _PREFIXES = re.compile(r"^(results|predictions|alphapose-results)[_.-](?=.)")
@@ -15,6 +16,7 @@ def json_files(path: Path) -> list[Path]:
     files = sorted(path.glob("*.json")) if path.is_dir() else [path]
     if not files:
         raise GhptDataError(path, "", "holds no JSON file", "Put a file for each camera there: cam1.json, cam2.json.")
+    check_view_count(path, len(files))
     return files
 
 

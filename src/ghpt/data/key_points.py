@@ -17,7 +17,7 @@ from ghpt.data.openpose import follow_views, read_openpose
 from ghpt.data.own_npz import read_own, write_key_points
 from ghpt.data.people import KeyPoints, People, everyone
 from ghpt.data.skeletons import SKELETONS, joints_of, parts_of
-from ghpt.data.validate import open_input
+from ghpt.data.validate import frame_rate, open_input
 from ghpt.errors import GhptDataError
 
 __all__ = ["FORMATS", "KeyPoints", "People", "read_key_points", "read_people", "write_key_points"]
@@ -38,6 +38,7 @@ def read_people(
     Raises GhptDataError for what is damaged, empty or not known, naming file, field and mend.
     """
     path = Path(path)
+    rate = None if rate_hz is None else frame_rate(path, rate_hz)
     if skeleton is not None:
         joints_of(path, skeleton)
     if format is not None and format not in FORMATS:
@@ -49,7 +50,7 @@ def read_people(
     for view, name in enumerate(people.views):
         if view not in seen_by:
             raise GhptDataError(path, f"view {name}", "has no key point", "Detect this view again, or leave it out.")
-    return people if rate_hz is None else replace(people, rate_hz=float(rate_hz))
+    return people if rate_hz is None else replace(people, rate_hz=rate)
 
 
 def read_key_points(

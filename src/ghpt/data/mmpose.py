@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ghpt.data.json_views import json_files, view_name
-from ghpt.data.people import Detections, People, detections, gather, triples
+from ghpt.data.people import Detections, People, check_people, detections, gather, triples
 from ghpt.data.skeletons import canonical
 from ghpt.data.validate import read_json
 from ghpt.errors import GhptDataError
@@ -51,6 +51,7 @@ def _view(file: Path, frames: list[dict[str, Any]]) -> Detections:
             raise GhptDataError(file, f"instance_info[{index}].frame_id", "is not a frame number", _MEND)
         if not isinstance(people, list) or not all(isinstance(person, dict) for person in people):
             raise GhptDataError(file, f"instance_info[{index}].instances", "is not a list of people", _MEND)
+        check_people(file, f"instance_info[{index}].instances", len(people))
         numbers.append(number)
         found += [(number, _person(file, f"instance_info[{index}].instances[{i}]", p)) for i, p in enumerate(people)]
     if len(set(numbers)) != len(numbers):

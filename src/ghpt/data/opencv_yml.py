@@ -6,6 +6,7 @@ Read without FileStorage: it reads names without quotes as numbers, and aborts t
 from __future__ import annotations
 
 import codecs
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +18,23 @@ from ghpt.data.validate import open_input
 from ghpt.errors import GhptDataError
 
 Node = str | float | list[str] | Float[np.ndarray, "..."]
-_LARGEST, _DEEPEST = 4 << 20, 100
+_LARGEST, _DEEPEST = 1 << 18, 100
+"""Bytes; lists in lists, by brackets or by indentation."""
+_INDENTED = re.compile(rb"^[ ?:-]{%d}" % (_DEEPEST + 1), re.MULTILINE)
+_Base: type = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+"""Builds texts, lists and dicts alone; libyaml's is ten times as fast and may be absent."""
 _MEND = "It must be a yml file that OpenCV or EasyMocap wrote."
+
+
+class _Loader(_Base):
+    """Refuses a key that is there twice: of two cameras with one name, one would be lost."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = [key.value for key, _ in node.value if isinstance(key.value, str)]
+        if len(set(keys)) != len(keys):
+            name = next(key for key in keys if keys.count(key) > 1)
+            raise yaml.constructor.ConstructorError(None, None, f"{name} is there twice", node.start_mark)
+        return super().construct_mapping(node, deep)
 
 
 def read_yml(path: Path) -> dict[str, Node | None]:
@@ -26,17 +42,17 @@ def read_yml(path: Path) -> dict[str, Node | None]:
     with open_input(path) as handle:
         data = handle.read(_LARGEST + 1)
     if len(data) > _LARGEST:
-        raise GhptDataError(path, "", f"has more than {_LARGEST >> 20} MiB", _MEND)
+        raise GhptDataError(path, "", f"has more than {_LARGEST >> 10} KiB", _MEND)
     if not data.endswith((b"\n", b"\r")):
         raise GhptDataError(path, "", "ends in the middle of a line: it is truncated", "Copy it again.")
     characters = np.frombuffer(data, np.uint8)
     deeper, higher = (np.isin(characters, list(signs)).astype(np.int32) for signs in (b"[{", b"]}"))
-    if np.cumsum(deeper - higher).max(initial=0) > _DEEPEST:
+    if np.cumsum(deeper - higher).max(initial=0) > _DEEPEST or _INDENTED.search(data):
         raise GhptDataError(path, "", f"has more than {_DEEPEST} lists in lists", _MEND)
     # %YAML:1.0 is no directive of YAML's
     body = b"\n".join(line for line in data.removeprefix(codecs.BOM_UTF8).splitlines() if not line.startswith(b"%"))
     try:
-        content = yaml.load(body.decode(), Loader=yaml.BaseLoader)  # builds texts, lists and dicts alone
+        content = yaml.load(body.decode(), Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise GhptDataError(path, "", f"is not valid yml ({' '.join(str(error).split())})", _MEND) from error
     if not isinstance(content, dict):

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ghpt.data.people import MOST_PEOPLE, Detections, People, gather, triples
-from ghpt.data.validate import read_json
+from ghpt.data.people import Detections, People, check_people, gather, triples
+from ghpt.data.validate import SMALL_JSON, check_view_count, read_json
 from ghpt.errors import GhptDataError
 
 _LAYOUT = "It must hold a folder for each camera, each with a JSON file for each frame: cam1/cam1_000000000012.json."
@@ -42,6 +42,7 @@ def camera_folders(root: Path) -> list[Path]:
     if not folders:
         mend = "Name the folder above." if root.is_dir() and any(root.glob("*.json")) else _LAYOUT
         raise GhptDataError(root, "", "holds no folder with OpenPose's JSON files", mend)
+    check_view_count(root, len(folders))
     return folders
 
 
@@ -87,12 +88,11 @@ def read_view(folder: Path) -> Detections:
 
 def _people(path: Path) -> tuple[Float[np.ndarray, "P K 3"], list[int]]:
     """The people of a file and their ``person_id``, -1 without one."""
-    content = read_json(path)
+    content = read_json(path, SMALL_JSON)
     people = content.get("people") if isinstance(content, dict) else None
     if not isinstance(people, list) or not all(isinstance(person, dict) for person in people):
         raise GhptDataError(path, "people", "is not a list of people", "This must be a file that OpenPose wrote.")
-    if len(people) > MOST_PEOPLE:
-        raise GhptDataError(path, "people", f"{len(people)} are listed", f"At most {MOST_PEOPLE} are read.")
+    check_people(path, "people", len(people))
     found = [triples(path, f"people[{i}].pose_keypoints_2d", person.get("pose_keypoints_2d"))
              for i, person in enumerate(people)]  # fmt: skip
     kept = [i for i, person in enumerate(found) if len(person)]

@@ -11,7 +11,7 @@ import numpy as np
 
 from ghpt.data.people import KeyPoints, joints_for
 from ghpt.data.skeletons import recognise
-from ghpt.data.validate import npy_header, open_input, read_npz
+from ghpt.data.validate import check_view_count, frame_rate, npy_header, open_input, read_npz
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
 
@@ -44,6 +44,7 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
         raise GhptDataError(path, "members", "are others than when it was written", "Write it again.")
     values = read_npz(path, {"key_points": ((None, None, None, 2), "f")})["key_points"].astype(np.float64)
     frames, count_views, count, _ = values.shape
+    check_view_count(path, count_views)
     shape = (frames, count_views, count)
     forms = {
         "confidence": (shape, "f"), "seen": (shape, "b"), "frame": ((frames,), "iu"), "rate_hz": ((), "fiu"),
@@ -67,7 +68,7 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
     frame = more.get("frame", np.arange(frames)).astype(np.int64)
     if not frames or (np.diff(frame) <= 0).any():
         raise GhptDataError(path, "frame", "is empty, or does not rise", "Number the frames in order.")
-    rate = float(more["rate_hz"]) if "rate_hz" in more else None
+    rate = frame_rate(path, float(more["rate_hz"])) if "rate_hz" in more else None
     return KeyPoints(str(path), views, joints, frame, values, np.where(seen, confidence, 0), seen, rate,
                      (0,) * count_views)  # fmt: skip
 

@@ -155,10 +155,16 @@ def detections(
         raise GhptDataError(path, "keypoints", problem, "Detect all frames with one model.")
     numbers = np.array([frame for frame, _ in found], np.int64)
     order = np.argsort(numbers, kind="stable")
-    if len(numbers) and (most := int(np.unique(numbers, return_counts=True)[1].max())) > MOST_PEOPLE:
-        raise GhptDataError(path, "keypoints", f"{most} people are in a frame", f"At most {MOST_PEOPLE} are read.")
+    check_people(path, "keypoints", int(np.unique(numbers, return_counts=True)[1].max(initial=0)))
     values = np.stack([joints for _, joints in found])[order] if found else np.zeros((0, 0, 3))
     return Detections(view, np.unique(np.array(frames, np.int64)), numbers[order], values, np.full(len(numbers), -1))
+
+
+def check_people(path: Path, field: str, count: int) -> None:
+    """Raise GhptDataError for more than ``MOST_PEOPLE`` people in a view of a frame."""
+    if count > MOST_PEOPLE:
+        problem = f"{count} people are in a frame"
+        raise GhptDataError(path, field, problem, f"At most {MOST_PEOPLE} are read.")
 
 
 def triples(path: Path, field: str, flat: object, per_joint: int = 3) -> Float[np.ndarray, "K per_joint"]:

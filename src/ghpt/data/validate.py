@@ -11,6 +11,7 @@ import math
 import warnings
 import zipfile
 import zlib
+from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,14 @@ Shape = tuple[int | None, ...]
 _MAX_HEADER = 10_000
 """Bytes of an npy header; numpy's own limit."""
 _MAX_JSON = 64 << 20
+SMALL_JSON = 4 << 20
+"""Bytes of a JSON file that holds a rig's cameras, or one frame."""
+_MOST_OBJECTS, _MOST_LISTS, _MOST_VALUES = 400_000, 1_500_000, 12_000_000
+"""In a JSON file of ``_MAX_JSON`` bytes: each costs up to a hundred times as many bytes of memory as of the file."""
+_RATES = (1e-3, 1e5)
+"""Frames per second, from a time lapse to the fastest camera."""
+MOST_VIEWS = 1000
+"""Cameras of a rig, or views of a recording."""
 _MAX_MEMBER = 1 << 28
 """Bytes of one array in an npz, unpacked."""
 
@@ -79,8 +88,9 @@ def _rotation(where: object, name: str, R: np.ndarray) -> np.ndarray:
 
 def check_names(where: object, names: Sequence[object], available: Sequence[object] | None = None) -> None:
     """Raise GhptDataError for fewer than two cameras, a camera listed twice, or one that is not ``available``."""
+    counts = Counter(map(repr, names))
     for name in names:
-        if list(names).count(name) > 1:
+        if counts[repr(name)] > 1:
             problem = f"camera {name} is listed twice"
             raise GhptDataError(where, "cameras", problem, "List each camera once.")
         if available is not None and name not in available:
@@ -89,6 +99,64 @@ def check_names(where: object, names: Sequence[object], available: Sequence[obje
     if len(names) < 2:
         problem = f"{len(names)} camera(s) listed; triangulation needs at least two"
         raise GhptDataError(where, "cameras", problem, "List more cameras.")
+
+
+def check_view_count(where: object, count: int) -> None:
+    """Raise GhptDataError for more than ``MOST_VIEWS`` cameras or views, before anything is made of them."""
+    if count > MOST_VIEWS:
+        problem = f"holds more than {MOST_VIEWS} cameras or views"
+        raise GhptDataError(where, "", problem, "Check that this is the right file.")
+
+
+def frame_rate(where: object, value: float | int) -> float | None:
+    """A frame rate in frames per second; None for NaN, which our own files write where it is unknown.
+
+    Raises GhptDataError for a rate that no camera has: 0, negative, infinite, or beyond ``_RATES``.
+    """
+    rate = float(value)
+    if math.isnan(rate):
+        return None
+    slowest, fastest = _RATES
+    if not slowest <= rate <= fastest:
+        problem = f"is {rate:g}, not between {slowest:g} and {fastest:g} frames per second"
+        raise GhptDataError(where, "rate_hz", problem, "Give the true rate: rate_hz=60, say.")
+    return rate
+
+
+def read_flag(where: object, field: str, value: object) -> bool:
+    """A file's true or false, which may be written 1 or 0. Raises GhptDataError for anything else."""
+    if type(value) is bool or (type(value) is int and value in (0, 1)):
+        return bool(value)
+    raise GhptDataError(where, field, f"is {value!r}, not true or false", "Write true or false.")
+
+
+def read_name(where: object, field: str, value: object) -> str:
+    """A file's name of a camera, which may be a number. Raises GhptDataError for anything else."""
+    if type(value) is int or (isinstance(value, str) and value.strip()):
+        return str(value)
+    raise GhptDataError(where, field, f"is {value!r}, not a name", "Give each camera a name.")
+
+
+def numbers_in(value: object) -> np.ndarray | None:
+    """A number, a list of numbers or lists of lists of them as float64, in the list's own shape.
+
+    None for anything else: ``true`` and ``"900"`` are no numbers, and lists of unequal lengths no array.
+    """
+    if isinstance(value, np.ndarray):
+        return value.astype(np.float64) if value.dtype.kind in "fiu" else None
+    if not _all_numbers(value):
+        return None
+    try:
+        return np.array(value, dtype=np.float64)
+    except (ValueError, OverflowError):
+        return None
+
+
+def _all_numbers(value: object, depth: int = 3) -> bool:
+    """Whether all that is in lists, at most so ``depth`` of them within one another, is a number."""
+    if isinstance(value, list | tuple):
+        return depth > 0 and all(_all_numbers(item, depth - 1) for item in value)
+    return type(value) in (int, float)
 
 
 def check_array(where: object, field: str, array: np.ndarray, shape: Shape, kinds: str) -> np.ndarray:
@@ -128,18 +196,35 @@ def read_npz(path: Path, fields: dict[str, tuple[Shape, str]]) -> dict[str, np.n
     return arrays
 
 
-def read_json(path: Path) -> Any:
-    """The content of a JSON file without NaN and Infinity; else GhptDataError."""
+def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
+    """The content of a JSON file of at most ``largest`` bytes.
+
+    Raises GhptDataError for a file that is larger or holds more values than any of its kind, and for one
+    with NaN, Infinity, or a key that is there twice: of two cameras with one name, one would be lost.
+    """
     with open_input(path) as handle:
-        data = handle.read(_MAX_JSON + 1)
-    if len(data) > _MAX_JSON:
-        raise GhptDataError(path, "", f"has more than {_MAX_JSON >> 20} MiB", "Check that this is the right file.")
+        data = handle.read(largest + 1)
+    mend = "Check that this is the right file."
+    if len(data) > largest:
+        raise GhptDataError(path, "", f"has more than {largest >> 20} MiB", mend)
+    # before they are made: a file of 64 MiB could ask for 2 GiB of memory
+    for sign, of_largest in ((b"{", _MOST_OBJECTS), (b"[", _MOST_LISTS), (b",", _MOST_VALUES)):
+        most = of_largest * largest // _MAX_JSON
+        if data.count(sign) > most:
+            raise GhptDataError(path, "", f"holds more than {most} times {sign.decode()!r}", mend)
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is no JSON number")
 
+    def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+        found = dict(pairs)
+        if len(found) != len(pairs):
+            name = next(key for key, count in Counter(key for key, _ in pairs).items() if count > 1)
+            raise ValueError(f"{name!r} is there twice in an object")
+        return found
+
     try:
-        return json.loads(data, parse_constant=refuse)
+        return json.loads(data, parse_constant=refuse, object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
         raise GhptDataError(path, "", f"is not valid JSON ({error})", "Get the file again.") from error
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int
 from ghpt.data.association import associate
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.detections import undistorted
+from ghpt.data.names import Name, chosen_name
 from ghpt.data.openpose import follow_views
 from ghpt.data.people import KeyPoints, People
 from ghpt.data.skeletons import joints17
@@ -62,8 +63,8 @@ class Views:
 def look_through(
     points: KeyPoints | People,
     cameras: CameraFile,
-    match: Mapping[str, str] | None = None,
-    views: Sequence[str] | None = None,
+    match: Mapping[Name, Name] | None = None,
+    views: Sequence[Name] | None = None,
     person: int = 0,
 ) -> Views:
     """Key points with their cameras: lens distortion undone, then the detector's joints mapped to the 17.
@@ -145,7 +146,11 @@ def _across(people: People, cameras: CameraFile, at: Sequence[int]) -> list[Int[
 
 
 def matched(
-    where: str, views: Sequence[str], cameras: CameraFile, match: Mapping[str, str], wanted: Sequence[str] | None
+    where: str,
+    views: Sequence[str],
+    cameras: CameraFile,
+    match: Mapping[Name, Name],
+    wanted: Sequence[Name] | None,
 ) -> list[tuple[int, int]]:
     """(view, camera) pairs, in the order of the cameras.
 
@@ -153,7 +158,10 @@ def matched(
     are the same but for case, separators, leading zeros and words like json (``cam1_json`` is ``cam_01``). Raises
     GhptDataError, listing both sides, where that is not one to one.
     """
-    known = {name for names in _names(cameras) for name in names}
+    known = {name: None for names in _names(cameras) for name in names}
+    match = {chosen_name(view, views): chosen_name(camera, known) for view, camera in match.items()}
+    if wanted is not None:
+        wanted = [chosen_name(name, (*views, *known)) for name in wanted]
     for view, camera in match.items():
         if view not in views or camera not in known:
             raise _unmatched(where, views, cameras, f"match says {view}: {camera}, of which one is not there")

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ghpt.models.scale import SEGMENTS
+from ghpt.report.escape import code, escaped, plain
 from ghpt.report.tables import NAMES, NONE, markdown
 
 Numbers = dict[str, Any]
@@ -59,14 +60,14 @@ def print_prediction(numbers: Numbers, console: Console | None = None) -> None:
     if len(numbers["evaluation"]["estimators"]) > 1:
         tables.append(("Estimators on the same key points", *comparison_rows(numbers)))
     for title, header, rows in tables:
-        table = Table(title=title, title_justify="left")
+        table = Table(title=plain(title, "table.title"), title_justify="left")
         for i, column in enumerate(header):
             table.add_column(column, justify="right" if i else "left")
         for row in rows:
-            table.add_row(*row)
+            table.add_row(*map(plain, row))
         console.print(table)
     for line in summary_lines(numbers):
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(plain(line), soft_wrap=True)
 
 
 def prediction_report(numbers: Numbers) -> str:
@@ -77,9 +78,10 @@ def prediction_report(numbers: Numbers) -> str:
     segments = [[name.replace("_", " "), *(number(found["segments"]["each"][name], 1, 100)
                                             for found in estimators.values())] for name in SEGMENTS]  # fmt: skip
     parts = [
-        f"# Prediction of {numbers['data']}",
-        f"ghpt {origin['ghpt']}, commit `{origin['commit'] or NONE}`, seed {origin['seed']}: `{origin['command']}`.",
-        "\n".join(f"- {line}" for line in summary_lines(numbers)),
+        f"# Prediction of {escaped(numbers['data'])}",
+        f"ghpt {origin['ghpt']}, commit `{origin['commit'] or NONE}`, seed {origin['seed']}: "
+        f"{code(origin['command'])}.",
+        "\n".join(f"- {escaped(line)}" for line in summary_lines(numbers)),
         "## Errors by view",
         f"On {evaluation['frames']} frames, evenly spread; median and 90 %, pixels. *Reprojection* is the distance of "
         "every key point from its joint, set aside or not; *left out*, from the joint that "

@@ -12,8 +12,10 @@ from jaxtyping import Int
 
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.detections import undistorted
+from ghpt.data.names import Name
 from ghpt.data.people import KeyPoints, joints_for
 from ghpt.data.skeletons import joints17, recognise
+from ghpt.data.validate import check_view_count, frame_rate
 from ghpt.data.views import look_through, matched
 from ghpt.errors import GhptDataError
 from ghpt.prediction.frames import Frames, Seen, calibrated
@@ -77,9 +79,12 @@ def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -
     lengths = {"confidence": (count, *shape), "seen": (count, *shape), "frame": (count,)}
     if two != 2 or not count or any(members[n].shape != s for n, s in lengths.items() if n in members):
         return None
+    check_view_count(path, shape[0])
     frame = read_rows(path, members["frame"], 0, count).astype(np.int64) if "frame" in members else np.arange(count)
     if rate_hz is None and "rate_hz" in members:
-        rate_hz = float(np.fromfile(path, members["rate_hz"].dtype, 1, offset=members["rate_hz"].offset)[0])
+        member = members["rate_hz"]
+        rate_hz = float(np.fromfile(path, member.dtype, 1, offset=member.offset)[0])
+    rate_hz = None if rate_hz is None else frame_rate(path, rate_hz)
     stored = StoredKeyPoints(path, members, views, (), frame, rate_hz)
     spread = stored.part(np.unique(np.linspace(0, count - 1, min(_CHECKED, count)).astype(np.int64)))
     joints = texts.get("joints", ()) if skeleton is None and "skeleton" not in texts else ()
@@ -100,8 +105,8 @@ def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -
 def frames_of_stored(
     stored: StoredKeyPoints,
     cameras: CameraFile,
-    match: Mapping[str, str] | None,
-    views: Sequence[str] | None,
+    match: Mapping[Name, Name] | None,
+    views: Sequence[Name] | None,
     title: str,
 ) -> Frames:
     """Raises GhptDataError as ``look_through`` does, and as ``frames_of_views``."""

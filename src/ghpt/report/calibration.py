@@ -11,16 +11,18 @@ import torch
 from jaxtyping import Bool, Float
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 from torch import Tensor
 
 from ghpt.models.baselines import Baseline
 from ghpt.models.scale import SEGMENTS
 from ghpt.recording import Recording
+from ghpt.report.escape import escaped, plain
 from ghpt.report.rig_comparison import held_out_errors, rig_difference, segment_variation, triangulate_recording
 from ghpt.report.tables import NONE, markdown
 
 Numbers = dict[str, Any]
-_MARKS = {"error": "[red]error[/red]", "warning": "[yellow]warning[/yellow]"}
+_COLOURS = {"error": "red", "warning": "yellow"}
 
 
 def explains(recordings: Mapping[str, Recording], estimator: Baseline, frames: int) -> Numbers:
@@ -60,18 +62,20 @@ def print_calibration(numbers: Numbers, console: Console | None = None) -> None:
     """The table of the cameras, then what was found, in 80 columns."""
     console = console or Console()
     header, rows = camera_rows(numbers)
-    table = Table(title=f"Calibration of {numbers['data']}", caption=_caption(numbers), title_justify="left",
-                  caption_justify="left")  # fmt: skip
+    title = plain(f"Calibration of {numbers['data']}", "table.title")
+    caption = plain(_caption(numbers), "table.caption")
+    table = Table(title=title, caption=caption, title_justify="left", caption_justify="left")
     for i, column in enumerate(header):
         table.add_column(column, justify="right" if i else "left")
     for row in rows:
-        table.add_row(*row)
+        table.add_row(*map(plain, row))
     console.print(table)
     for line in summary_lines(numbers):
-        console.print(line, highlight=False)
+        console.print(plain(line))
     for found in numbers["diagnoses"]:
-        mark = _MARKS.get(found["severity"], found["severity"])
-        console.print(f"{mark}: {found['text']}", highlight=False, soft_wrap=True)
+        severity = found["severity"]
+        line = Text.assemble((severity, _COLOURS.get(severity, "")), ": ", plain(found["text"]))
+        console.print(line, soft_wrap=True)
 
 
 def camera_rows(numbers: Numbers) -> tuple[list[str], list[list[str]]]:
@@ -110,15 +114,15 @@ def calibration_report(numbers: Numbers) -> str:
     """The Markdown report."""
     explained = numbers["explains"]
     parts = [
-        f"# Calibration of {numbers['data']}",
+        f"# Calibration of {escaped(numbers['data'])}",
         f"{numbers['frames']} frames, {len(numbers['cameras'])} views, seed {numbers['seed']}, "
         f"ghpt {numbers['provenance']['ghpt']}, commit `{numbers['provenance']['commit'] or NONE}`.",
-        "\n".join(f"- {line}" for line in summary_lines(numbers)),
+        "\n".join(f"- {escaped(line)}" for line in summary_lines(numbers)),
         "## Diagnoses",
-        "\n".join(f"- **{d['severity']}** ({d['code']}): {d['text']}" for d in numbers["diagnoses"]) or "None.",
+        "\n".join(_diagnosis(found) for found in numbers["diagnoses"]) or "None.",
         "## Cameras",
         markdown(*camera_rows(numbers)),
-        _caption(numbers),
+        "\n".join(map(escaped, _caption(numbers).split("\n"))),
     ]
     if explained:
         names = list(explained)
@@ -136,6 +140,10 @@ def calibration_report(numbers: Numbers) -> str:
             markdown(["segment", *names], _segment_rows(explained)),
         ]  # fmt: skip
     return "\n\n".join(parts) + "\n"
+
+
+def _diagnosis(found: Mapping[str, Any]) -> str:
+    return f"- **{found['severity']}** ({found['code']}): {escaped(found['text'])}"
 
 
 _QUANTILES = ("median", "p90")

@@ -1,6 +1,5 @@
 """metrics.json: all numbers of a test run, computed from its predictions alone."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
@@ -10,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.data.human36m import DAMAGED
-from ghpt.files import atomic_write
+from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.metrics.pose_prior import PARTS, PosePrior
 from ghpt.recording import PoseEstimate
@@ -119,6 +118,4 @@ def _selection(metrics: _Selection, actions: list[str], subjects: list[str]) -> 
 
 def write_metrics(path: str | Path, metrics: dict[str, Any]) -> None:
     """Write ``evaluate``'s result as metrics.json."""
-    with atomic_write(path, "w") as handle:
-        json.dump(metrics, handle, indent=1, allow_nan=False)
-        handle.write("\n")
+    write_json(path, metrics)

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from ghpt.files import atomic_write
 from ghpt.models.selection import SELECTIONS
+from ghpt.report.escape import code, escaped, plain
 from ghpt.report.pair_evaluate import ALONE, ERRORS
 from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
 from ghpt.report.tables import NONE, Rows, markdown, title, trained_on
@@ -74,7 +75,7 @@ def print_pair_tables(metrics: Mapping[str, Any], console: Console | None = None
     rows = pair_rows(metrics, "weight")
     worst = f", the {MANY} worst of {len(rows)} pairs" if len(rows) > MANY else ""
     table = Table(
-        title=f"weight{worst} on {title(metrics)}",
+        title=plain(f"weight{worst} on {title(metrics)}", "table.title"),
         caption=_CAPTION + (_PAPER if of_paper(metrics, FUNDAMENTAL) else ""),
         title_justify="left",
         caption_justify="left",
@@ -82,14 +83,14 @@ def print_pair_tables(metrics: Mapping[str, Any], console: Console | None = None
     for column in ("pair", "E_R", "E_t", "E_2D", "E_3D", "rot", "dir"):
         table.add_column(column, justify="left" if column == "pair" else "right", no_wrap=True)
     for row in rows[:MANY]:
-        table.add_row(*row)
+        table.add_row(*map(plain, row))
     console.print(table)
     header, rows = comparison(metrics)
     table = Table(title="E_3D in mm", title_justify="left", caption="cov: pairs estimated, %", caption_justify="left")
     for column in header:
         table.add_column(column, justify="left" if column == "selection" else "right", no_wrap=True)
     for name, row in zip(metrics["selections"], rows, strict=True):
-        table.add_row(*row, end_section=name == SELECTIONS[-1], style="bold" if name == "weight" else None)
+        table.add_row(*map(plain, row), end_section=name == SELECTIONS[-1], style="bold" if name == "weight" else None)
     console.print(table)
 
 
@@ -115,9 +116,10 @@ def pair_report(metrics: Mapping[str, Any]) -> str:
     provenance = metrics.get("provenance") or {}
     paper = of_paper(metrics, FUNDAMENTAL)
     parts = [
-        f"# Relative camera poses on {title(metrics)}",
-        f"{metrics['draws']} draws of {metrics['frames']} frames, cameras {', '.join(metrics['cameras'])}, "
-        f"seed {metrics['seed']}, checkpoint `{provenance.get('checkpoint', NONE)}`, "
+        f"# Relative camera poses on {escaped(title(metrics))}",
+        f"{metrics['draws']} draws of {metrics['frames']} frames, "
+        f"cameras {', '.join(map(escaped, metrics['cameras']))}, "
+        f"seed {metrics['seed']}, checkpoint {code(provenance.get('checkpoint', NONE))}, "
         f"ghpt {provenance.get('ghpt', NONE)}, commit `{provenance.get('commit') or NONE}`.",
         "Errors of section 4.5 of the paper: E_R of the rotation (difference of quaternions, in 10⁻³), E_t of the "
         "translation (mm), E_2D (pixels) and E_3D (mm) of random points of the capture volume; and angles between the "

@@ -55,7 +55,9 @@ def rig_figure(
         centre = (shown.centre / 1000).numpy()[:, [i, j]]
         for v, name in enumerate(names):
             _ellipse(axes, centre[v], spread[v][[i, j]][:, [i, j]].numpy(), magnified)
-            axes.annotate(name, centre[v], xytext=(5, 5), textcoords="offset points", fontsize=8)
+            # a dollar in a name begins no formula
+            label = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 8}
+            axes.annotate(name, centre[v], parse_math=False, **label)
         axes.set(xlabel="xyz"[i] + ", m", ylabel="xyz"[j] + ", m", aspect="equal")
         axes.set_title(view, fontsize=10)
         axes.grid(color="#E5E5E5", linewidth=0.6)
@@ -70,7 +72,7 @@ def rig_figure(
         handles.append(Line2D([], [], color=REFERENCE, linestyle="--", label=reference_name))
     handles.append(Line2D([], [], color=PEOPLE, marker=".", label="people"))
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    figure.suptitle(wrapped(heading, 110), fontsize=10)
+    figure.suptitle(wrapped(heading, 110), fontsize=10, parse_math=False)
     return figure
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import math
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +18,7 @@ from ghpt.calibration.rig import RigEstimate
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.data.rigs import Rig
-from ghpt.files import atomic_write, remove
+from ghpt.files import atomic_write, finite, remove, write_json
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
 from ghpt.report.calibration import calibration_report
@@ -76,10 +75,11 @@ def write_poses(
     """The recording's 3D joints: mm, NaN where not estimated."""
     values = torch.where(estimated[..., None], points, torch.nan).double().numpy()
     meta = {key: numbers[key] for key in ("data", "source", "scale", "world", "triangulation", "usable", "provenance")}
+    text = json.dumps(finite(meta), allow_nan=False)
     with atomic_write(path) as handle:
         np.savez_compressed(
             handle, points=values, estimated=estimated.numpy(), frame=recording.frame, joints=np.array(JOINTS),
-            rate_hz=np.array(recording.rate_hz), unit=np.array("mm"), meta=np.array(json.dumps(meta)),
+            rate_hz=np.array(recording.rate_hz), unit=np.array("mm"), meta=np.array(text),
         )  # fmt: skip
 
 
@@ -111,17 +111,6 @@ def write_rig_figure(
 
 def write_numbers(output: Path, numbers: dict[str, Any]) -> None:
     """calibration.json and report.md."""
-    with atomic_write(output / "calibration.json", "w") as handle:
-        json.dump(_finite(numbers), handle, indent=1, allow_nan=False)
-        handle.write("\n")
+    write_json(output / "calibration.json", numbers)
     with atomic_write(output / "report.md", "w") as handle:
         handle.write(calibration_report(numbers))
-
-
-def _finite(value: Any) -> Any:
-    """null for numbers that JSON has no word for."""
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(inner) for inner in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

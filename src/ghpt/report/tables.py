@@ -12,6 +12,7 @@ from rich.table import Table
 from ghpt.files import atomic_write
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.selection import SELECTIONS
+from ghpt.report.escape import code, escaped, plain
 from ghpt.report.paper import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 
 NAMES = {
@@ -67,14 +68,17 @@ def main_rows(metrics: Mapping[str, Any]) -> Rows:
 def print_table(metrics: Mapping[str, Any], console: Console | None = None) -> None:
     """Print the main table to the terminal (or to ``console``), in 80 columns."""
     table = Table(
-        title=f"MPJPE in mm on {title(metrics)}", caption=_CAPTION, title_justify="left", caption_justify="left"
+        title=plain(f"MPJPE in mm on {title(metrics)}", "table.title"),
+        caption=_CAPTION,
+        title_justify="left",
+        caption_justify="left",
     )
     for column, short in _TERMINAL.items():
         table.add_column(short, justify="left" if column == COLUMNS[0] else "right", no_wrap=True)
     for name, row in zip(metrics["selections"], main_rows(metrics), strict=True):
         cells = [cell.removesuffix(" %") for cell in row]
         style = "bold" if name in ("weight", "view_weights") else None
-        table.add_row(*cells, end_section=name == SELECTIONS[-1], style=style)
+        table.add_row(*map(plain, cells), end_section=name == SELECTIONS[-1], style=style)
     (console or Console()).print(table)
 
 
@@ -83,8 +87,9 @@ def report(metrics: Mapping[str, Any]) -> str:
     selections = metrics["selections"]
     provenance = metrics.get("provenance") or {}
     parts = [
-        f"# Test on {title(metrics)}",
-        f"{metrics['frames']} frames, seed {metrics['seed']}, checkpoint `{provenance.get('checkpoint', NONE)}`, "
+        f"# Test on {escaped(title(metrics))}",
+        f"{metrics['frames']} frames, seed {metrics['seed']}, "
+        f"checkpoint {code(provenance.get('checkpoint', NONE))}, "
         f"ghpt {provenance.get('ghpt', NONE)}, commit `{provenance.get('commit') or NONE}`.",
         "MPJPE in mm: in the world, relative to the pelvis, after Procrustes alignment, and (relative) on elbows, "
         "wrists and knees. Coverage: joints that were estimated, of all that have a truth. Best and worst look at "
@@ -101,7 +106,7 @@ def report(metrics: Mapping[str, Any]) -> str:
     parts += ["## Actions", "Relative MPJPE, mm.", markdown(*action_table(metrics))]
     parts += ["## Pose prior", "Variance over frames of the ratio of left to right part, times 1000."]
     for subject in next(iter(selections.values()))["pose_prior"]:
-        parts += [f"### {subject}", markdown(*prior_table(metrics, subject))]
+        parts += [f"### {escaped(subject)}", markdown(*prior_table(metrics, subject))]
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -147,8 +152,11 @@ def max_difference(values: Iterable[float]) -> float:
 
 
 def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], text: Collection[int] = (0,)) -> str:
-    """A Markdown table, also aligned as plain text; the columns ``text`` to the left, numbers to the right."""
-    table = [list(header), *(list(row) for row in rows)]
+    """A Markdown table, also aligned as plain text; the columns ``text`` to the left, numbers to the right.
+
+    Cells are escaped, unless they are ``Markdown`` already.
+    """
+    table = [list(map(escaped, row)) for row in (header, *rows)]
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = [
         " | ".join(

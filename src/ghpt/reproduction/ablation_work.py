@@ -9,13 +9,13 @@ from torch import Tensor
 
 from ghpt.config import build
 from ghpt.data.frames import Frames
+from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose import PoseHypotheses
 from ghpt.models.selection import limit_spread, selection_weights
 from ghpt.recording import KeyPointBatch
-from ghpt.reproduction.cells import write_json
 from ghpt.reproduction.work import CHECKPOINT
 from ghpt.skeleton import JOINTS
 

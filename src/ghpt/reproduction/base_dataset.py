@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from ghpt.report.escape import escaped
 from ghpt.report.paper import (
     HYPERPARAMETERS,
     LIMITATION,
@@ -79,7 +80,7 @@ def _hypotheses(results: Results) -> Section:
         ]
         others = [Compared(VIEW_WEIGHTS, None, results.relative(test, "view_weights"))]
         others += [Compared(NAMES.get(s, s), None, results.relative(test, s)) for s in BASELINES[1:]]
-        about = f"**{results.words(data)}**, trained on the same"
+        about = f"**{escaped(results.words(data))}**, trained on the same"
         tables.append(f"{about}\n\n{comparison([*rows, *others], 'hypothesis')}")
         compared += [Compared(f"{name}, {row.what}", row.paper, row.ours, row.better) for row in rows]
         claims += _hypotheses_claims(name, {s: results.relative(test, s).mean for s in paper}, paper)

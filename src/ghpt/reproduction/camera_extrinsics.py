@@ -16,13 +16,14 @@ from ghpt.config import build
 from ghpt.data.frames import Frames
 from ghpt.data.pairs import Pairs, PairSettings
 from ghpt.errors import GhptDataError
+from ghpt.files import write_json
 from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.recording import PairBatch, RelativePoseEstimate
 from ghpt.report.pair_evaluate import camera_after
-from ghpt.reproduction.cells import read_json, write_json
+from ghpt.reproduction.cells import read_json
 from ghpt.reproduction.work import CHECKPOINT
 from ghpt.skeleton import JOINTS
 

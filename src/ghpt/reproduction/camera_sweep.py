@@ -8,12 +8,12 @@ from typing import Any
 import torch
 
 from ghpt.config import build
+from ghpt.files import write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.selection import SELECTIONS
 from ghpt.report.collect import CollectPairs
 from ghpt.report.pair_evaluate import errors_of_pair, pair_name
 from ghpt.report.pair_predictions import open_pairs
-from ghpt.reproduction.cells import write_json
 from ghpt.reproduction.work import CHECKPOINT
 
 

@@ -12,7 +12,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from ghpt.files import atomic_folder, atomic_write
+from ghpt.files import atomic_folder, write_json
 from ghpt.provenance import provenance
 from ghpt.reproduction.code import code_digest
 
@@ -80,12 +80,6 @@ def with_needs(cells: Iterable[Cell]) -> dict[str, Cell]:
     for cell in cells:
         visit(cell)
     return found
-
-
-def write_json(path: Path, content: Any) -> None:
-    with atomic_write(path, "w") as handle:
-        json.dump(content, handle, indent=1, allow_nan=False)
-        handle.write("\n")
 
 
 def read_json(path: Path) -> Any:

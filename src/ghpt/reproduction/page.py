@@ -18,9 +18,9 @@ import matplotlib
 from markdown_it import MarkdownIt
 from matplotlib.figure import Figure
 
-from ghpt.files import atomic_write
+from ghpt.files import atomic_write, write_json
+from ghpt.report.escape import Markdown, code_block, escaped
 from ghpt.report.tables import markdown
-from ghpt.reproduction.cells import write_json
 from ghpt.reproduction.item import TOLERANCE, Claim, Compared, Item, Section, signed
 
 TITLE = "Generalizable Human Pose Triangulation: the paper's tables and figures again"
@@ -81,7 +81,7 @@ class Page:
 
     def front(self) -> str:
         """What comes before the entries, Markdown."""
-        lines = "\n".join(f"- {name}: {value}" for name, value in self.about.items())
+        lines = "\n".join(f"- {name}: {escaped(value)}" for name, value in self.about.items())
         held = sum(claim.holds for claim in self.claims)
         compared = sum(len(entry.section.compared) for entry in self.entries)
         misses = [(entry, number) for entry in self.entries for number in entry.misses]
@@ -109,7 +109,7 @@ class Page:
         return "\n\n".join(parts)
 
 
-HOLDS = {True: "yes", False: "**no**", None: "–"}
+HOLDS = {True: "yes", False: Markdown("**no**"), None: "–"}
 
 
 def claims_table(claims: Sequence[Claim]) -> str:
@@ -123,10 +123,12 @@ def told(entry: Entry) -> list[Claim]:
 
 def _summary_row(entry: Entry) -> list[str]:
     claims, numbers = told(entry), entry.section.compared
+    # a comparison may lack a number, the paper's or ours
+    known = [number.difference for number in numbers if number.difference is not None]
     return [
-        f"[{entry.item.label}](#{entry.item.label})",
+        Markdown(f"[{entry.item.label}](#{entry.item.label})"),
         str(len(numbers) or "–"),
-        f"{signed(100 * statistics.median(n.difference for n in numbers))} %" if numbers else "–",
+        f"{signed(100 * statistics.median(known))} %" if known else "–",
         str(len(entry.misses)) if numbers else "–",
         f"{sum(claim.holds for claim in claims)} of {len(claims)}" if claims else "–",
     ]
@@ -165,9 +167,9 @@ def as_markdown(page: Page) -> str:
         for name in entry.section.figures:
             body = body.replace(f"]({name}.svg)", f"]({FOLDER}/{name}.svg)")
         commands = "\n".join(entry.commands)
-        parts += [f'<a id="{entry.item.label}"></a>', f"## {entry.heading}", body, f"Again: `{entry.again}`"]
-        parts += [f"By hand:\n\n```bash\n{commands}\n```"] if commands else []
-    return "\n\n".join([*parts, "## Configuration", f"```yaml\n{page.config.rstrip()}\n```"]) + "\n"
+        parts += [f'<a id="{entry.item.label}"></a>', f"## {escaped(entry.heading)}", body, f"Again: `{entry.again}`"]
+        parts += ["By hand:", code_block(commands, "bash")] if commands else []
+    return "\n\n".join([*parts, "## Configuration", code_block(page.config.rstrip(), "yaml")]) + "\n"
 
 
 def as_html(page: Page, pictures: Mapping[str, bytes]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from ghpt.report.escape import Markdown
 from ghpt.report.tables import NONE, markdown
 from ghpt.reproduction.item import signed
 from ghpt.reproduction.robustness_curve import Curve, Found, nan_to_last
@@ -22,7 +23,8 @@ def table(curve: Curve, of: Found, kind: str) -> str:
     for i, level in enumerate(of.levels):
         least = min(nan_to_last(spreads[i].mean) for name, spreads in of.errors[kind].items() if name != "best")
         texts = [NONE if math.isnan(s[i].mean) else s[i].text() for s in of.errors[kind].values()]
-        bold = [f"**{t}**" if s[i].mean == least else t for t, s in zip(texts, of.errors[kind].values(), strict=True)]
+        means = [spreads[i].mean for spreads in of.errors[kind].values()]
+        bold = [Markdown(f"**{text}**") if mean == least else text for text, mean in zip(texts, means, strict=True)]
         rows.append([level, *bold, *([_share(*of.coverage[i])] if partial_coverage else [])])
     return markdown([*head, *(["joints counted"] if partial_coverage else [])], rows)
 

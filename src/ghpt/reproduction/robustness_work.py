@@ -8,13 +8,13 @@ from typing import Any
 import torch
 
 from ghpt.config import build
+from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.selection import selection_weights
 from ghpt.recording import KeyPointBatch, PoseEstimate
 from ghpt.report.poses import estimators
-from ghpt.reproduction.cells import write_json
 from ghpt.reproduction.work import CHECKPOINT
 from ghpt.skeleton import JOINTS
 

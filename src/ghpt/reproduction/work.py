@@ -4,8 +4,8 @@ from pathlib import Path
 from typing import Any
 
 from ghpt.config import build
+from ghpt.files import write_json
 from ghpt.models.checkpoint import LAST, PREVIOUS, AtomicCheckpointIO, read_checkpoint
-from ghpt.reproduction.cells import write_json
 from ghpt.test import measure
 from ghpt.train import train
 
