@@ -2,6 +2,7 @@
 
     python scripts/mutants.py                                     # 100 random mutants of the files of TESTS
     python scripts/mutants.py --files src/ghpt/geometry/*.py --count 50 --seed 1
+    python scripts/mutants.py --planted                           # the bugs of planted_bugs.json instead
 
 One mutant at a time is written into a temporary copy of ``src``, never into the working tree. The tests of its file
 run in a fork of this process, which has imported the large libraries already; so this needs Linux or macOS. Which
@@ -31,6 +32,8 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 EQUIVALENT = Path(__file__).with_name("equivalent_mutants.json")
 """Mutants that no test can notice, each with the reason."""
+PLANTED = Path(__file__).with_name("planted_bugs.json")
+"""Bugs as people make them: a wrong axis, unit or sign, a mask or a limit left out."""
 
 TESTS = {
     "src/ghpt/geometry/cameras.py": ["test_cameras.py"],
@@ -41,13 +44,19 @@ TESTS = {
     "src/ghpt/geometry/subsets.py": ["test_subsets.py"],
     "src/ghpt/geometry/triangulation.py": ["test_triangulation.py"],
     "src/ghpt/metrics/pose_error.py": ["test_pose_error.py"],
+    "src/ghpt/metrics/pose_prior.py": ["test_pose_prior.py"],
+    "src/ghpt/metrics/relative_pose.py": ["test_relative_pose.py"],
     "src/ghpt/models/loss.py": ["test_loss.py"],
+    "src/ghpt/models/quality.py": ["test_quality.py"],
+    "src/ghpt/models/scale.py": ["test_scale.py"],
+    "src/ghpt/models/selection.py": ["test_selection.py"],
+    "src/ghpt/calibration/observations.py": ["test_calibration.py"],
     "src/ghpt/prediction/shards.py": ["test_shards.py"],
     "src/ghpt/prediction/gaps.py": ["test_gaps.py"],
     "src/ghpt/files.py": ["test_files.py"],
     "src/ghpt/data/openpose.py": ["test_openpose.py"],
 }
-"""The files that are mutated, and for each the tests that must notice it."""
+"""What may be mutated, and for each file the tests that must notice it."""
 
 LIBRARIES = ("torch", "lightning.pytorch", "torchmetrics", "hydra", "scipy.spatial.transform", "cv2", "hypothesis")
 """Imported once, before the forks. Nothing of ghpt may be: it differs from mutant to mutant."""
@@ -121,6 +130,8 @@ def variants(node: ast.AST) -> Iterator[ast.AST | str]:
                 yield ast.BinOp(right, operator, left)
         case ast.BoolOp(op=operator):
             yield ast.BoolOp(ast.Or() if isinstance(operator, ast.And) else ast.And(), node.values)
+        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int())):
+            pass  # -1 for 1 is the same dimension or the one beside it, which changing the number tries
         case ast.UnaryOp(operand=operand):
             yield operand
         case ast.Constant(value=bool() as value):
@@ -205,6 +216,20 @@ def changes(mutant: Mutant, original: str, root: Path) -> bool:
         return ast.dump(ast.parse(mutant.source(root))) != original
     except SyntaxError:
         return False
+
+
+def planted(root: Path = ROOT) -> list[Mutant]:
+    """The bugs of ``PLANTED``; what stands in the place of each must be in its file once."""
+    found = []
+    for row in json.loads(PLANTED.read_text(encoding="utf-8")):
+        source = (root / row["file"]).read_bytes()
+        before = row["before"].encode()
+        if source.count(before) != 1:
+            raise SystemExit(f"{PLANTED.name}: {row['file']} has not one {row['before']!r}.")
+        start = source.index(before)
+        line = source.count(b"\n", 0, start) + 1
+        found.append(Mutant(row["file"], line, start, start + len(before), row["after"]))
+    return found
 
 
 def equivalent() -> dict[tuple[str, str, str], str]:
@@ -299,15 +324,17 @@ def score(rows: list[dict]) -> tuple[int, int]:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--files", nargs="+", default=sorted(TESTS), help="which of the files of TESTS")
+    parser.add_argument("--files", nargs="+", help="which of the files of TESTS; all")
+    parser.add_argument("--planted", action="store_true", help="the bugs of planted_bugs.json instead of random ones")
     parser.add_argument("--count", type=int, default=100, help="how many mutants, drawn among all of these files")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--least", type=float, default=0.0, help="exit with 1 if a smaller share is killed")
     parser.add_argument("--output", default="mutants.json")
     options = parser.parse_args()
-    if unknown := sorted(set(options.files) - set(TESTS)):
+    files = options.files or sorted(TESTS)
+    every = planted() if options.planted else [mutant for file in sorted(files) for mutant in mutants(file)]
+    if unknown := sorted({mutant.file for mutant in every} - set(TESTS)):
         parser.error(f"no tests are named for {', '.join(unknown)}: add them to TESTS")
-    every = [mutant for file in sorted(options.files) for mutant in mutants(file)]
     chosen = random.Random(options.seed).sample(every, min(options.count, len(every)))
     for library in LIBRARIES:
         importlib.import_module(library)
@@ -320,7 +347,7 @@ def main() -> int:
             print(f"{row['result']:10} {row['file']}:{row['line']}", flush=True)
             print(f"    - {row['before']}\n    + {row['after']}", flush=True)
             rows.append(row)
-    for file in sorted(options.files):
+    for file in sorted({row["file"] for row in rows}):
         killed, total = score([row for row in rows if row["file"] == file])
         print(f"{killed:4} of {total:4} killed  {file}")
     killed, total = score(rows)
