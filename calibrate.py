@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ghpt.app import run
-from ghpt.calibrate import calibrate, summary
+from ghpt.calibrate import COMMAND
 
 if __name__ == "__main__":
-    run(Path(__file__).parent / "conf", "calibrate", calibrate, summary)
+    run(Path(__file__).parent / "conf", COMMAND)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ghpt.app import run
-from ghpt.doctor import examine, summary
+from ghpt.doctor import COMMAND
 
 if __name__ == "__main__":
-    run(Path(__file__).parent / "conf", "cameras", examine, summary)
+    run(Path(__file__).parent / "conf", COMMAND)

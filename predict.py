@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ghpt.app import run
-from ghpt.predict import predict, summary
+from ghpt.predict import COMMAND
 
 if __name__ == "__main__":
-    run(Path(__file__).parent / "conf", "predict", predict, summary)
+    run(Path(__file__).parent / "conf", COMMAND)

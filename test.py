@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ghpt.app import run
-from ghpt.test import summary, test
+from ghpt.test import COMMAND
 
 if __name__ == "__main__":
-    run(Path(__file__).parent / "conf", "test", test, summary)
+    run(Path(__file__).parent / "conf", COMMAND)

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from ghpt.app import run
-from ghpt.train import summary, train
+from ghpt.train import COMMAND
 
 if __name__ == "__main__":
-    run(Path(__file__).parent / "conf", "train", train, summary)
+    run(Path(__file__).parent / "conf", COMMAND)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from ghpt.app import run
+from ghpt.app import Command, run
 
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if WORKER:  # each of several test processes has its own core, and so have the commands that it runs
@@ -41,17 +41,17 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.Monk
 
 @pytest.fixture
 def typed(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """``typed(conf, "train", words, task, summary)`` runs train.py in this process: (exit status, stdout, stderr)."""
+    """``typed(conf, command, words)`` runs train.py in this process: (exit status, stdout, stderr)."""
     handlers, level = list(logging.root.handlers), logging.root.level
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
 
-    def call(conf: Path, name: str, words: Any, task: Any, summary: Any, *after: Any) -> tuple[int, str, str]:
+    def call(conf: Path, command: Command, words: Any) -> tuple[int, str, str]:
         os.environ["HYDRA_FULL_ERROR"] = "0"
-        monkeypatch.setattr(sys, "argv", [f"{name}.py", *map(str, words)])
+        monkeypatch.setattr(sys, "argv", [f"{command.name}.py", *map(str, words)])
         status = 0
         capfd.readouterr()
         try:
-            run(conf, name, task, summary, *after)
+            run(conf, command)
         except SystemExit as stop:
             status = stop.code
             if isinstance(status, str):  # what Python itself would do with it

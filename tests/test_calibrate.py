@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.calibrate import calibrate, people_note, summary
+from ghpt.calibrate import COMMAND, people_note
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.data.camera_files import read_cameras
 from ghpt.data.camera_writers import write_pose2sim
@@ -34,7 +34,7 @@ OUTPUTS = {
 def command(monkeypatch, typed):
     """``command(*words)`` runs calibrate.py in this process: (exit status, stdout, stderr)."""
     monkeypatch.setenv("COLUMNS", "120")
-    return lambda *words: typed(ROOT / "conf", "calibrate", words, calibrate, summary)
+    return lambda *words: typed(ROOT / "conf", COMMAND, words)
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ import ghpt.test as testing
 import toys
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
-from ghpt.train import summary, train, typed
+from ghpt.train import COMMAND, train, typed
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ("data=toy", "model.hypotheses=5", "model.scorer.layers=[4]", "trainer.accelerator=cpu", "progress_bar=false")
@@ -39,8 +39,8 @@ def conf(tmp_path_factory):
 @pytest.fixture
 def command(conf, typed):
     """``command("train", *words)`` runs train.py in this process: (exit status, stdout, stderr)."""
-    tasks = {"train": (train, summary), "test": (testing.test, testing.summary)}
-    return lambda name, *words: typed(conf, name, words, *tasks[name])
+    commands = {"train": COMMAND, "test": testing.COMMAND}
+    return lambda name, *words: typed(conf, commands[name], words)
 
 
 def files(folder):
@@ -58,6 +58,7 @@ def test_train_then_test_as_typed(command, tmp_path):
     assert status == 0
     written = [re.sub(r"tfevents.*", "tfevents", name) for name in files(output)]
     assert written == [
+        ".ghpt/finished.json", ".ghpt/lock", ".ghpt/manifest.json",
         ".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml",
         "best.ckpt", "events.out.tfevents", "last.ckpt", "train.log",
     ]  # fmt: skip
@@ -155,7 +156,7 @@ TYPOS = {
     "data.evaluate=tset": r"data\.evaluate: is 'tset'\. Existing: train, validation, test\.",
     "data.root=/no/such": r"/no/such: data\.root: there is no such folder\. ",
     "seed=abc": r"seed: is 'abc', not an integer\. ",
-    "resume=3": r"resume: is 3, not true or false\. ",
+    "resume=3": r"resume: is 3, not true or false or 'auto'\. ",
     "save_every=0": r"save_every: is 0\. ",
     "trainer.accelerator=gpuu": r"trainer: You selected an invalid accelerator name: ",
     "trainer.max_epochs=x": r"trainer\.max_epochs: is 'x', not an integer or null\. ",
@@ -170,7 +171,8 @@ def test_a_mistake_ends_in_one_line_that_names_it(command, tmp_path, typo):
     assert status == 1
     assert re.fullmatch(f"error: {TYPOS[typo]}.*\n", said), said
     assert out == ""
-    assert not [name for name in files(tmp_path) if not name.startswith(".hydra/") and name != "train.log"]
+    records = (".ghpt/", ".hydra/", "train.log")
+    assert not [name for name in files(tmp_path) if not name.startswith(records)]
 
 
 @pytest.mark.parametrize(
@@ -194,11 +196,13 @@ def test_a_mistake_in_testing(command, tmp_path, word, message):
     assert said.count("\n") == 1
 
 
-def test_an_output_that_cannot_hold_the_log(command, tmp_path):
-    (tmp_path / "train.log").mkdir()
+def test_a_log_that_is_not_ours_is_left_alone(command, tmp_path):
+    (tmp_path / "train.log").write_text("somebody's")
     status, _, said = command("train", *SMALL, f"output={tmp_path}")
     assert status == 1
-    assert re.fullmatch(r"error: output: .*Is a directory.*train\.log.*\n", said)
+    assert re.fullmatch(r"error: .*train\.log: was not written by ghpt, .*\n", said)
+    assert files(tmp_path) == ["train.log"]
+    assert (tmp_path / "train.log").read_text() == "somebody's"
 
 
 def test_the_trace_is_shown_to_who_asks_for_it(conf, tmp_path):

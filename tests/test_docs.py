@@ -21,11 +21,11 @@ from ghpt.data import embedded
 from ghpt.overrides import check_overrides
 
 MAINS = {
-    "train.py": ((train.train, train.summary), {"last.ckpt", "best.ckpt"}),
-    "test.py": ((testing.test, testing.summary), {"predictions.npz", "metrics.json", "report.md"}),
-    "predict.py": ((predict.predict, predict.summary), {"poses.npz", "report.md", "prediction.json"}),
-    "cameras.py": ((doctor.examine, doctor.summary), {"checkup.json", "report.md"}),
-    "calibrate.py": ((calibrate.calibrate, calibrate.summary), {"rig.toml", "calibration.json", "report.md"}),
+    "train.py": (train.COMMAND, {"last.ckpt", "best.ckpt"}),
+    "test.py": (testing.COMMAND, {"predictions.npz", "metrics.json", "report.md"}),
+    "predict.py": (predict.COMMAND, {"poses.npz", "report.md", "prediction.json"}),
+    "cameras.py": (doctor.COMMAND, {"checkup.json", "report.md"}),
+    "calibrate.py": (calibrate.COMMAND, {"rig.toml", "calibration.json", "report.md"}),
 }
 """What a script runs, and what its output folder then holds."""
 
@@ -104,10 +104,10 @@ class Page:
         given = {word.split("=")[0] for word in words}
         more = SMALL[command.script] + (SMALL_PAIRS if "model=camera" in words else ())
         words += [word for word in more if word.split("=")[0] not in given]
-        task, files = MAINS[command.script]
+        main, files = MAINS[command.script]
         if "resume=true" in words:  # what was stopped was begun by the same command
-            self.typed(self.conf, "train", [word for word in words if word != "resume=true"], *task)
-        status, said, errors = self.typed(self.conf, command.script.removesuffix(".py"), words, *task)
+            self.typed(self.conf, main, [word for word in words if word != "resume=true"])
+        status, said, errors = self.typed(self.conf, main, words)
         spoilt = next((word.split("=")[1] for word in words if word.startswith("spoil=")), None)
         if spoilt:
             assert (status, spoilt in errors) == (1, True), f"{command.where}\n{said}{errors}"

@@ -19,7 +19,7 @@ import ghpt.jobs
 import toys
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.overrides import check_overrides
-from ghpt.train import summary, train
+from ghpt.train import COMMAND
 
 ROOT = Path(__file__).resolve().parents[1]
 TOY = [sys.executable, str(ROOT / "tests" / "toy_sweep.py")]
@@ -135,7 +135,7 @@ def test_a_launcher_that_is_not_there(typed, monkeypatch, tmp_path, launcher, in
     monkeypatch.setattr(ghpt.jobs, "find_spec", lambda name: installed or None)
     monkeypatch.setenv("PATH", str(tmp_path))
     words = ("-m", "data=cmu1,cmu2", f"hydra/launcher={launcher}")
-    status, _, said = typed(ROOT / "conf", "train", words, train, summary)
+    status, _, said = typed(ROOT / "conf", COMMAND, words)
     assert (status, said.count("\n")) == (1, 1)
     assert said.startswith(f"error: hydra/launcher: {message}")
 
@@ -143,7 +143,7 @@ def test_a_launcher_that_is_not_there(typed, monkeypatch, tmp_path, launcher, in
 def test_slurm_s_settings_compose_where_there_is_no_slurm(typed):
     settings = {"partition": "gpu", "gpus_per_node": 1, "timeout_min": 120, "cpus_per_task": 4}
     words = ["hydra/launcher=submitit_slurm", *(f"hydra.launcher.{k}={v}" for k, v in settings.items()), "--cfg=hydra"]
-    status, said, _ = typed(ROOT / "conf", "train", words, train, summary)
+    status, said, _ = typed(ROOT / "conf", COMMAND, words)
     launcher = yaml.safe_load(said)["hydra"]["launcher"]
     assert status == 0
     assert {key: launcher[key] for key in settings} == settings
@@ -169,7 +169,7 @@ def test_trainings_of_a_local_pool_are_those_of_one_process(typed, tmp_path, mon
     said = {}
     for launcher in ("basic", "submitit_local"):
         words = ("-m", *small, "progress_bar=false", f"output={tmp_path / launcher}", f"hydra/launcher={launcher}")
-        status, text, errors = typed(conf, "train", words, train, summary)
+        status, text, errors = typed(conf, COMMAND, words)
         assert status == 0, errors
         said[launcher] = lines(text)[0]
     assert said["basic"] == said["submitit_local"]

@@ -18,7 +18,7 @@ from ghpt.data.key_points import KeyPoints, write_key_points
 from ghpt.data.rigs import Rig, human36m_rig
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.predict import predict, summary
+from ghpt.predict import COMMAND, predict
 from ghpt.reconstruction import State
 from ghpt.skeleton import JOINTS
 from predicting import CONF, QUICK, cameras_file, config, frames_of, openpose_folders, walk, write_people
@@ -32,7 +32,7 @@ PIXELS = project(RIG.cameras, walk())[0].numpy()
 def command(monkeypatch, typed):
     """``command(*words)`` runs predict.py in this process: (exit status, stdout, stderr)."""
     monkeypatch.setenv("COLUMNS", "120")
-    return lambda *words: typed(CONF, "predict", [*words, *QUICK], predict, summary)
+    return lambda *words: typed(CONF, COMMAND, [*words, *QUICK])
 
 
 def points_file(folder: Path, values=None, name="points.npz", frames=40, **changed) -> Path:
@@ -328,13 +328,13 @@ sys.argv = ["predict.py", *{words!r}]
 from ghpt.app import run
 resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
 import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-run(Path({conf!r}), "predict", ghpt.predict.predict, ghpt.predict.summary)
+run(Path({conf!r}), ghpt.predict.COMMAND)
 """
 
 
 @pytest.mark.parametrize(("limit", "file"), [(9_000, "000000.npz"), (25_000, "poses.npz")])
 def test_a_full_disk_is_named_and_the_next_run_goes_on(tmp_path, limit, file):
-    given = [*QUICK, *words(tmp_path, points_file(tmp_path)), "shard_frames=20", "formats=[npz]"]
+    given = [*QUICK, *words(tmp_path, points_file(tmp_path)), "shard_frames=20", "formats=[npz]", "overwrite=true"]
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "poses.npz").write_bytes(b"of an earlier run")
     script = DISK.format(words=given, limit=limit, conf=str(CONF))

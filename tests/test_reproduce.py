@@ -1,13 +1,13 @@
 """reproduce.py as it is typed, with models of 16 samples."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import pytest
 
+from ghpt import reproduce
 from ghpt.errors import GhptConfigError
-from ghpt.reproduce import ITEMS, chosen, gather, reproduce, spread, summary
+from ghpt.reproduce import ITEMS, chosen, spread
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SMALL = ("overrides.train=['data.train_samples=16','model.hypotheses=8','data.stride=4096']",
@@ -24,8 +24,7 @@ def command(typed, tmp_path):
         flags = [word for word in words if word == "-m"]  # Hydra wants them first
         settings = [*SMALL, *(word for word in words if word not in flags)]
         folders = [f"output={tmp_path / 'report'}", f"cells={tmp_path / 'cells'}"]
-        task, after = (partial(function, conf=CONF) for function in (reproduce, gather))
-        return typed(CONF, "reproduce", [*spread([*flags, *settings]), *folders], task, summary, after)
+        return typed(CONF, reproduce.command(CONF), [*spread([*flags, *settings]), *folders])
 
     return call
 

@@ -7,12 +7,18 @@ import sys
 import time
 from pathlib import Path
 
-from ghpt.app import run
+from ghpt.app import Command, run
 from ghpt.errors import GhptConfigError
+from ghpt.files import atomic_write
+from ghpt.outputs import Files
 
 
 def task(config, output):
     match config["how"]:
+        case "once":  # fails in its first run
+            if not (output / "failed").exists():
+                (output / "failed").touch()
+                raise GhptConfigError("how", "is once", "Say well.")
         case "user":
             raise GhptConfigError("how", "is user", "Say well.")
         case "fault":
@@ -24,6 +30,8 @@ def task(config, output):
         case "waits":
             (output / "begun").touch()
             time.sleep(60)
+    with atomic_write(output / "pid", "w") as handle:
+        handle.write(str(os.getpid()))
     return {"pid": os.getpid()}
 
 
@@ -37,4 +45,5 @@ if __name__ == "__main__":
         import submitit
 
         submitit.Job._results_timeout_s = 0  # a local disk shows at once what a killed job has left
-    run(Path(os.environ["TOY_CONF"]), "toy", task, lambda result: "done", after)
+    command = Command("toy", task, lambda result: "done", lambda settings: Files(), after)
+    run(Path(os.environ["TOY_CONF"]), command)

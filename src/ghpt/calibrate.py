@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from ghpt.app import Command
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.millimetres import check_scale, in_millimetres, of_scale
 from ghpt.calibration.rig import RigEstimate
@@ -22,8 +23,9 @@ from ghpt.data.chosen import InputSettings, own_cameras, own_key_points, recordi
 from ghpt.data.key_points import KeyPoints
 from ghpt.data.views import Views, look_through
 from ghpt.errors import GhptDataError, check
-from ghpt.files import sweep_temporaries
+from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
+from ghpt.outputs import Files, check_apart, input_paths
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
 from ghpt.report.calibration import differences, explains, print_calibration
@@ -67,6 +69,14 @@ class Case:
     notes: tuple[Diagnosis, ...] = ()
 
 
+def files(config: dict[str, Any]) -> Files:
+    """What a calibration reads and writes. Raises GhptConfigError for settings that cannot work."""
+    check_type(config, Settings, "")
+    check_apart(config)
+    names = ("calibration.json", "report.md", "rig.png", "rig.svg")
+    return Files(input_paths(config), (*RIG_FILES, *names))
+
+
 def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     """Calibrate the cameras of ``config["keypoints"]``, or of a recording of ``config["data"]``.
 
@@ -85,7 +95,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     check_scale(config["scale"], cameras.names)
     sweep_temporaries(output)
     for name in RIG_FILES:  # of an earlier run: they must not pass for this one's
-        (output / name).unlink(missing_ok=True)
+        remove(output / name)
 
     estimate: RigEstimate = calibration(
         cameras.names, cameras.K, torch.from_numpy(views.key_points).double(),
@@ -188,3 +198,6 @@ def _gauge(estimate: RigEstimate, placed: list[int], reference: Cameras | None, 
 
 def _through(case: Case, views: list[int], cameras: Cameras) -> Recording:
     return case.views.part(views).recording(case.title, cameras.index(views))
+
+
+COMMAND = Command("calibrate", calibrate, summary, files)

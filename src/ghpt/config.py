@@ -174,10 +174,10 @@ def _words(wanted: Any) -> str:
     """What ``_fits`` looks for, for people."""
     origin, inner = get_origin(wanted), get_args(wanted)
     if origin in (Union, types.UnionType):
-        plain_ones = [one for one in inner if one in _SCALARS]
+        plain_ones = [one for one in inner if one in _SCALARS or get_origin(one) is Literal]
         return " or ".join(dict.fromkeys(map(_words, plain_ones or inner)))
     if origin is Literal:
-        return "one of " + ", ".join(map(repr, inner))
+        return ("one of " if len(inner) > 1 else "") + ", ".join(map(repr, inner))
     if origin in (list, tuple, Sequence, Iterable):
         return "a list" + (f" ({_words(inner[0])} each)" if inner else "")
     if origin in (dict, Mapping) or is_typeddict(wanted):

@@ -14,6 +14,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from ghpt.app import Command
 from ghpt.calibrate import people_note
 from ghpt.checkup.breakages import BREAKAGES
 from ghpt.checkup.evidence import Evidence, choose, gather
@@ -27,7 +28,8 @@ from ghpt.data.key_points import KeyPoints
 from ghpt.data.lens import distort
 from ghpt.data.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
-from ghpt.files import atomic_write, sweep_temporaries
+from ghpt.files import atomic_write, remove, sweep_temporaries
+from ghpt.outputs import Files, check_apart, input_paths
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
 from ghpt.report.tables import markdown, words
@@ -60,6 +62,13 @@ class Patient:
     """Which of the key points' views are the evidence's."""
 
 
+def files(config: dict[str, Any]) -> Files:
+    """What an examination reads and writes. Raises GhptConfigError for settings that cannot work."""
+    check_type(config, Settings, "")
+    check_apart(config)
+    return Files(input_paths(config), (*MENDED, "checkup.json", "report.md"))
+
+
 def examine(config: dict[str, Any], output: Path) -> dict[str, Any]:
     """Examine the cameras of ``config["cameras"]`` with ``config["keypoints"]``, or a recording of ``config["data"]``.
 
@@ -71,7 +80,7 @@ def examine(config: dict[str, Any], output: Path) -> dict[str, Any]:
     patient = from_files(config, doctor) if config["keypoints"] else from_data(config, doctor)
     sweep_temporaries(output)
     for name in MENDED:  # of an earlier run
-        (output / name).unlink(missing_ok=True)
+        remove(output / name)
     checkup = doctor(patient.evidence, patient.setup)
     numbers = _numbers(patient, checkup) | {"provenance": provenance(config["seed"])}
     mended = any(finding.mended for finding in checkup.findings)
@@ -188,3 +197,6 @@ def _sentence(finding: Mapping[str, Any]) -> str:
 def _stature(numbers: dict[str, Any]) -> str:
     height = numbers["stature_mm"]
     return f"The person measures {height / 1000:.2f} m." if height else "The person's size cannot be told."
+
+
+COMMAND = Command("cameras", examine, summary, files)

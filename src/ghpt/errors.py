@@ -45,6 +45,11 @@ class GhptCheckpointError(GhptError):
         super().__init__(f"{path}: {problem}. {mend}")
 
 
+def one_line(error: BaseException) -> str:
+    """An error's text without its line breaks."""
+    return " ".join(str(error).split())
+
+
 def check(condition: bool, key: str, problem: str, mend: str) -> None:
     """Raise GhptConfigError unless ``condition`` holds: for the constructors that yaml values reach."""
     if not condition:

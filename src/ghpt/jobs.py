@@ -148,8 +148,8 @@ def take_signals() -> None:
 
 
 @contextmanager
-def own_command(script: str) -> Iterator[None]:
-    """Within the block, the running job of a sweep is a command of its own to Lightning.
+def own_command(script: str, added: Sequence[str] = ()) -> Iterator[None]:
+    """Within the block, the running job of a sweep is a command of its own to Lightning, with ``added`` words.
 
     Lightning starts a training's other processes with this process's command, which is the whole sweep's; and leaves
     its variables behind, with which the next job would believe to have been started by the one before.
@@ -159,7 +159,7 @@ def own_command(script: str) -> Iterator[None]:
     with read_write(hydra), open_dict(hydra):
         hydra.run.dir = hydra.runtime.output_dir
     settings = [word for word in hydra.overrides.task if not word.startswith("output=")]
-    sys.argv[:], __main__.__spec__ = [script, *settings, f"output='{hydra.runtime.output_dir}'"], None
+    sys.argv[:], __main__.__spec__ = [script, *settings, *added, f"output='{hydra.runtime.output_dir}'"], None
     try:
         yield
     finally:
@@ -171,9 +171,14 @@ def own_command(script: str) -> Iterator[None]:
             distributed.destroy_process_group()
 
 
+def is_first_process() -> bool:
+    """Whether this is not one of the further processes that Lightning starts for a training."""
+    return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
+
+
 def first_of_several_ends() -> bool:
     """Whether this is one of a training's several processes, but the first, and that one ends too: it says why."""
-    if os.environ.get("LOCAL_RANK", "0") == "0":
+    if is_first_process():
         return False
     first, end = os.getppid(), time.monotonic() + _PATIENCE / 2
     while os.getppid() == first and time.monotonic() < end:

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from ghpt.app import Command
 from ghpt.calibrate import from_data
 from ghpt.config import build, check_type, suggest
 from ghpt.data.chosen import InputSettings, own_cameras
@@ -23,6 +24,7 @@ from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
 from ghpt.models.predictors import Classical, Learned
 from ghpt.models.swaps import Swaps
+from ghpt.outputs import Files, check_apart, input_paths
 from ghpt.prediction.frames import Frames, calibrated, evidence, frames_of_views
 from ghpt.prediction.gaps import Gaps, after, gap_frames
 from ghpt.prediction.report import prediction_report, print_prediction
@@ -81,6 +83,19 @@ class Chosen:
     weights: torch.nn.Module | None
     identity: dict[str, Any]
     """What its results depend on, as plain data."""
+
+
+def files(config: dict[str, Any]) -> Files:
+    """What a prediction reads and writes. Raises GhptConfigError for settings that cannot work."""
+    check_type(config, Settings, "")
+    _check(config)
+    check_apart(config)
+    names = [WRITERS[name].file for name in config["formats"] or _ALL]
+    return Files(
+        reads=input_paths(config),
+        writes=(*names, "prediction.json", "report.md"),
+        growing=(SHARDS,),
+    )
 
 
 def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
@@ -221,3 +236,6 @@ def _check(config: dict[str, Any]) -> None:
     ):  # fmt: skip
         for name in names:
             check(name in existing, key, f"there is no {name!r}", suggest(name, existing))
+
+
+COMMAND = Command("predict", predict, summary, files)

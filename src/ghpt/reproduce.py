@@ -6,14 +6,17 @@ import logging
 import os
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, TypedDict
 
 import yaml
 
+from ghpt.app import Command
 from ghpt.config import check_type, suggest
 from ghpt.errors import GhptConfigError, check
 from ghpt.jobs import Job
+from ghpt.outputs import Files
 from ghpt.provenance import provenance
 from ghpt.report.tables import words
 from ghpt.reproduction import (
@@ -69,6 +72,13 @@ class Settings(TypedDict):
     sizes: dict[str, Any]
     cells: str
     progress_bar: bool
+
+
+def files(config: dict[str, Any]) -> Files:
+    """What `reproduce` reads and writes. Raises GhptConfigError for settings that cannot work."""
+    check_type(config, Settings, "")
+    roots = [Path(root).expanduser() for root in config["data"].values() if root]
+    return Files(tuple(roots), ("report.md", "report.html", "report.json"))
 
 
 def reproduce(config: dict[str, Any], output: Path, conf: Path) -> dict[str, Any]:
@@ -200,3 +210,9 @@ def _about(config: dict[str, Any], setups: Sequence[Setup], done: int, start: fl
         "command": f"`{origin['command']}`",
         "run time": f"{minutes:.1f} minutes on {processors()} processors, for {done} cells that were not there before",
     }  # fmt: skip
+
+
+def command(conf: Path) -> Command:
+    """The command, of the configurations in the folder ``conf``."""
+    task, after = partial(reproduce, conf=conf), partial(gather, conf=conf)
+    return Command("reproduce", task, summary, files, after)

@@ -5,12 +5,14 @@ import shutil
 from pathlib import Path
 from typing import Any, TypedDict
 
+from ghpt.app import Command
 from ghpt.config import build, check_type
 from ghpt.errors import GhptCheckpointError
 from ghpt.files import sweep_temporaries
 from ghpt.models.checkpoint import load_model
 from ghpt.models.pose import PoseTriangulation
 from ghpt.models.relative_pose import RelativePose
+from ghpt.outputs import Files, input_paths
 from ghpt.provenance import provenance
 from ghpt.report.evaluate import write_metrics
 from ghpt.report.pairs import PAIRS
@@ -32,6 +34,13 @@ class Settings(TypedDict):
     trainer: dict[str, Any]
     seed: int
     progress_bar: bool
+
+
+def files(config: dict[str, Any]) -> Files:
+    """What a test reads and writes. Raises GhptConfigError for settings that cannot work."""
+    check_type(config, Settings, "")
+    names = ("predictions.npz", "metrics.json", "report.md")
+    return Files(input_paths(config), names, growing=(".predictions",))
 
 
 def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
@@ -100,3 +109,6 @@ def summary(metrics: dict[str, Any]) -> str:
 
 
 test.__test__ = False  # not one for pytest
+
+
+COMMAND = Command("test", test, summary, files)

@@ -6,22 +6,25 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict
 
 import lightning as L
 import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
+from ghpt.app import Command
 from ghpt.config import build, check_arguments, check_type
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.files import sweep_temporaries
 from ghpt.models.callbacks import LogHyperparameters, Progress, SaveLast, best_checkpoint
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO, read_checkpoint
+from ghpt.outputs import Files, input_paths
 from ghpt.provenance import provenance
 from ghpt.report.logger import ForgivingTensorBoard
 from ghpt.report.tables import words
 
+LAST, BEST = "last.ckpt", "best.ckpt"
 _log = logging.getLogger(__name__)
 
 
@@ -33,15 +36,27 @@ class Settings(TypedDict):
     trainer: dict[str, Any]
     seed: int
     save_every: int
-    resume: bool
+    resume: bool | Literal["auto"]
     progress_bar: bool
+
+
+def files(config: dict[str, Any]) -> Files:
+    """What a training reads and writes. Raises GhptConfigError for settings that cannot work."""
+    check_type(config, Settings, "")
+    checkpoints = (LAST, BEST)
+    return Files(
+        reads=input_paths(config),
+        writes=checkpoints,
+        keeps=() if config["resume"] else checkpoints,
+    )
 
 
 def train(config: dict[str, Any], output: Path) -> dict[str, float]:
     """Train ``config["model"]`` on ``config["data"]``; returns the validation errors (mm).
 
     Writes ``last.ckpt``, ``best.ckpt`` and TensorBoard events into ``output``. With ``resume`` it goes on from
-    ``last.ckpt`` there, to the same numbers as an uninterrupted run. Exits with 130 on SIGINT and 143 on SIGTERM.
+    ``last.ckpt`` there, to the same numbers as an uninterrupted run; ``auto`` does so where there is one. Exits with
+    130 on SIGINT and 143 on SIGTERM.
     """
     check_type(config, Settings, "")
     torch.set_float32_matmul_precision("high")
@@ -55,7 +70,8 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
         "config": {"model": config["model"], "data": config["data"], "seed": seed},
         "provenance": provenance(seed) | {"data": data.name, "source": data.source},
     }
-    last = output / "last.ckpt"
+    last = output / LAST
+    resume = last.exists() if config["resume"] == "auto" else config["resume"]
     saver = SaveLast(last, config["save_every"], identity)
     about = {"data": data.name, "source": data.source, "train_samples": data.train_samples, "seed": seed}
     trainer = make_trainer(
@@ -73,11 +89,11 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
         num_sanity_val_steps=0,
     )
     sweep_temporaries(output)
-    if config["resume"]:
+    if resume:
         _check_resumable(last, config)
     try:
         with shell_status():
-            trainer.fit(model, datamodule=data, ckpt_path=str(last) if config["resume"] else None, weights_only=True)
+            trainer.fit(model, datamodule=data, ckpt_path=str(last) if resume else None, weights_only=True)
     except SystemExit:
         if trainer.is_global_zero:
             _say_stopped(last, saver.saved)
@@ -173,3 +189,6 @@ def _say_stopped(last: Path, step: int | None) -> None:
     else:
         _log.warning("Stopped. %s holds training step %d.", shown(last), step)
         _log.warning("Go on with the same command and %s resume=true", typed("output", shown(last.parent)))
+
+
+COMMAND = Command("train", train, summary, files)

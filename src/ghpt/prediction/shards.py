@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import io
 import json
 import logging
 import os
+import re
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,9 +16,10 @@ from typing import Any
 
 import numpy as np
 import torch
+from filelock import BaseFileLock
 
 from ghpt.errors import GhptDataError
-from ghpt.files import atomic_write, sweep_temporaries
+from ghpt.files import acquire, atomic_write, sweep_temporaries
 from ghpt.reconstruction import Reconstruction
 from ghpt.report.stored_npz import add_member, members_of, read_rows
 
@@ -29,6 +30,7 @@ _DTYPES = {
     "score": "<f4", "swapped": "|b1",
 }  # fmt: skip
 _MEND = "Run the prediction again: what is damaged is made anew"
+_SHARD = re.compile(r"\d{6,}\.npz")
 _log = logging.getLogger(__name__)
 
 
@@ -44,10 +46,11 @@ class Shards:
     def __init__(self, folder: Path, key: str, frames: int, size: int, clean: bool = True) -> None:
         self.folder, self.frames, self.size = folder, frames, size
         self._header = {"version": FORMAT_VERSION, "key": key, "frames": frames, "shard_frames": size}
-        self._lock: int | None = None
+        self._lock: BaseFileLock | None = None
         if clean:
             folder.mkdir(parents=True, exist_ok=True)
-            self._lock = _locked(folder)
+            self._lock = acquire(folder / "lock", "another prediction writes here")
+            self._check_folder()
         there = self._manifest()
         self.kept = {shard: entry for shard, entry in there.items() if self._vouched(shard, entry)}
         if clean:
@@ -63,7 +66,7 @@ class Shards:
     def close(self) -> None:
         """Let others write here; the end of the process does so too."""
         if self._lock is not None:
-            os.close(self._lock)
+            self._lock.release()
         self._lock = None
 
     def look(self) -> None:
@@ -112,6 +115,15 @@ class Shards:
     def path(self, shard: int) -> Path:
         return self.folder / f"{shard:06d}.npz"
 
+    def _check_folder(self) -> None:
+        """Raise GhptDataError for shards that no manifest speaks of: another program may have made them."""
+        if (self.folder / MANIFEST).exists():
+            return
+        for path in self.folder.iterdir():
+            if _SHARD.fullmatch(path.name):
+                problem = "is there, but no manifest that says what it is of"
+                raise GhptDataError(path, "", problem, "Move it away, or name another output.")
+
     def _manifest(self) -> dict[int, dict[str, Any]]:
         """What the manifest lists; a last line that was cut off is none."""
         try:
@@ -137,8 +149,8 @@ class Shards:
             for entry in (self._header, *(self.kept[shard] for shard in sorted(self.kept))):
                 handle.write(_line(entry))
         keep = {self.path(shard) for shard in self.kept}
-        for path in self.folder.glob("*.npz"):
-            if path not in keep:
+        for path in self.folder.iterdir():
+            if _SHARD.fullmatch(path.name) and path not in keep:
                 path.unlink()
 
 
@@ -151,18 +163,3 @@ def _parsed(line: bytes) -> Any:
         return json.loads(line)
     except ValueError:
         return None
-
-
-def _locked(folder: Path) -> int:
-    """A handle that holds the folder until the process ends, however it does."""
-    handle = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o644)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(handle)
-        raise GhptDataError(
-            folder, "", "another prediction writes here", "Wait for it, or name another output."
-        ) from None
-    except OSError:  # a file system without locks
-        pass
-    return handle

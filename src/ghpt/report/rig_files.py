@@ -19,7 +19,7 @@ from ghpt.calibration.rig import RigEstimate
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.data.rigs import Rig
-from ghpt.files import atomic_write
+from ghpt.files import atomic_write, remove
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
 from ghpt.report.calibration import calibration_report
@@ -91,7 +91,7 @@ def write_rig_figure(
     """rig.png and rig.svg of the calibrated cameras, and of a reference's brought onto them by ``align``."""
     if not bool(calibrated.any()):
         for name in ("rig.png", "rig.svg"):
-            (output / name).unlink(missing_ok=True)
+            remove(output / name)
         return
     shown = cameras.index(calibrated)
     names = tuple(camera["name"] for camera in numbers["cameras"] if camera["calibrated"])
