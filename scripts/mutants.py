@@ -38,8 +38,8 @@ PLANTED = Path(__file__).with_name("planted_bugs.json")
 TESTS = {
     "src/ghpt/geometry/cameras.py": ["test_cameras.py"],
     "src/ghpt/geometry/epipolar.py": ["test_epipolar.py"],
-    "src/ghpt/geometry/normal_equations.py": ["test_triangulation.py"],
-    "src/ghpt/geometry/reweighting.py": ["test_baselines.py"],
+    "src/ghpt/geometry/normal_equations.py": ["test_normal_equations.py", "test_triangulation.py"],
+    "src/ghpt/geometry/reweighting.py": ["test_reweighting.py"],
     "src/ghpt/geometry/rotations.py": ["test_rotations.py"],
     "src/ghpt/geometry/subsets.py": ["test_subsets.py"],
     "src/ghpt/geometry/triangulation.py": ["test_triangulation.py"],
