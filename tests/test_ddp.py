@@ -131,6 +131,7 @@ def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
     assert errors.count("\n") == 1
 
 
+@pytest.mark.posix
 def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
     child = typed_for_two("train", *MODELS["pose"], "trainer.max_epochs=5000", "save_every=2", f"output={tmp_path}")
     end = time.monotonic() + 300
@@ -146,4 +147,4 @@ def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
     assert others.split()
     for pid in others.split():
         status = Path(f"/proc/{pid}/status")
-        assert not status.exists() or "State:\tZ" in status.read_text()
+        assert not status.exists() or "State:\tZ" in status.read_text(encoding="utf-8")
