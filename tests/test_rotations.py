@@ -22,7 +22,7 @@ SHAPES = [(), (1,), (3, 1, 2, 1)]
 
 def random_rotations(shape, seed=0):
     count = int(np.prod(shape))
-    return torch.from_numpy(Rotation.random(count, rng=np.random.default_rng(seed)).as_matrix()).reshape(*shape, 3, 3)
+    return torch.from_numpy(Rotation.random(count, np.random.default_rng(seed)).as_matrix()).reshape(*shape, 3, 3)
 
 
 def special_rotations():
@@ -40,7 +40,7 @@ def test_quaternions_and_vectors_are_scipy_s(shape):
     reference = Rotation.from_matrix(R.reshape(-1, 3, 3).numpy())
     q = matrix_to_quaternion(R)
     assert (q[..., 0] >= 0).all()
-    expected = torch.from_numpy(reference.as_quat(canonical=True, scalar_first=True)).reshape(*shape, 4)
+    expected = torch.from_numpy(np.roll(reference.as_quat(canonical=True), 1, axis=-1)).reshape(*shape, 4)
     torch.testing.assert_close(q, expected, rtol=0, atol=1e-12)
     v = torch.from_numpy(reference.as_rotvec()).reshape(*shape, 3)
     torch.testing.assert_close(matrix_to_vector(R), v, rtol=0, atol=1e-12)
