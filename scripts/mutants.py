@@ -100,14 +100,14 @@ class Mutant:
     end: int
     text: str
 
-    def source(self, root: Path = ROOT) -> bytes:
+    def source(self) -> bytes:
         """The whole mutated file."""
-        original = (root / self.file).read_bytes()
+        original = (ROOT / self.file).read_bytes()
         return original[: self.start] + self.text.encode() + original[self.end :]
 
-    def change(self, root: Path = ROOT) -> tuple[str, str]:
+    def change(self) -> tuple[str, str]:
         """The touched lines before and after, each as one line."""
-        original = (root / self.file).read_bytes()
+        original = (ROOT / self.file).read_bytes()
         first = original.rfind(b"\n", 0, self.start) + 1
         last = original.index(b"\n", self.end)
         after = original[first : self.start] + self.text.encode() + original[self.end : last]
@@ -190,9 +190,9 @@ def nodes(tree: ast.AST) -> Iterator[ast.AST]:
                 yield from nodes(child)
 
 
-def mutants(file: str, root: Path = ROOT) -> list[Mutant]:
+def mutants(file: str) -> list[Mutant]:
     """All mutants of a file, in the order of its text."""
-    source = (root / file).read_bytes()
+    source = (ROOT / file).read_bytes()
     lines = source.splitlines(keepends=True)
     starts = [0]
     for line in lines:
@@ -207,22 +207,22 @@ def mutants(file: str, root: Path = ROOT) -> list[Mutant]:
             start = starts[node.lineno - 1] + node.col_offset
             end = starts[node.end_lineno - 1] + node.end_col_offset
             found.add(Mutant(file, node.lineno, start, end, text))
-    return [m for m in sorted(found, key=lambda m: (m.start, m.end, m.text)) if changes(m, original, root)]
+    return [m for m in sorted(found, key=lambda m: (m.start, m.end, m.text)) if differs(m, original)]
 
 
-def changes(mutant: Mutant, original: str, root: Path) -> bool:
+def differs(mutant: Mutant, original: str) -> bool:
     """Whether a mutant is a program, and another one than the file."""
     try:
-        return ast.dump(ast.parse(mutant.source(root))) != original
+        return ast.dump(ast.parse(mutant.source())) != original
     except SyntaxError:
         return False
 
 
-def planted(root: Path = ROOT) -> list[Mutant]:
+def planted() -> list[Mutant]:
     """The bugs of ``PLANTED``; what stands in the place of each must be in its file once."""
     found = []
     for row in json.loads(PLANTED.read_text(encoding="utf-8")):
-        source = (root / row["file"]).read_bytes()
+        source = (ROOT / row["file"]).read_bytes()
         before = row["before"].encode()
         if source.count(before) != 1:
             raise SystemExit(f"{PLANTED.name}: {row['file']} has not one {row['before']!r}.")
