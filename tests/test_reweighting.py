@@ -4,7 +4,7 @@ import torch
 from ghpt.geometry.cameras import project
 from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
 from ghpt.geometry.triangulation import Status, triangulate
-from scenes import random_scene
+from scenes import Scene, random_scene
 
 TOLERANCE = 1e-6
 SCALE = 4.0
@@ -60,6 +60,23 @@ def test_not_converged_is_said_where_the_last_step_is_longer_than_the_tolerance(
     status = robustly(scene, "cauchy", iterations, tolerance=tolerance)[0].status
     assert torch.equal(status == Status.NOT_CONVERGED, step > tolerance)
     assert ((status == Status.OK) == (step <= tolerance)).all()
+
+
+def test_a_joint_rests_only_when_its_step_is_far_below_the_tolerance():
+    scene = scene_with_outliers(frames=6)
+    exact = robustly(scene, "geman_mcclure", 200)[0].points
+    coarse = robustly(scene, "geman_mcclure", 200, tolerance=5.0)[0].points
+    assert (coarse - exact).norm(dim=-1).max() < 0.5
+
+
+def test_a_resting_joint_stays_though_others_move():
+    scene = scene_with_outliers(frames=6)
+    together = robustly(scene, "geman_mcclure", 200, tolerance=5.0)[0].points
+    for frame in range(6):
+        rows = slice(frame, frame + 1)
+        alone = Scene(scene.cameras.index(rows), scene.points[rows], scene.key_points[rows])
+        points = robustly(alone, "geman_mcclure", 200, tolerance=5.0)[0].points
+        torch.testing.assert_close(points[0], together[frame], rtol=0, atol=1e-9)
 
 
 def test_what_is_not_seen_is_not_used_and_what_is_broken_is_said():

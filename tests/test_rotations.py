@@ -167,6 +167,14 @@ def test_procrustes_undoes_any_similarity_and_no_reflection():
     assert (procrustes(mirrored, target, mask) - target).abs().amax((-2, -1)).min() > 10
 
 
+def test_three_joints_fix_a_similarity():
+    target = random_poses(frames=3)[0]
+    mask = torch.zeros(3, 17, dtype=torch.bool)
+    mask[:, [1, 8, 13]] = True
+    points = 0.5 * target @ random_rotations((3,)).mT + 100
+    torch.testing.assert_close(procrustes(points, target, mask), target, rtol=0, atol=1e-8)
+
+
 def test_procrustes_is_the_best_similarity():
     target, rng = random_poses()
     points = target + torch.from_numpy(rng.normal(0, 100, target.shape))
