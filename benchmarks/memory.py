@@ -21,7 +21,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def peak(command: list[str], **environment: str) -> tuple[float, float, float]:
     """Peak of a process's whole and private memory, MiB, and its seconds."""
     start, whole, private = time.perf_counter(), 0, 0
-    with open(os.devnull, "w") as nowhere:
+    with open(os.devnull, "w", encoding="utf-8") as nowhere:
         process = subprocess.Popen(
             [sys.executable, *command], cwd=ROOT, env=os.environ | environment, stdout=nowhere, stderr=subprocess.PIPE
         )
@@ -36,7 +36,7 @@ def peak(command: list[str], **environment: str) -> tuple[float, float, float]:
 
 def _status(pid: int) -> dict[str, int]:
     try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
     except OSError:  # it has just ended
         return {}
     return {name: int(value.split()[0]) for name, value in (line.split(":", 1) for line in lines) if "kB" in value}

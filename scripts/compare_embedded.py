@@ -119,7 +119,7 @@ def caliscope(shared: Path) -> Detected:
     """MediaPipe; a key point outside the image counts as not seen."""
     table = tomllib.loads((shared / "caliscope/camera_array.toml").read_text())["cameras"]
     entries = [table[name] for name in sorted(table, key=int)]
-    with open(shared / "caliscope/xy_HOLISTIC.csv", newline="") as handle:
+    with open(shared / "caliscope/xy_HOLISTIC.csv", encoding="utf-8", newline="") as handle:
         lines = [line for line in csv.DictReader(handle) if int(line["point_id"]) in MEDIAPIPE]
     frames = {number: index for index, number in enumerate(sorted({int(line["sync_index"]) for line in lines}))}
     raw = np.full((len(frames), len(entries), len(COMMON), 2), np.nan)

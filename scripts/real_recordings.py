@@ -82,7 +82,8 @@ def distance(ours: dict[int, np.ndarray], theirs: dict[int, np.ndarray]) -> tupl
 
 def of_pose2sim(folder: Path) -> dict[int, np.ndarray]:
     """Metres, counted from 1, and turned to y up: x, y, z of the cameras' world are the file's z, x, y."""
-    rows = list(csv.reader(open(folder / "pose2sim_single" / "Balancing_for_IK.trc"), delimiter="\t"))  # noqa: SIM115
+    with open(folder / "pose2sim_single" / "Balancing_for_IK.trc", encoding="utf-8") as handle:
+        rows = list(csv.reader(handle, delimiter="\t"))
     names = [name for name in rows[3][2:] if name]
     at = [names.index("".join((name[0].upper(), name.split("_")[1].capitalize()))) for name in LIMBS]
     found = {}
@@ -96,7 +97,7 @@ def of_caliscope(folder: Path) -> dict[int, np.ndarray]:
     """Metres, in the cameras' world."""
     at = {SKELETONS["mediapipe_33"].index(name): place for place, name in enumerate(LIMBS)}
     found: dict[int, np.ndarray] = {}
-    with open(folder / "caliscope" / "xyz_HOLISTIC.csv") as handle:
+    with open(folder / "caliscope" / "xyz_HOLISTIC.csv", encoding="utf-8") as handle:
         for row in csv.DictReader(handle):
             if int(row["point_id"]) in at:
                 pose = found.setdefault(int(row["sync_index"]), np.full((len(LIMBS), 3), np.nan))

@@ -19,6 +19,15 @@ if WORKER:  # each of several test processes has its own core, and so have the c
     torch.set_num_threads(1)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip on Windows what is marked ``posix``."""
+    if os.name != "nt":
+        return
+    for item in items:
+        if item.get_closest_marker("posix"):
+            item.add_marker(pytest.mark.skip(reason="needs forks, signals or programs that Windows lacks"))
+
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # so a script's background job starts, and all that it starts
     signal.signal(signal.SIGINT, signal.default_int_handler)
 

@@ -77,4 +77,4 @@ def write_people(path: Path, people: list[Tensor]) -> None:
         values = torch.cat([person, torch.ones(len(person), 1, dtype=person.dtype)], dim=-1)
         values = torch.where(values.isfinite().all(-1, keepdim=True), values, 0.0)
         rows.append({"pose_keypoints_2d": values.flatten().tolist()})
-    path.write_text(json.dumps({"people": rows}))
+    path.write_text(json.dumps({"people": rows}), encoding="utf-8")

@@ -1,7 +1,7 @@
 import numpy as np
 import torch
 
-from ghpt.geometry.cameras import project, reprojection_error
+from ghpt.geometry.cameras import Cameras, project, reprojection_error
 from scenes import random_scene
 
 
@@ -54,3 +54,20 @@ def test_moving_and_indexing_keep_the_cameras():
     cameras = random_scene(5, frames=3).cameras
     assert cameras.to(torch.float32).K.dtype == torch.float32
     torch.testing.assert_close(cameras.index(1).centre, cameras.centre[1])
+
+
+def test_a_point_in_the_camera_s_plane_has_no_error_but_infinity():
+    scene = random_scene(6, frames=1, views=1)
+    eye, zero = torch.eye(3, dtype=torch.float64)[None, None], torch.zeros(1, 1, 3, dtype=torch.float64)
+    cameras = Cameras(scene.cameras.K, eye, zero)
+    points = torch.tensor([[[300.0, -200.0, 0.0], [300.0, -200.0, 1e-3]]], dtype=torch.float64)
+    error = reprojection_error(cameras, torch.zeros(1, 1, 2, 2), points)
+    assert torch.isinf(error[0, 0]).tolist() == [True, False]
+
+
+def test_reprojection_errors_are_double_whatever_is_given():
+    scene = random_scene(7)
+    cameras = scene.cameras.to(torch.float32)
+    error = reprojection_error(cameras, scene.key_points.float(), scene.points.float())
+    assert error.dtype == torch.float64
+    assert error.max() < 1e-2

@@ -102,6 +102,7 @@ def slow(diary):
     return [cell(diary, 1), *(cell(diary, n, sleep=600) for n in (2, 3))]
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize(("stop", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGKILL", -9)])
 def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_path, stop, status):
     program = tmp_path / "program.py"
@@ -124,7 +125,7 @@ def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_pat
 
 def alive(process):
     try:
-        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+        return Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()[0] != "Z"
     except OSError:
         return False
 

@@ -241,6 +241,7 @@ def uninterrupted(tmp_path_factory):
     return read_checkpoint(folder / "last.ckpt")
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(tmp_path, uninterrupted, number, status):
     script = ROOT / "tests" / "reliability" / "run_toy.py"
@@ -268,6 +269,7 @@ def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(tmp_path
         assert torch.equal(resumed["state_dict"][key], value), key
 
 
+@pytest.mark.posix
 def test_a_second_interrupt_takes_effect_at_once(tmp_path, monkeypatch):
     """Sent within a step, of which the first waits for the end."""
     reached = []
@@ -333,6 +335,7 @@ def test_a_system_without_that_signal_trains(tmp_path, monkeypatch):
     assert train(toys.TRAIN, tmp_path)
 
 
+@pytest.mark.posix
 def test_an_interrupt_while_the_data_are_prepared_leaves_nothing(tmp_path, monkeypatch):
     def interrupted(self, split):
         raise KeyboardInterrupt

@@ -151,6 +151,7 @@ def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
     assert errors.count("\n") == 1
 
 
+@pytest.mark.posix
 def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
     child = typed_for_two("train", *MODELS["pose"], "trainer.max_epochs=5000", "save_every=2", f"output={tmp_path}")
     until_saved(child, tmp_path)
@@ -164,6 +165,7 @@ def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
     assert not any(alive(pid) for pid in others)
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("dies", ["the second", "the first"])
 def test_a_killed_process_ends_both_in_a_line_and_the_training_goes_on(typed_for_two, tmp_path, dies):
     """E6: not in a hang, and in less than a minute."""

@@ -96,7 +96,7 @@ class Page:
 
     def write(self, path: Path, text: str) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
 
     def run(self, command: Command) -> None:
         """Run a command, made small, and look at what it leaves behind."""

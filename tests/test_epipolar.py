@@ -18,6 +18,7 @@ from ghpt.geometry.epipolar import (
     pose_in_front,
     poses_in_front,
     ray_distances,
+    robust_weights,
     sampson_error,
 )
 from ghpt.geometry.rotations import vector_to_matrix
@@ -184,6 +185,27 @@ def test_ray_distances_are_those_of_the_nearest_points():
         alpha, beta = depths(Rs[h], ts[h], a, b)
         one = alpha[:, None] * (homogeneous(a) @ Rs[h].T) + ts[h]
         torch.testing.assert_close(found[h], (one - beta[:, None] * homogeneous(b)).norm(dim=-1), rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("frames", [8, 40])  # 136 correspondences, and 680, of which every third makes the median
+def test_robust_weights_are_those_of_sampson_distances_under_geman_and_mcclure(frames):
+    a, b = images(*two_views(4, frames), sigma=3)
+    E = essential(*(x[None] for x in relative(two_views(4)[0])))
+    used = torch.rand(len(a), generator=torch.Generator().manual_seed(0)) < 0.8
+    r = sampson_error(E, a, b)[0]
+    step = -(-len(a) // 256)
+    scale = 3 * r[::step][used[::step]].median()
+    residual = ((homogeneous(b) @ E[0]) * homogeneous(a)).sum(-1)
+    expected = torch.where(used, (r / residual) ** 2 / (1 + (r / scale) ** 2) ** 2, 0.0)
+    found = robust_weights(E, a, b, used)
+    torch.testing.assert_close(found[0], expected / expected.max(), rtol=1e-7, atol=0)
+    torch.testing.assert_close(robust_weights(2 * E.expand(3, 3, 3), a, b, used), found.expand(3, -1))
+
+
+def test_robust_weights_of_nothing_are_0():
+    a, b = images(*two_views(4))
+    E = essential(*relative(two_views(4)[0]))[None]
+    assert (robust_weights(E, a, b, ones(a) == 0) == 0).all()
 
 
 def test_the_order_of_the_correspondences_and_their_repetition_are_nothing():
@@ -360,8 +382,10 @@ def test_a_bad_pair_is_masked_and_its_neighbours_keep_every_bit(case):
 
 def test_geometry_never_raises_on_values():
     nan = torch.full((3, 3), torch.nan, dtype=torch.float64)
+    one = EYE.clone()
+    one[0, 1] = torch.nan
     a, b = batch([0])
-    for E in (nan, torch.zeros_like(nan), torch.full_like(nan, torch.inf)):
+    for E in (nan, one, torch.zeros_like(nan), torch.full_like(nan, torch.inf)):
         Rs, ts = decompose(E)
         assert torch.isfinite(Rs).all()
         assert torch.isfinite(ts).all()

@@ -29,7 +29,7 @@ def test_invariant_to_translation_and_equivariant_lengths():
     x = poses()
     shift = torch.tensor([1e4, -5e3, 77.0]).double()
     torch.testing.assert_close(normalised_coordinates(x + shift, ALL), normalised_coordinates(x, ALL))
-    turn = torch.from_numpy(Rotation.random(rng=3).as_matrix())
+    turn = torch.from_numpy(Rotation.random(None, 3).as_matrix())
     torch.testing.assert_close(body_part_lengths(x @ turn.T + shift, ALL), body_part_lengths(x, ALL))
 
 

@@ -72,6 +72,7 @@ def commands(folder, **content):
 WELL_AND_NOT = ["  0_how-well: done", "  1_how-user: error: how: is user. Say well."]
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("launcher", ["basic", "submitit_local", "submitit_slurm"])
 def test_a_sweep_says_the_same_wherever_its_jobs_run(toy, tmp_path, launcher):
     child = toy("-m", "how=well,user", f"hydra/launcher={launcher}", path=commands(tmp_path, **SLURM))
@@ -88,6 +89,7 @@ def test_a_sweep_says_the_same_wherever_its_jobs_run(toy, tmp_path, launcher):
     assert "error: how: is user" in (tmp_path / "out" / "1_how-user" / "train.log").read_text()
 
 
+@pytest.mark.posix
 def test_a_job_that_dies_is_named_and_the_others_finish(toy, tmp_path):
     child = toy("-m", "how=killed,fault,exits,well", LOCAL)
     said, errors = child.communicate(timeout=300)
@@ -100,6 +102,7 @@ def test_a_job_that_dies_is_named_and_the_others_finish(toy, tmp_path):
     assert "Traceback" in (tmp_path / "out" / "1_how-fault" / "train.log").read_text()
 
 
+@pytest.mark.posix
 def test_an_interrupt_stops_every_job(toy, tmp_path):
     child = toy("-m", "how=well,waits", LOCAL)
     end = time.monotonic() + 300
@@ -113,6 +116,7 @@ def test_an_interrupt_stops_every_job(toy, tmp_path):
     assert "Traceback" not in errors
 
 
+@pytest.mark.posix
 def test_what_sbatch_refuses_is_said_in_one_line(toy, tmp_path):
     refusing = SLURM | {"sbatch": "echo 'sbatch: error: invalid partition specified: gpuu' >&2; exit 1"}
     words = ("-m", "how=well,user", "hydra/launcher=submitit_slurm", "hydra.launcher.partition=gpuu")
@@ -159,6 +163,7 @@ def test_the_commands_of_the_page_about_clusters_are_understood():
     assert launchers == {"basic", "submitit_local", "submitit_slurm"}
 
 
+@pytest.mark.posix
 def test_trainings_of_a_local_pool_are_those_of_one_process(typed, tmp_path, monkeypatch):
     conf = tmp_path / "conf"
     shutil.copytree(ROOT / "conf", conf)

@@ -77,8 +77,23 @@ def test_uneven_shares_average_to_the_whole():
         assert (sum(parts) / 2).item() == pytest.approx(whole.item(), rel=1e-12)
 
 
+def test_what_is_not_counted_is_not_there_whatever_it_is():
+    values = torch.tensor([1.0, torch.nan, 3.0, torch.inf], dtype=torch.float64, requires_grad=True)
+    counted = torch.tensor([True, False, True, False])
+    mean = mean_over_all(values, counted, counted.sum(), 1)
+    assert mean == 2
+    mean.backward()
+    assert values.grad.tolist() == [0.5, 0, 0.5, 0]
+
+
+@pytest.mark.parametrize(("counted", "expected"), [([False, False], 0.0), ([True, False], 7.0)])
+def test_the_mean_of_none_is_0_and_of_one_is_it(counted, expected):
+    counted = torch.tensor(counted)
+    assert mean_over_all(torch.tensor([7.0, 9.0]), counted, counted.sum(), 1) == expected
+
+
 @pytest.mark.parametrize("name", ["alpha", "beta", "gamma"])
 def test_negative_weights_are_refused(name):
     settings = {"alpha": 1.0, "beta": 1.0, "gamma": 1.0} | {name: -0.1}
-    with pytest.raises(GhptConfigError, match=rf"model\.loss\.{name}"):
+    with pytest.raises(GhptConfigError, match=rf"^model\.loss\.{name}: "):
         StochasticLoss(**settings, relative_errors=True)

@@ -24,7 +24,11 @@ ENVIRONMENT = {
 
 def private_memory() -> float:
     """MiB that the process itself holds, without mapped files."""
-    return next(int(line.split()[1]) / 1024 for line in STATUS.read_text().splitlines() if line.startswith("RssAnon"))
+    return next(
+        int(line.split()[1]) / 1024
+        for line in STATUS.read_text(encoding="utf-8").splitlines()
+        if line.startswith("RssAnon")
+    )
 
 
 def child(folder: str, frames: int) -> None:

@@ -103,6 +103,15 @@ def test_frames_that_fix_no_frame_do_not_count():
     assert (errors == 0).all()
 
 
+def test_three_joints_are_enough_to_align():
+    estimate, truth, truth_seen, _ = frames(1, missing=0.0)
+    three = torch.zeros_like(truth_seen)
+    three[:, [2, 9, 16]] = True
+    errors, counted = joint_errors(PoseEstimate(estimate.points, three), truth, truth_seen, "aligned")
+    assert torch.equal(counted, three)
+    assert errors[three].max() > 1  # the noise has changed the triangle's shape
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_uneven_processes_give_the_number_of_one(kind):
     estimate, truth, truth_seen, group = frames(97)

@@ -334,6 +334,7 @@ run(Path({conf!r}), ghpt.predict.COMMAND)
 """
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize(("limit", "file"), [(9_000, "000000.npz"), (25_000, "poses.npz")])
 def test_a_full_disk_is_named_and_the_next_run_goes_on(tmp_path, limit, file):
     given = [*QUICK, *words(tmp_path, points_file(tmp_path)), "shard_frames=20", "formats=[npz]", "overwrite=true"]

@@ -16,7 +16,7 @@ from ghpt.metrics.relative_pose import (
 
 
 def rotations(count: int, seed: int):
-    turns = Rotation.random(count, random_state=np.random.default_rng(seed))
+    turns = Rotation.random(count, np.random.default_rng(seed))
     return turns, torch.from_numpy(turns.as_matrix())
 
 

@@ -113,7 +113,7 @@ def test_unseen_joints_are_not_measured():
 
 def test_segments_of_a_rigid_body_do_not_vary():
     body = torch.from_numpy(np.random.default_rng(0).normal(0, 400, (17, 3)))
-    turns = torch.from_numpy(Rotation.random(20, rng=1).as_matrix())
+    turns = torch.from_numpy(Rotation.random(20, 1).as_matrix())
     points, estimated = body @ turns.mT, torch.ones(20, 17, dtype=torch.bool)
     variation, known = segment_variation(points, estimated)
     assert known.all()

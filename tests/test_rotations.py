@@ -6,6 +6,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from ghpt.geometry.rotations import (
+    average_rotation,
     is_rotation,
     matrix_to_quaternion,
     matrix_to_vector,
@@ -21,7 +22,7 @@ SHAPES = [(), (1,), (3, 1, 2, 1)]
 
 def random_rotations(shape, seed=0):
     count = int(np.prod(shape))
-    return torch.from_numpy(Rotation.random(count, rng=np.random.default_rng(seed)).as_matrix()).reshape(*shape, 3, 3)
+    return torch.from_numpy(Rotation.random(count, np.random.default_rng(seed)).as_matrix()).reshape(*shape, 3, 3)
 
 
 def special_rotations():
@@ -39,7 +40,7 @@ def test_quaternions_and_vectors_are_scipy_s(shape):
     reference = Rotation.from_matrix(R.reshape(-1, 3, 3).numpy())
     q = matrix_to_quaternion(R)
     assert (q[..., 0] >= 0).all()
-    expected = torch.from_numpy(reference.as_quat(canonical=True, scalar_first=True)).reshape(*shape, 4)
+    expected = torch.from_numpy(np.roll(reference.as_quat(canonical=True), 1, axis=-1)).reshape(*shape, 4)
     torch.testing.assert_close(q, expected, rtol=0, atol=1e-12)
     v = torch.from_numpy(reference.as_rotvec()).reshape(*shape, 3)
     torch.testing.assert_close(matrix_to_vector(R), v, rtol=0, atol=1e-12)
@@ -117,12 +118,38 @@ def test_rotation_between_takes_one_direction_to_the_other(a, b, sign, mix):
     assert abs(matrix_to_vector(R).norm() - angle) < 1e-7
 
 
+def test_rotations_between_a_batch_of_directions_are_those_between_each_pair():
+    rng = torch.Generator().manual_seed(0)
+    a, b = (torch.randn(4, 3, 3, generator=rng, dtype=torch.float64) for _ in range(2))
+    b[0, 0], b[1, 1], a[2, 2] = -a[0, 0], a[1, 1], 0.0
+    together = rotation_between(a, b)
+    for i, j in np.ndindex(4, 3):
+        torch.testing.assert_close(together[i, j], rotation_between(a[i, j], b[i, j]), rtol=0, atol=1e-15)
+
+
 def test_rotation_between_is_the_identity_where_a_direction_is_none():
     good = torch.tensor([1.0, 2.0, 3.0])
     bad = torch.tensor([[0.0, 0, 0], [torch.nan, 0, 1], [torch.inf, 0, 0]])
     identity = torch.eye(3).expand(3, 3, 3)
     assert torch.equal(rotation_between(bad, good.expand(3, 3)), identity)
     assert torch.equal(rotation_between(good.expand(3, 3), bad), identity)
+
+
+@pytest.mark.parametrize("degrees", [0, 90, 179.9])  # the quaternions of half turns have either sign
+def test_an_average_rotation_is_that_of_the_aligned_quaternions(degrees):
+    rng = np.random.default_rng(0)
+    base = Rotation.from_rotvec([0, np.deg2rad(degrees), 0])
+    turned = Rotation.from_rotvec(rng.normal(0, 0.3, (20, 3))) * base
+    R = torch.from_numpy(turned.as_matrix())
+    weights = torch.from_numpy(rng.uniform(0.1, 1, 20))
+    q = turned.as_quat()
+    q = q * np.sign(q @ base.as_quat())[:, None]
+    expected = Rotation.from_quat(weights.numpy() @ q).as_matrix()
+    found = average_rotation(R[None], weights[None])[0]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    both = average_rotation(R.expand(2, -1, -1, -1), torch.stack((weights, weights.flip(0))))
+    torch.testing.assert_close(both[0], found)
+    assert (both[1] - found).abs().max() > 1e-3
 
 
 def random_poses(frames=6, joints=17, seed=0):
@@ -138,6 +165,14 @@ def test_procrustes_undoes_any_similarity_and_no_reflection():
     torch.testing.assert_close(procrustes(points, target, mask), target, rtol=0, atol=1e-8)
     mirrored = points * torch.tensor([-1.0, 1, 1], dtype=torch.float64)
     assert (procrustes(mirrored, target, mask) - target).abs().amax((-2, -1)).min() > 10
+
+
+def test_three_joints_fix_a_similarity():
+    target = random_poses(frames=3)[0]
+    mask = torch.zeros(3, 17, dtype=torch.bool)
+    mask[:, [1, 8, 13]] = True
+    points = 0.5 * target @ random_rotations((3,)).mT + 100
+    torch.testing.assert_close(procrustes(points, target, mask), target, rtol=0, atol=1e-8)
 
 
 def test_procrustes_is_the_best_similarity():

@@ -117,7 +117,7 @@ def test_an_unlisted_shard_does_not_count(tmp_path, whole):
 )
 def test_lines_that_are_no_entries_are_passed_over(tmp_path, whole, line):
     filled(tmp_path, whole).close()
-    with open(tmp_path / MANIFEST, "a") as handle:
+    with open(tmp_path / MANIFEST, "a", encoding="utf-8") as handle:
         handle.write(line + "\n")
     assert shards(tmp_path).missing() == []
 

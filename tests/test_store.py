@@ -105,6 +105,7 @@ def _make_slowly(root: Path, started: Path) -> None:
     store.prepared(root, {"name": "x"}, make, {})
 
 
+@pytest.mark.posix
 def test_a_killed_preparation_is_swept_and_made_anew(tmp_path: Path) -> None:
     root, started = tmp_path / "cache", tmp_path / "started"
     child = multiprocessing.get_context("fork").Process(target=_make_slowly, args=(root, started))
@@ -125,6 +126,7 @@ def _prepare(root: Path, start, results) -> None:
     results.put(int(takes[0].frame.sum()))
 
 
+@pytest.mark.posix
 def test_processes_that_prepare_the_same_at_once(tmp_path: Path) -> None:
     fork = multiprocessing.get_context("fork")
     start, results = fork.Event(), fork.Queue()

@@ -58,6 +58,17 @@ def test_too_few_seen_views_give_the_empty_subset():
     assert (subsets[:, :, 2].sum(-1) >= 2).all()
 
 
+@pytest.mark.parametrize("count", [0, 1, 2, 5, 62, 63])
+def test_few_seen_of_many_views_are_drawn_from_as_of_few(count):
+    visible = torch.zeros(1, 130, 1, dtype=torch.bool)
+    visible[0, torch.randperm(130, generator=torch.Generator().manual_seed(count))[:count]] = True
+    subsets = random_subsets(visible, 300, key(4, "test", torch.tensor([0])))[0, :, 0]
+    assert not subsets[:, ~visible[0, :, 0]].any()
+    sizes = subsets.sum(-1)
+    assert (sizes >= 2).all() if count >= 2 else (sizes == 0).all()
+    assert subsets.any(0).sum() == (count if count >= 2 else 0)
+
+
 @pytest.mark.parametrize("views", [4, 31, 100])
 def test_a_frame_s_draw_depends_on_its_key_and_its_own_views_alone(views):
     visible = torch.rand((5, views, 17), generator=torch.Generator().manual_seed(0)) < 0.7

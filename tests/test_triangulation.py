@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.cameras import Cameras, project, reprojection_error
 from ghpt.geometry.normal_equations import solve_symmetric
 from ghpt.geometry.rotations import vector_to_matrix
-from ghpt.geometry.triangulation import Status, triangulate, triangulate_subsets
+from ghpt.geometry.triangulation import Status, System, triangulate, triangulate_subsets
 from scenes import random_scene
 
 
@@ -228,3 +228,123 @@ def test_a_narrow_baseline_keeps_the_digits_that_squaring_would_cost():
     assert result.ok.all()
     assert (result.points - scene.points).norm(dim=-1).median() < 1e-7
     assert (result.points - scene.points).norm(dim=-1).max() < 1e-4
+
+
+def test_the_numbers_of_the_states_are_those_of_the_files():
+    names = ("OK", "FEW_VIEWS", "PARALLEL", "BEHIND", "NONFINITE_INPUT", "NOT_CONVERGED")
+    assert {state.name: state.value for state in Status} == {name: i for i, name in enumerate(names)}
+
+
+@pytest.mark.parametrize("coordinate", [0, 1])
+@pytest.mark.parametrize("value", [torch.nan, -torch.inf, 1.1e12])
+def test_either_coordinate_of_a_key_point_may_be_broken(coordinate, value):
+    scene = random_scene(16, frames=1, views=3)
+    scene.key_points[0, 1, 5, coordinate] = value
+    status = triangulate(scene.cameras, scene.key_points, ones(scene)).status[0]
+    assert status[5] == Status.NONFINITE_INPUT
+    assert (status != Status.OK).sum() == 1
+
+
+@pytest.mark.parametrize("weight", [torch.nan, torch.inf])
+def test_a_broken_weight_is_said(weight):
+    scene = random_scene(17, frames=1, views=3)
+    weights = ones(scene)
+    weights[0, 2, 4] = weight
+    status = triangulate(scene.cameras, scene.key_points, weights).status[0]
+    assert status[4] == Status.NONFINITE_INPUT
+    assert (status != Status.OK).sum() == 1
+
+
+def test_two_cameras_at_one_place_fix_no_point_though_a_third_is_elsewhere():
+    scene = random_scene(18, frames=2, views=3)
+    turn = vector_to_matrix(torch.tensor([0.02, -0.03, 0.1], dtype=torch.float64))
+    R, t = scene.cameras.R.clone(), scene.cameras.t.clone()
+    R[:, 1], t[:, 1] = turn @ R[:, 0], t[:, 0] @ turn.mT
+    cameras = Cameras(scene.cameras.K, R, t)
+    key_points = project(cameras, scene.points)[0]
+    weights = ones(scene)
+    weights[:, 2, :9] = 0
+    status = triangulate(cameras, key_points, weights).status
+    assert (status[:, :9] == Status.PARALLEL).all()
+    assert (status[:, 9:] == Status.OK).all()
+
+
+def test_a_point_behind_one_camera_is_said_with_its_depth():
+    scene = random_scene(19, frames=1, views=3)
+    points = scene.points.clone()
+    points[:, 3] = 2 * scene.cameras.centre[:, 0]  # the rig looks at the origin
+    key_points, depth = project(scene.cameras, points)
+    result = triangulate(scene.cameras, key_points, ones(scene))
+    assert result.status[0, 3] == Status.BEHIND
+    assert (result.status != Status.OK).sum() == 1
+    torch.testing.assert_close(result.depth_min, depth.amin(1))
+    assert (result.points[0, 3] == 0).all()
+
+
+def test_the_angle_of_many_views_is_the_root_mean_square_of_the_sines():
+    scene = random_scene(20, frames=2, views=4)
+    weights = ones(scene)
+    weights[:, 3, ::2] = 0
+    ray = scene.points[:, None] - scene.cameras.centre[:, :, None]
+    ray = ray / ray.norm(dim=-1, keepdim=True)
+    pairs = list(combinations(range(4), 2))
+    sines = torch.stack([torch.linalg.cross(ray[:, i], ray[:, j]).norm(dim=-1) for i, j in pairs])
+    used = torch.stack([(weights[:, i] > 0) & (weights[:, j] > 0) for i, j in pairs])
+    expected = ((sines**2 * used).sum(0) / used.sum(0)).sqrt().asin()
+    result = triangulate(scene.cameras, scene.key_points, weights)
+    torch.testing.assert_close(result.angle, expected, rtol=0, atol=1e-8)
+
+
+def test_rows_are_put_in_their_places():
+    scene = random_scene(21, frames=4, views=3)
+    whole = triangulate(scene.cameras, scene.key_points, ones(scene))
+    few = ones(scene)[:2].clone()
+    few[:, 1:] = 0
+    part = triangulate(scene.cameras.index(slice(2)), scene.key_points[:2], few)
+    mixed = whole.with_rows(torch.tensor([3, 1]), part)
+    assert (mixed.status[[1, 3]] == Status.FEW_VIEWS).all()
+    for name in ("points", "status", "angle", "depth_min", "cond"):
+        assert torch.equal(getattr(mixed, name)[[0, 2]], getattr(whole, name)[[0, 2]])
+        assert torch.equal(getattr(mixed, name)[[3, 1]], getattr(part, name))
+
+
+def test_squared_residuals_are_those_of_the_projection():
+    scene = random_scene(22, frames=2, views=3).noisy(4, 0)
+    system = System(scene.cameras, scene.key_points, torch.ones(3, 17, 2, dtype=torch.bool))
+    points = scene.points.clone()
+    points[:, 2] = 2 * scene.cameras.centre[:, 1]  # behind the second camera
+    expected = reprojection_error(scene.cameras, scene.key_points, points).square()
+    local = (points - system.origin[:, None]).permute(2, 1, 0)
+    square = torch.full((3, 17, 2), 4.0, dtype=torch.float64)
+    square[:, 5] = 0
+    for view in range(3):
+        found = system.square_residuals(local, square, view).mT
+        torch.testing.assert_close(found[:, 6:], expected[:, view, 6:] / 4, rtol=1e-6, atol=1e-9)
+        assert torch.isinf(found[:, 5]).all()
+    assert torch.isinf(system.square_residuals(local, square, 1)[2]).all()
+
+
+def test_frames_beyond_what_is_worked_on_at_once_are_the_same():
+    scene = random_scene(23, frames=3, views=4).noisy(5, 0)
+    many = [x.repeat(200, *[1] * (x.ndim - 1)) for x in (scene.key_points, ones(scene))]
+    cameras = Cameras(*(x.repeat(200, *[1] * (x.ndim - 1)) for x in vars(scene.cameras).values()))
+    together = triangulate(cameras, *many)
+    few = triangulate(scene.cameras, scene.key_points, ones(scene))
+    torch.testing.assert_close(together.points, few.points.repeat(200, 1, 1), rtol=0, atol=1e-9)
+    shared = scene.cameras.index(0)
+    rig = Cameras(*(x.expand(600, *x.shape) for x in vars(shared).values()))
+    alone = triangulate(shared, many[0][299], many[1][299])
+    torch.testing.assert_close(triangulate(rig, *many).points[299], alone.points, rtol=0, atol=1e-9)
+
+
+def test_a_subset_s_point_is_in_front_of_every_camera_of_it():
+    scene = random_scene(24, frames=1, views=3)
+    points = scene.points.clone()
+    points[:, 3] = 2 * scene.cameras.centre[:, 0]  # behind the first camera
+    key_points = project(scene.cameras, points)[0]
+    seen = torch.ones(1, 3, 17, dtype=torch.bool)
+    subsets = every_subset(3)
+    found, ok = triangulate_subsets(scene.cameras, key_points, seen, subsets)
+    assert torch.equal(ok[..., 3], ~subsets[:, :, 3, 0])
+    assert ok[..., :3].all()
+    assert (found[..., 3, :][~ok[..., 3]] == 0).all()

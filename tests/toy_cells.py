@@ -12,7 +12,7 @@ from ghpt.reproduction.cells import Cell, read_json
 
 def add(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
     """The config's number and those of the needs; leaves a line in ``config["diary"]``."""
-    with open(config["diary"], "a") as diary:
+    with open(config["diary"], "a", encoding="utf-8") as diary:
         diary.write(f"{config['number']} {os.getpid()}\n")
     time.sleep(config.get("sleep", 0))
     if config["number"] < 0:

@@ -341,7 +341,7 @@ def batch(row: str, form: Format, numbers: range, folder: Path, target: Path) ->
     """Reads one file after the other; what each gave, and by how much the memory grew."""
     whole, reference, outcomes, notes = target.read_bytes(), form.read(folder), Counter(), []
     signal.signal(signal.SIGPROF, late)
-    held = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    held = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for number, data in zip(numbers, spoilt(row, whole, form, numbers), strict=True):

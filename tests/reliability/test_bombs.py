@@ -85,7 +85,7 @@ def npz_overlapping(path: Path) -> None:
 def yaml_laughs(path: Path) -> None:
     lines = ["%YAML:1.0", "---", "a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 10)]
-    path.write_text("\n".join([*lines, "names: *a9", "K_x: {rows: 3, cols: 3, data: *a9}"]) + "\n")
+    path.write_text("\n".join([*lines, "names: *a9", "K_x: {rows: 3, cols: 3, data: *a9}"]) + "\n", encoding="utf-8")
 
 
 def sparse(path: Path, start: bytes, size: int, end: bytes = b"") -> None:

@@ -55,6 +55,7 @@ def test_a6_npz_gives_the_names_back(tmp_path):
     assert read_reconstruction(tmp_path / "poses.npz")[0] == who
 
 
+@pytest.mark.posix
 @pytest.mark.parametrize("format", ["npz", "csv", "trc", "c3d", "html"])
 def test_a6_a_link_in_the_output_s_place_is_replaced_not_followed(tmp_path, format):
     precious, path = tmp_path / "precious", tmp_path / WRITERS[format].file

@@ -29,11 +29,11 @@ def forked(output: Path, frames: int, settings: dict, seconds: float | None = No
     child = os.fork()
     if child == 0:
         try:
-            with open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+            with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
                 predict(output, frames, settings)
             os._exit(0)
         except BaseException:
-            with open(output.parent / "trace", "a") as handle:
+            with open(output.parent / "trace", "a", encoding="utf-8") as handle:
                 traceback.print_exc(file=handle)
             os._exit(1)
     if seconds is not None:
