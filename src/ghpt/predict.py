@@ -117,7 +117,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
             for name in formats:
                 WRITERS[name].write(output / WRITERS[name].file, about, chunks, **settings.get(name, {}))
             found = counts(chunks(), about.joints, about.camera_names)
-    estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor)}
+    estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor.rejecting_nothing())}
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
     numbers = {
         "data": frames.title, "source": frames.source, "cameras": list(frames.camera_names),
