@@ -14,7 +14,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ghpt.calibration.diagnosis import Diagnosis
-from ghpt.calibration.millimetres import check_scale, in_millimetres, of_scale
+from ghpt.calibration.millimetres import in_millimetres, of_scale, read_scale
 from ghpt.calibration.rig import RigEstimate
 from ghpt.config import build, check_type, suggest
 from ghpt.data.camera_files import CameraFile
@@ -26,7 +26,7 @@ from ghpt.files import sweep_temporaries
 from ghpt.geometry.cameras import Cameras
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
-from ghpt.report.calibration import differences, explains, print_calibration
+from ghpt.report.calibration import differences, explains, print_calibration, spread
 from ghpt.report.rig_comparison import Similarity, align, triangulate_recording, upright
 from ghpt.report.rig_files import RIG_FILES, camera_numbers, write_numbers, write_poses, write_rig, write_rig_figure
 from ghpt.report.tables import words
@@ -82,7 +82,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     estimator = build(config["baselines"][config["triangulation"]], f"baselines.{config['triangulation']}")
     case = from_files(config) if config["keypoints"] else from_data(config)
     cameras, views = case.views.cameras, case.views
-    check_scale(config["scale"], cameras.names)
+    lengths = read_scale(config["scale"], cameras.names)
     sweep_temporaries(output)
     for name in RIG_FILES:  # of an earlier run: they must not pass for this one's
         (output / name).unlink(missing_ok=True)
@@ -91,8 +91,14 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
         cameras.names, cameras.K, torch.from_numpy(views.key_points).double(),
         torch.from_numpy(views.confidence).double(), torch.from_numpy(views.seen), cameras.size, config["seed"],
     )  # fmt: skip
-    estimate, scale = in_millimetres(estimate, config["scale"])
     placed = torch.nonzero(estimate.calibrated)[:, 0].tolist() if int(estimate.calibrated.sum()) >= 2 else []
+
+    def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
+        used = torch.nonzero(usable_cameras(estimate))[:, 0].tolist() or placed
+        recording = spread(_through(case, used, rig), config["evaluated_frames"])
+        return triangulate_recording(recording, estimator)
+
+    estimate, scale = in_millimetres(estimate, lengths, measure)
     chosen = torch.nonzero(usable_cameras(estimate))[:, 0].tolist()
     world, gauge = _gauge(estimate, placed, cameras.cameras, case.reference)
     moved = gauge.cameras(estimate.cameras)
