@@ -9,10 +9,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghpt.checkup.agreement import LARGEST, Agreement, agreement, all_pairs, errors, median, pair_errors, triangulated
-from ghpt.checkup.candidates import UNITS, Candidate, exchanged, of_file, of_view, shifted
+from ghpt.checkup.candidates import RATES, UNITS, Candidate, at_rate, exchanged, of_file, of_view, shifted
 from ghpt.checkup.evidence import Evidence
 from ghpt.checkup.resection import resect
 from ghpt.checkup.setup import Look, Setup
+from ghpt.checkup.units import unit_of
 from ghpt.errors import check
 from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.baselines import Baseline, MEstimator
@@ -66,7 +67,8 @@ class Doctor:
     ``level``: largest error of a view that agrees. ``discrete``, ``shifted``, ``lens``, ``lenses``, ``fitted``: what
     the undoing of a mistake must leave at most of the error of the views it is about: of one of few possibilities, a
     shift in time, one camera's lens, all lenses, and a camera's place. ``least``: and by how much it must lessen it.
-    ``astray``: a view that stays worse than this is said to be off. ``pairs``: most pairs of views tried. ``rounds``:
+    ``astray``: a view that stays worse than this is said to be off. ``rated``: other frame
+    rates are tried for a view that is worse. ``pairs``: most pairs of views tried. ``rounds``:
     most mistakes in one recording. ``consensus``: what the person is measured with.
     """
 
@@ -80,6 +82,7 @@ class Doctor:
     fitted: float
     least: float
     astray: float
+    rated: float
     pairs: int
     rounds: int
     estimator: MEstimator
@@ -188,6 +191,7 @@ class Doctor:
             look.prepare(setup, view)
             tried = list(of_view(setup, view))
             tried += [shifted(setup, view, by) for by in self._shifts(look, setup, view)]
+            tried += self._rates(look, setup, now, view)
             tried += self._moved(look, setup, now, view)
             each = []
             for candidate in tried:
@@ -203,6 +207,12 @@ class Doctor:
     def _shifts(self, look: Look, setup: Setup, view: int) -> list[int]:
         reach = look.evidence.reach
         return [by for by in range(-reach - setup.shift[view], reach - setup.shift[view] + 1) if by]
+
+    def _rates(self, look: Look, setup: Setup, now: Agreement, view: int) -> list[Candidate]:
+        """Of a view that does not agree."""
+        if look.evidence.at_rate is None or now.error[view] < self.rated or setup.rate[view] != 1:
+            return []
+        return [at_rate(setup, view, ratio) for ratio in RATES]
 
     def _moved(self, look: Look, setup: Setup, now: Agreement, view: int) -> list[Candidate]:
         found = resect(look.view(setup, view), now.points[view], now.known[view], LARGEST, 0)
@@ -261,6 +271,10 @@ class Doctor:
 
     def _unit(self, setup: Setup, height: float) -> tuple[Setup, list[Finding], float]:
         low, high = STATURES
+        if height and setup.unit_mm is not None:
+            unit = unit_of(height / setup.unit_mm) or setup.unit_mm
+            factor = unit / setup.unit_mm
+            setup, height = replace(setup, t=factor * setup.t, unit_mm=None), factor * height
         if not height or low <= height <= high:
             return setup, [], height
         for factor, words in UNITS.items():

@@ -24,6 +24,8 @@ from ghpt.skeleton import JOINTS
 _log = logging.getLogger(__name__)
 _MEND = "Rename them, say which is which (match={view: camera}), or name the views to use (views=[...])."
 _MOST_OUTSIDE = 0.25
+_NORMALISED, _NEARLY_ALL = 1.5, 0.99
+"""Nearly all coordinates of a view within this are no pixels: of the image's size, with a joint or two beyond it."""
 _WORDS = r"[ _.-](json|openpose|pose|keypoints|kpts|body|2d)\b"
 
 
@@ -77,6 +79,7 @@ def look_through(
     if isinstance(points, People):
         points = points.pick(who(points, ordered, at, person))
     pixels, seen = np.zeros(points.key_points[:, at].shape, np.float32), points.seen[:, at].copy()
+    check_pixels(points.path, points.key_points[:, at], seen, ordered)
     _check_sizes(points.path, points.key_points[:, at], seen, ordered)
     for view in range(len(at)):
         K, lens = ordered.K[view].numpy(), ordered.distortion[view].numpy()
@@ -196,17 +199,59 @@ def _unmatched(where: str, views: Sequence[str], cameras: CameraFile, problem: s
     return GhptDataError(where, "views", f"{problem} ({sides})", _MEND)
 
 
+def image_size(cameras: CameraFile) -> Float[np.ndarray, "V 2"]:
+    """Width and height of the images; where the file does not say, twice the principal point."""
+    if cameras.size is not None:
+        return cameras.size.numpy().astype(np.float64)
+    return (2 * cameras.K[:, :2, 2] + 1).numpy()
+
+
+def check_pixels(
+    where: str, pixels: Float[np.ndarray, "T V K 2"], seen: Bool[np.ndarray, "T V K"], cameras: CameraFile
+) -> None:
+    """Raise GhptDataError for key points in [0, 1] or [-1, 1], as shares of the image, where pixels are wanted."""
+    size = image_size(cameras)
+    for view, name in enumerate(cameras.names):
+        own = pixels[:, view][seen[:, view]]
+        own = own[np.isfinite(own).all(-1)]
+        # a detector that gives (0, 0) for what it does not see says nothing of the unit
+        if not len(own) or not own.any() or size[view].min() < 20 * _NORMALISED:
+            continue
+        if np.quantile(np.abs(own), _NEARLY_ALL) > _NORMALISED:
+            continue
+        width, height = size[view]
+        signed = (own < 0).any(-1).mean() > 1 - _NEARLY_ALL
+        bounds = "-1 and 1" if signed else "0 and 1"
+        problem = f"key points lie between {bounds} in an image of {width:.0f} x {height:.0f}: they are normalised"
+        scaled = f"multiply x by {width:.0f} and y by {height:.0f}"
+        if signed:
+            scaled = f"add 1, then multiply x by {width / 2:g} and y by {height / 2:g}"
+        mend = f"Give pixels: {scaled}; or detect again (OpenPose: --keypoint_scale 0)."
+        raise GhptDataError(where, f"view {name}", problem, mend)
+
+
 def _check_sizes(where: str, pixels: np.ndarray, seen: np.ndarray, cameras: CameraFile) -> None:
     """Detectors place some joints beyond the image's edge; many there are those of an image of another size."""
     if cameras.size is None:
         return
     size = cameras.size.numpy()
-    outside = seen & ((pixels < -0.5) | (pixels > size[:, None] - 0.5)).any(-1)
-    share = outside.sum((0, 2)) / seen.sum((0, 2)).clip(1)
+    share = _outside(pixels, seen, size)
+    turned = _outside(pixels, seen, size[:, ::-1])
     for view in np.flatnonzero(share > _MOST_OUTSIDE):
         width, height = size[view]
         reach = pixels[:, view][seen[:, view]].max(0)
         image = f"its image of {width} x {height}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
         problem = f"{share[view]:.0%} of the key points lie outside {image}"
         mend = "Give the intrinsics of the resolution that the key points were detected in."
+        if turned[view] < 1 - _NEARLY_ALL:
+            problem += f", as in an image of {height} x {width}: turned by 90 degrees, or x and y exchanged"
+            mend = "Detect in images that are turned as the calibration's, or calibrate the turned ones."
         raise GhptDataError(where, f"view {cameras.names[view]}", problem, mend)
+
+
+def _outside(
+    pixels: Float[np.ndarray, "T V K 2"], seen: Bool[np.ndarray, "T V K"], size: Float[np.ndarray, "V 2"]
+) -> Float[np.ndarray, " V"]:
+    """The share of each view's key points beyond images of this size."""
+    outside = seen & ((pixels < -0.5) | (pixels > size[:, None] - 0.5)).any(-1)
+    return outside.sum((0, 2)) / seen.sum((0, 2)).clip(1)
