@@ -9,7 +9,7 @@ from ghpt.data.camera_files import CameraFile
 from ghpt.errors import GhptDataError
 from ghpt.models.baselines import Baseline
 from ghpt.models.rejection import Rejection
-from ghpt.models.scale import HUMAN, stature
+from ghpt.models.scale import HUMAN, STATURES, stature
 from ghpt.recording import KeyPointBatch
 
 UNITS_MM = {1.0: "millimetres", 10.0: "centimetres", 1000.0: "metres"}
@@ -26,6 +26,13 @@ def unit_of(height: float) -> float | None:
     statures span less than a factor of ten."""
     fits = (mm for mm in UNITS_MM if HUMAN[0] <= mm * height <= HUMAN[1])
     return next(fits, None)
+
+
+def unit_for(height: float) -> float:
+    """The unit (mm) to suggest for a person of this height in it: one that rulers have, or that of an adult."""
+    rulers = (*UNITS_MM, 100.0, 25.4, 304.8)
+    fits = (mm for mm in rulers if STATURES[0] <= mm * height <= STATURES[1])
+    return next(fits, float(f"{_ADULT / height:.4g}"))
 
 
 def decide_unit(cameras: CameraFile, batch: KeyPointBatch, estimator: Baseline, ask: bool) -> CameraFile:

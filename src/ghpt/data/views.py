@@ -74,10 +74,7 @@ def look_through(
     every camera its view. ``match`` gives the camera of a view where names do not tell. Of several people that one is
     taken who `who` says. Raises GhptDataError.
     """
-    pairs = matched(points.path, points.views, cameras, match or {}, views)
-    at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
-    if isinstance(points, People):
-        points = points.pick(who(points, ordered, at, person))
+    points, at, ordered = as_one_person(points, cameras, match, views, person)
     pixels, seen = np.zeros(points.key_points[:, at].shape, np.float32), points.seen[:, at].copy()
     check_pixels(points.path, points.key_points[:, at], seen, ordered)
     _check_sizes(points.path, points.key_points[:, at], seen, ordered)
@@ -86,6 +83,21 @@ def look_through(
         pixels[:, view], seen[:, view] = undistorted(points.key_points[:, at[view]], seen[:, view], K, lens)
     values = joints17(points.path, points.joints, pixels, points.confidence[:, at], seen)
     return Views(ordered, *values, frame=points.frame, rate_hz=points.rate_hz)
+
+
+def as_one_person(
+    points: KeyPoints | People,
+    cameras: CameraFile,
+    match: Mapping[str, str] | None,
+    views: Sequence[str] | None,
+    person: int,
+) -> tuple[KeyPoints, list[int], CameraFile]:
+    """One person's key points, which of their views have a camera, and these cameras in the order of the views."""
+    pairs = matched(points.path, points.views, cameras, match or {}, views)
+    at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
+    if isinstance(points, People):
+        points = points.pick(who(points, ordered, at, person))
+    return points, at, ordered
 
 
 def who(people: People, cameras: CameraFile, at: Sequence[int], person: int = 0) -> Int[np.ndarray, "T V"]:
@@ -234,17 +246,17 @@ def _check_sizes(where: str, pixels: np.ndarray, seen: np.ndarray, cameras: Came
     """Detectors place some joints beyond the image's edge; many there are those of an image of another size."""
     if cameras.size is None:
         return
-    size = cameras.size.numpy()
+    size = image_size(cameras)
     share = _outside(pixels, seen, size)
     turned = _outside(pixels, seen, size[:, ::-1])
     for view in np.flatnonzero(share > _MOST_OUTSIDE):
         width, height = size[view]
         reach = pixels[:, view][seen[:, view]].max(0)
-        image = f"its image of {width} x {height}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
+        image = f"its image of {width:.0f} x {height:.0f}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
         problem = f"{share[view]:.0%} of the key points lie outside {image}"
         mend = "Give the intrinsics of the resolution that the key points were detected in."
         if turned[view] < 1 - _NEARLY_ALL:
-            problem += f", as in an image of {height} x {width}: turned by 90 degrees, or x and y exchanged"
+            problem += f", as in an image of {height:.0f} x {width:.0f}: turned by 90 degrees, or x and y exchanged"
             mend = "Detect in images that are turned as the calibration's, or calibrate the turned ones."
         raise GhptDataError(where, f"view {cameras.names[view]}", problem, mend)
 
