@@ -189,7 +189,6 @@ def test_steps_of_one_kind_are_one_finding():
         ({"fitted": 1.0}, "fitted"),
         ({"frames": 0}, "frames"),
         ({"shift": -1}, "shift"),
-        ({"statures": [2.0, 1.0]}, "stat"),
     ],
 )
 def test_bad_settings_are_named(changed, key):

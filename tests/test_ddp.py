@@ -90,7 +90,7 @@ def children_of(pid):
 
 def alive(pid):
     status = Path(f"/proc/{pid}/status")
-    return status.exists() and "State:\tZ" not in status.read_text()
+    return status.exists() and "State:\tZ" not in status.read_text(encoding="utf-8")
 
 
 def until_saved(child, folder):

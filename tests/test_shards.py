@@ -196,7 +196,7 @@ def test_a_shard_beyond_the_recording_is_none_even_if_it_is_whole(tmp_path, whol
     opened.close()
     opened.path(number).write_bytes(opened.path(0).read_bytes())
     line = lines_of(tmp_path)[1] | {"shard": number}
-    with open(tmp_path / MANIFEST, "a") as handle:
+    with open(tmp_path / MANIFEST, "a", encoding="utf-8") as handle:
         handle.write(json.dumps(line) + "\n")
     again = shards(tmp_path)
     assert sorted(again.kept) == [0, 1, 2]

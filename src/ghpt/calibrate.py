@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ghpt.app import Command
 from ghpt.calibration.diagnosis import Diagnosis
-from ghpt.calibration.millimetres import check_scale, in_millimetres, of_scale
+from ghpt.calibration.millimetres import in_millimetres, of_scale, read_scale
 from ghpt.calibration.rig import RigEstimate
 from ghpt.config import build, check_type, suggest
 from ghpt.data.camera_files import CameraFile
@@ -29,7 +29,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.outputs import Files, check_apart, input_paths
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
-from ghpt.report.calibration import differences, explains, print_calibration
+from ghpt.report.calibration import differences, explains, print_calibration, spread
 from ghpt.report.rig_comparison import Similarity, align, triangulate_recording, upright
 from ghpt.report.rig_files import RIG_FILES, camera_numbers, write_numbers, write_poses, write_rig, write_rig_figure
 from ghpt.report.tables import words
@@ -93,7 +93,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     estimator = build(config["baselines"][config["triangulation"]], f"baselines.{config['triangulation']}")
     case = from_files(config) if config["keypoints"] else from_data(config)
     cameras, views = case.views.cameras, case.views
-    check_scale(config["scale"], cameras.names)
+    lengths = read_scale(config["scale"], cameras.names)
     sweep_temporaries(output)
     for name in RIG_FILES:  # of an earlier run: they must not pass for this one's
         remove(output / name)
@@ -102,8 +102,14 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
         cameras.names, cameras.K, torch.from_numpy(views.key_points).double(),
         torch.from_numpy(views.confidence).double(), torch.from_numpy(views.seen), cameras.size, config["seed"],
     )  # fmt: skip
-    estimate, scale = in_millimetres(estimate, config["scale"])
     placed = torch.nonzero(estimate.calibrated)[:, 0].tolist() if int(estimate.calibrated.sum()) >= 2 else []
+
+    def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
+        used = torch.nonzero(usable_cameras(estimate))[:, 0].tolist() or placed
+        recording = spread(_through(case, used, rig), config["evaluated_frames"])
+        return triangulate_recording(recording, estimator)
+
+    estimate, scale = in_millimetres(estimate, lengths, measure)
     chosen = torch.nonzero(usable_cameras(estimate))[:, 0].tolist()
     world, gauge = _gauge(estimate, placed, cameras.cameras, case.reference)
     moved = gauge.cameras(estimate.cameras)

@@ -5,19 +5,22 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NotRequired
 
+import numpy as np
 import torch
+from jaxtyping import Int
 
 from ghpt.app import Command
 from ghpt.calibrate import from_data
 from ghpt.config import build, check_type, suggest
 from ghpt.data.chosen import InputSettings, own_cameras
 from ghpt.data.key_points import read_people
-from ghpt.data.views import look_through
-from ghpt.errors import GhptCheckpointError, check
+from ghpt.data.skeletons import joints17
+from ghpt.data.views import as_one_person, look_through
+from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Scene
 from ghpt.export.scene import origin_note
 from ghpt.files import atomic_write, sweep_temporaries, write_json
@@ -26,12 +29,15 @@ from ghpt.models.pose import PoseTriangulation
 from ghpt.models.predictors import Classical, Learned
 from ghpt.models.swaps import Swaps
 from ghpt.outputs import Files, check_apart, input_paths
-from ghpt.prediction.frames import Frames, calibrated, evidence, frames_of_views
+from ghpt.prediction.camera_check import check_cameras
+from ghpt.prediction.commands import commands_on
+from ghpt.prediction.frames import Detected, Frames, Seen, calibrated, evidence, frames_of_views, in_unit
 from ghpt.prediction.gaps import Gaps, after, gap_frames
-from ghpt.prediction.report import prediction_report, print_prediction
+from ghpt.prediction.report import prediction_report, print_prediction, print_verdict
 from ghpt.prediction.run import predicted
 from ghpt.prediction.statistics import Estimate, counts, estimate_of, evaluate
 from ghpt.prediction.stored import frames_of_stored, open_stored
+from ghpt.prediction.verdict import Level
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About
 from ghpt.report.tables import NAMES
@@ -70,6 +76,9 @@ class Settings(InputSettings):
     estimator: dict[str, Any]
     view_weights: dict[str, Any]
     fitted_frames: int
+    doctor: dict[str, Any]
+    verdict: dict[str, Any]
+    strict: bool
     seed: int
 
 
@@ -110,7 +119,8 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     _check(config)
     chosen = choose(config)
     compared = {name: build(config["baselines"][name], f"baselines.{name}") for name in config["compare"]}
-    frames = from_files(config) if config["keypoints"] else _from_data(config)
+    doctor, judge = build(config["doctor"], "doctor"), build(config["verdict"], "verdict")
+    frames = in_unit(from_files(config), doctor.consensus) if config["keypoints"] else _from_data(config)
     hertz = None if config["smooth"] is None else float(config["smooth"])
     gaps = Gaps(gap_frames(config["fill"], frames.rate_hz), config["interpolation"], hertz, frames.rate_hz)
     origin = provenance(config["seed"])
@@ -136,21 +146,32 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
             for name in formats:
                 WRITERS[name].write(output / WRITERS[name].file, about, chunks, **settings.get(name, {}))
             found = counts(chunks(), about.joints, about.camera_names)
-    estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor)}
+    estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor.rejecting_nothing())}
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
+    evaluation = evaluate(frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"])
+    own = evaluation["estimators"][chosen.name]
+    unit = frames.detected.cameras.unit_mm if frames.detected else 1.0
     numbers = {
         "data": frames.title, "source": frames.source, "cameras": list(frames.camera_names),
         "estimator": chosen.name, "estimator_text": chosen.text, "rate_hz": frames.rate_hz,
         "fill_frames": gaps.longest, "smooth_hz": gaps.cut_off_hz, **found,
-        "evaluation": evaluate(frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"]),
+        "stature_mm": own["stature_mm"], "scales": own["scales"], "unit_mm": unit, "evaluation": evaluation,
         "formats": formats, "provenance": about.provenance,
     }  # fmt: skip
+    checkup = check_cameras(frames, doctor) if judge.asks(own["scales"]["views"]) else None
+    verdict = judge(numbers, checkup, unit, commands_on(config, output))
+    numbers["verdict"] = verdict.numbers()
     write_json(output / "prediction.json", numbers)
     with atomic_write(output / "report.md", "w") as handle:
         handle.write(prediction_report(numbers))
     print_prediction(numbers)
     files = ", ".join(WRITERS[name].file for name in formats)
     _log.info("Written: %s and report.md in %s.", files, shown(output))
+    print_verdict(numbers["verdict"])
+    if config["strict"] and verdict.level != Level.GOOD:
+        worst = max(verdict.findings, key=lambda finding: finding.level)
+        problem = f"{verdict.level.words}: {worst.text}"
+        raise GhptDataError(frames.source, "verdict", problem, f"Next: {worst.command}")
     return numbers
 
 
@@ -158,7 +179,8 @@ def summary(numbers: dict[str, Any]) -> str:
     """What `predict` returned, in words."""
     if not numbers:
         return "done by the first process"
-    return f"{numbers['data']}: {numbers['frames']} frames, {100 * numbers['share']['observed']:.1f} % observed"
+    observed = f"{100 * numbers['share']['observed']:.1f} % observed"
+    return f"{numbers['data']}: {numbers['frames']} frames, {observed}, {numbers['verdict']['level']}"
 
 
 def choose(config: dict[str, Any]) -> Chosen:
@@ -198,12 +220,19 @@ def from_files(config: dict[str, Any]) -> Frames:
     if stored is not None:
         return frames_of_stored(stored, cameras, config["match"], config["views"], title)
     people = read_people(config["keypoints"], config["skeleton"], rate, config["format"])
-    views = look_through(people, cameras, config["match"], config["views"], config["person"])
+    points, at, ordered = as_one_person(people, cameras, config["match"], config["views"], config["person"])
+    views = look_through(points, cameras, config["match"], config["views"])
+
+    def detected(rows: Int[np.ndarray, " N"]) -> Seen:
+        values = (part[rows][:, at] for part in (points.key_points, points.confidence, points.seen))
+        return joints17(points.path, points.joints, *values)
+
     several = dict(zip(people.views, (people.counts() > 1).sum(0).tolist(), strict=True))
     if any(several.values()):
         words = ", ".join(f"{n} frames of {view}" for view, n in several.items() if n)
         _log.warning("Several people are in %s: person %d is followed (person=).", words, config["person"])
-    return frames_of_views(views, str(Path(config["keypoints"]).resolve()), title)
+    frames = frames_of_views(views, str(Path(config["keypoints"]).resolve()), title)
+    return replace(frames, detected=Detected(ordered, detected))
 
 
 def _from_data(config: dict[str, Any]) -> Frames:

@@ -26,7 +26,7 @@ class State(IntEnum):
     BAD_INPUT = 5
     """Missing: a key point or camera is not finite or absurd."""
     REJECTED = 6
-    """Missing: no two views agree on it."""
+    """Missing: no two views explain it, so wherever it were put would be made up."""
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ def held() -> dict[str, float]:
     """MiB of private memory, open files, threads and processes; what glibc keeps of freed memory is given back."""
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
-    lines = dict(line.split(":", 1) for line in STATUS.read_text().splitlines())
+    lines = dict(line.split(":", 1) for line in STATUS.read_text(encoding="utf-8").splitlines())
     return {
         "memory": int(lines["RssAnon"].split()[0]) / 1024,
         "files": len(os.listdir("/proc/self/fd")),
@@ -53,7 +53,7 @@ def child(folder: str, steps: int) -> None:
 
 def gone(pid: int) -> bool:
     status = Path(f"/proc/{pid}/status")
-    return not status.exists() or "State:\tZ" in status.read_text()
+    return not status.exists() or "State:\tZ" in status.read_text(encoding="utf-8")
 
 
 @pytest.mark.skipif(not STATUS.is_file(), reason="needs Linux's /proc")

@@ -58,7 +58,7 @@ def cells(path) -> np.ndarray:
 
 def test_d7_no_value_without_its_state(tmp_path, record_row):
     rng, checked, violations, filled = np.random.default_rng(0), 0, 0, 0
-    predictor = Classical(Linear(), Quality(noise=None, prior=10.0, shared=0.0), swaps=None, reject=False)
+    predictor = Classical(Linear(), Quality(noise=None, prior=10.0, shared=0.0), swaps=None, reject=None)
     for number in range(FILES):
         seen = pattern(rng)
         folder = tmp_path / str(number)

@@ -15,10 +15,7 @@ from ghpt.calibration.observations import Observations
 from ghpt.calibration.pairs import PairTable
 from ghpt.calibration.repair import find_repair
 from ghpt.calibration.resection import Resection, Rig
-from ghpt.models.scale import stature
-
-HUMAN = (1300.0, 2200.0)
-"""Statures (mm) beyond which nearly no adult is."""
+from ghpt.models.scale import HUMAN, STATURES, stature
 
 
 @dataclass(frozen=True)
@@ -82,10 +79,14 @@ class Case:
 
 
 def of_stature(points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]) -> Iterator[Diagnosis]:
-    """Whether the person in the scaled rig (mm) is of human size."""
+    """Whether the person in the scaled rig (mm) is of human size: an error for a size that is nobody's."""
     height = float(stature(points, estimated))
-    if height and not HUMAN[0] <= height <= HUMAN[1]:
-        yield Diagnosis("stature", "warning", (), (
-            f"the person measures {height / 1000:.3g} m by the rig's scale, people measure 1.3 to 2.2 m; "
-            "check the length that gave the scale and its unit (millimetres)"
-        ), height)  # fmt: skip
+    if not height or STATURES[0] <= height <= STATURES[1]:
+        return
+    severity: Literal["error", "warning"] = "warning" if HUMAN[0] <= height <= HUMAN[1] else "error"
+    low, high = (size / 1000 for size in STATURES)
+    text = (
+        f"the person measures {height / 1000:.3g} m by the rig's scale, people measure {low:g} to {high:g} m; "
+        "check the length that gave the scale and its unit (millimetres)"
+    )
+    yield Diagnosis("stature", severity, (), text, height)

@@ -11,7 +11,7 @@ from torch import Tensor
 from ghpt.checkup.setup import Look, Rays, Setup
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.baselines import MEstimator
+from ghpt.models.baselines import Baseline, MEstimator
 from ghpt.recording import KeyPointBatch
 
 LARGEST = 0.1
@@ -111,9 +111,9 @@ def _without(core: Bool[Tensor, " V"]) -> Bool[Tensor, "V V"]:
 
 
 def triangulated(
-    rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: MEstimator
+    rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: Baseline
 ) -> tuple[Float[Tensor, "G F J 3"], Bool[Tensor, "G F J"]]:
-    """Points from G choices of views by the M-estimator, in normalised image coordinates."""
+    """Points from G choices of views by an estimator, in normalised image coordinates."""
     groups, (frames, joints) = len(used), rays.seen.shape[1:]
     seen = (rays.seen.transpose(0, 1) & used[:, None, :, None]).flatten(0, 1)
     count = groups * frames

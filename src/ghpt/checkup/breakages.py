@@ -114,7 +114,8 @@ class Breakage:
 
     def spoil(self, case: Case) -> Case:
         views = len(case[1])
-        return self.how(case, range(views) if self.every else [views - 1])
+        evidence = replace(case[0], at_rate=None)  # the recording itself is not spoilt
+        return self.how((evidence, case[1]), range(views) if self.every else [views - 1])
 
 
 def _of_one_or_all() -> dict[str, Breakage]:

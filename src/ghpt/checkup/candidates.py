@@ -15,8 +15,13 @@ from ghpt.checkup.setup import Setup
 UNITS = {1e3: "metres for millimetres", 1e2: "decimetres for millimetres", 1e1: "centimetres for millimetres",
          1e-1: "ten times too large", 1e-2: "a hundred times too large", 1e-3: "millimetres for metres"}  # fmt: skip
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
+_FPS = (24.0, 25.0, 30.0, 50.0, 60.0, 100.0, 120.0)
 RADIAL = tuple(k / 20 for k in range(-9, 10) if k)
 """k1 of the lenses that are tried."""
+
+
+RATES = tuple(sorted({a / b for a in _FPS for b in _FPS if a != b and 0.2 < a / b < 5}))
+"""Ratios of the frame rates that cameras offer."""
 
 
 @dataclass(frozen=True)
@@ -125,11 +130,20 @@ def shifted(setup: Setup, view: int, by: int) -> Candidate:
     return Candidate("out_of_sync", (view,), text, setup.changed(view, shift=total), float(total))
 
 
+def at_rate(setup: Setup, view: int, ratio: float) -> Candidate:
+    """Of another frame rate than the others."""
+    text = (
+        f"{{camera}} has another frame rate: {ratio:.3g} of its frames go with one of the others' "
+        "(frame numbers must be of one clock)"
+    )
+    return Candidate("frame_rate", (view,), text, setup.changed(view, rate=ratio), ratio)
+
+
 def exchanged(setup: Setup, one: int, other: int) -> Candidate:
     """Two cameras with each other's key points, and all that goes with these."""
     new = setup
     for a, b in ((one, other), (other, one)):
-        new = new.changed(a, source=setup.source[b], shift=setup.shift[b], sides=setup.sides[b])
+        new = new.changed(a, source=setup.source[b], shift=setup.shift[b], sides=setup.sides[b], rate=setup.rate[b])
     text = "key points of {camera} are those of {other}, and the reverse; exchange the two names"
     return Candidate("views_swapped", (one, other), text, new, 0.0)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,11 +14,14 @@ from ghpt.data.camera_files import CameraFile
 from ghpt.data.key_points import KeyPoints
 from ghpt.data.names import Name
 from ghpt.data.skeletons import joints17
-from ghpt.data.views import matched
+from ghpt.data.views import check_pixels, matched
 from ghpt.errors import GhptDataError
 
 _LEAST_JOINTS = 6
 """Seen in two views for a frame to be looked at."""
+_NEAR = 0.25
+"""Frames: a view of another rate has no frame of a moment that is farther from its nearest one."""
+AtRate = Callable[[int, float], tuple[Float[Tensor, "S F J 2"], Bool[Tensor, "S F J"]]]
 
 
 @dataclass(frozen=True)
@@ -30,6 +33,9 @@ class Evidence:
     """As detected, through the lens."""
     seen: Bool[Tensor, "V S F J"]
     frame: Int[Tensor, " F"]
+    at_rate: AtRate | None = None
+    """The pixels of a view, and what is seen, if its frame numbers count ``ratio`` times as fast as the others'; None
+    where the recording is not at hand."""
 
     @property
     def reach(self) -> int:
@@ -57,9 +63,17 @@ def gather(
     if ordered.cameras is None:
         mend = "Calibrate them first: python calibrate.py --help"
         raise GhptDataError(cameras.path, "extrinsics", "are missing: there is nothing to check", mend)
+    return of_points(points, at, ordered, frames, reach), ordered, tuple(at)
+
+
+def of_points(points: KeyPoints, at: Sequence[int], cameras: CameraFile, frames: int, reach: int) -> Evidence:
+    """The evidence of the views ``at``, whose cameras these are. Raises GhptDataError for key points that are no
+    pixels."""
+    at = list(at)
     arrays = points.key_points[:, at], points.confidence[:, at], points.seen[:, at]
+    check_pixels(points.path, arrays[0], arrays[2], cameras)
     pixels, _, seen = joints17(points.path, points.joints, *arrays)
-    return choose(ordered.names, pixels, seen, points.frame, frames, reach, points.path), ordered, tuple(at)
+    return choose(cameras.names, pixels, seen, points.frame, frames, reach, points.path)
 
 
 def choose(
@@ -73,14 +87,36 @@ def choose(
         raise GhptDataError(where, "key points", f"no frame has {_LEAST_JOINTS} joints in two views", mend)
     rows = usable[np.unique(np.linspace(0, len(usable) - 1, min(frames, len(usable))).round().astype(int))]
     reach = min(reach, len(usable) // 4)
-    wanted = frame[rows][None] + np.arange(-reach, reach + 1)[:, None]
-    index = np.searchsorted(frame, wanted).clip(0, len(frame) - 1)
-    there = frame[index] == wanted
-    finite = np.isfinite(pixels).all(-1)
-    seen = (seen & finite)[index] & there[..., None, None]
-    pixels = np.where(seen[..., None], pixels[index], 0.0)
+    seen = seen & np.isfinite(pixels).all(-1)
     order = (2, 0, 1, 3)
+
+    def around(moments: Float[np.ndarray, " F"], views: int | slice) -> tuple[np.ndarray, np.ndarray]:
+        """What is nearest to the moments (numbers of frames) and their neighbours: [S, F, ...]."""
+        wanted = moments[None] + np.arange(-reach, reach + 1)[:, None]
+        index = np.searchsorted(frame, np.rint(wanted)).clip(0, len(frame) - 1)
+        there = (np.abs(frame[index] - wanted) <= _NEAR)[(..., *[None] * (seen[:, views].ndim - 1))]
+        shown = seen[:, views][index] & there
+        return np.where(shown[..., None], pixels[:, views][index], 0.0), shown
+
+    def at_rate(view: int, ratio: float) -> tuple[Tensor, Tensor]:
+        values, shown = around(frame[0] + ratio * (frame[rows] - frame[0]), view)
+        return torch.from_numpy(values).double(), torch.from_numpy(shown)
+
+    values, shown = around(frame[rows].astype(np.float64), slice(None))
     return Evidence(
-        names, torch.from_numpy(pixels.transpose(*order, 4)).double(), torch.from_numpy(seen.transpose(*order).copy()),
+        names,
+        torch.from_numpy(values.transpose(*order, 4)).double(),
+        torch.from_numpy(shown.transpose(*order).copy()),
         torch.from_numpy(frame[rows].astype(np.int64)),
-    )  # fmt: skip
+        at_rate,
+    )
+
+
+def moment(
+    frame: Int[np.ndarray, " T"], rate: float, shift: int
+) -> tuple[Int[np.ndarray, " T"], Bool[np.ndarray, " T"]]:
+    """The rows of a view at the others' frames, and where it has one: for a view whose numbers count ``rate`` times as
+    fast and are ``shift`` later."""
+    wanted = frame[0] + rate * (frame - frame[0]) + shift
+    rows = np.searchsorted(frame, np.rint(wanted)).clip(0, len(frame) - 1)
+    return rows, np.abs(frame[rows] - wanted) <= _NEAR

@@ -8,15 +8,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghpt.checkup.agreement import LARGEST, Agreement, agreement, all_pairs, errors, median, pair_errors
-from ghpt.checkup.candidates import UNITS, Candidate, exchanged, of_file, of_view, shifted
+from ghpt.checkup.agreement import LARGEST, Agreement, agreement, all_pairs, errors, median, pair_errors, triangulated
+from ghpt.checkup.candidates import RATES, UNITS, Candidate, at_rate, exchanged, of_file, of_view, shifted
 from ghpt.checkup.evidence import Evidence
 from ghpt.checkup.resection import resect
 from ghpt.checkup.setup import Look, Setup
+from ghpt.checkup.units import unit_of
 from ghpt.errors import check
 from ghpt.metrics.relative_pose import rotation_deg
-from ghpt.models.baselines import MEstimator
-from ghpt.models.scale import stature
+from ghpt.models.baselines import Baseline, MEstimator
+from ghpt.models.scale import STATURES, stature
 
 _FEW = 80
 """Key points, of which a quarter gives a median."""
@@ -66,8 +67,9 @@ class Doctor:
     ``level``: largest error of a view that agrees. ``discrete``, ``shifted``, ``lens``, ``lenses``, ``fitted``: what
     the undoing of a mistake must leave at most of the error of the views it is about: of one of few possibilities, a
     shift in time, one camera's lens, all lenses, and a camera's place. ``least``: and by how much it must lessen it.
-    ``astray``: a view that stays worse than this is said to be off. ``pairs``: most pairs of views tried. ``rounds``:
-    most mistakes in one recording. ``statures`` (mm): what people measure; beyond, the unit of length is wrong.
+    ``astray``: a view that stays worse than this is said to be off. ``rated``: other frame
+    rates are tried for a view that is worse. ``pairs``: most pairs of views tried. ``rounds``:
+    most mistakes in one recording. ``consensus``: what the person is measured with.
     """
 
     frames: int
@@ -80,10 +82,11 @@ class Doctor:
     fitted: float
     least: float
     astray: float
+    rated: float
     pairs: int
     rounds: int
-    statures: list[float]
     estimator: MEstimator
+    consensus: Baseline
 
     def __post_init__(self) -> None:
         for name in ("discrete", "shifted", "lens", "lenses", "fitted"):
@@ -91,9 +94,6 @@ class Doctor:
         for name in ("frames", "level", "astray", "pairs", "rounds"):
             check(getattr(self, name) > 0, name, f"is {getattr(self, name)}", "It must be > 0.")
         check(self.shift >= 0, "shift", f"is {self.shift}", "It must not be negative.")
-        check(len(self.statures) == 2, "statures", f"are {self.statures}", "Give the least and the largest, mm.")
-        low, high = self.statures
-        check(0 < low < high, "statures", f"are {low} to {high}", "Give the least and the largest, mm.")
 
     @torch.no_grad()
     def __call__(self, evidence: Evidence, setup: Setup) -> Checkup:
@@ -109,8 +109,7 @@ class Doctor:
             findings = [*findings, self._finding(look, setup, candidate, now, after)]
             setup, now = candidate.setup, after
         findings += self._left(look, setup, now)
-        height = float(stature(now.points[0], now.known[0])) if bool((now.error < self.level).any()) else 0.0
-        setup, unit, height = self._unit(setup, height)
+        setup, unit, height = self._unit(setup, self._stature(look, setup, now))
         pixels = self._pixels(look, setup, now.error)
         return Checkup((*merged(findings), *unit), setup, pixels, given, height)
 
@@ -192,6 +191,7 @@ class Doctor:
             look.prepare(setup, view)
             tried = list(of_view(setup, view))
             tried += [shifted(setup, view, by) for by in self._shifts(look, setup, view)]
+            tried += self._rates(look, setup, now, view)
             tried += self._moved(look, setup, now, view)
             each = []
             for candidate in tried:
@@ -207,6 +207,12 @@ class Doctor:
     def _shifts(self, look: Look, setup: Setup, view: int) -> list[int]:
         reach = look.evidence.reach
         return [by for by in range(-reach - setup.shift[view], reach - setup.shift[view] + 1) if by]
+
+    def _rates(self, look: Look, setup: Setup, now: Agreement, view: int) -> list[Candidate]:
+        """Of a view that does not agree."""
+        if look.evidence.at_rate is None or now.error[view] < self.rated or setup.rate[view] != 1:
+            return []
+        return [at_rate(setup, view, ratio) for ratio in RATES]
 
     def _moved(self, look: Look, setup: Setup, now: Agreement, view: int) -> list[Candidate]:
         found = resect(look.view(setup, view), now.points[view], now.known[view], LARGEST, 0)
@@ -256,8 +262,19 @@ class Doctor:
                                  float(pixels[view]), False))  # fmt: skip
         return found
 
+    def _stature(self, look: Look, setup: Setup, now: Agreement) -> float:
+        """Of the person that all views together show (mm), as every command measures it; 0 where no views agree."""
+        if not bool((now.error < self.level).any()):
+            return 0.0
+        points, known = triangulated(look.all(setup), setup, now.core[None], self.consensus)
+        return float(stature(points[0], known[0]))
+
     def _unit(self, setup: Setup, height: float) -> tuple[Setup, list[Finding], float]:
-        low, high = self.statures
+        low, high = STATURES
+        if height and setup.unit_mm is not None:
+            unit = unit_of(height / setup.unit_mm) or setup.unit_mm
+            factor = unit / setup.unit_mm
+            setup, height = replace(setup, t=factor * setup.t, unit_mm=None), factor * height
         if not height or low <= height <= high:
             return setup, [], height
         for factor, words in UNITS.items():

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ghpt.checkup.evidence import moment
 from ghpt.checkup.examination import Checkup
+from ghpt.checkup.setup import Setup
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.camera_writers import write_pose2sim
 from ghpt.data.key_points import KeyPoints, write_key_points
@@ -22,16 +24,21 @@ MENDED = ("cameras.toml", "keypoints.npz")
 def write_mended(
     output: Path, cameras: CameraFile, checkup: Checkup, points: KeyPoints | None, at: Sequence[int]
 ) -> None:
-    """``cameras.toml``; and ``keypoints.npz``, the 17 joints, where a view was shifted, mirrored or its sides
-    exchanged. Exchanged views are mended by their cameras' names alone."""
+    """``cameras.toml``; and ``keypoints.npz``, the 17 joints, where a view was shifted, thinned to the others'
+    frames, mirrored or its sides exchanged. Exchanged views are mended by their cameras' names alone."""
     setup = checkup.setup
     names = tuple(cameras.names[source] for source in setup.source)
     size = (2 * cameras.K[:, :2, 2] + 1).round().long() if cameras.size is None else cameras.size
     rig = Rig(names, Cameras(setup.K, setup.R, setup.t), setup.lens, size)
     said = "; ".join(finding.text for finding in checkup.findings if finding.mended)
     write_pose2sim(output / MENDED[0], rig, {"adjusted": True, "mended": said})
-    if points is not None and (any(setup.shift) or any(setup.mirrored) or any(setup.sides)):
+    if points is not None and (_changes_points(setup)):
         write_key_points(output / MENDED[1], mended_points(points, at, cameras, checkup))
+
+
+def _changes_points(setup: Setup) -> bool:
+    rates = any(rate != 1 for rate in setup.rate)
+    return rates or any(setup.shift) or any(setup.mirrored) or any(setup.sides)
 
 
 def mended_points(points: KeyPoints, at: Sequence[int], cameras: CameraFile, checkup: Checkup) -> KeyPoints:
@@ -42,12 +49,11 @@ def mended_points(points: KeyPoints, at: Sequence[int], cameras: CameraFile, che
     pixels, sure, seen = (array.copy() for array in joints17(points.path, points.joints, *arrays))
     old = pixels.copy(), sure.copy(), seen.copy()
     for view, source in enumerate(setup.source):
-        wanted = points.frame + setup.shift[view]
-        rows = np.searchsorted(points.frame, wanted).clip(0, len(points.frame) - 1)
+        rows, there = moment(points.frame, setup.rate[view], setup.shift[view])
         for new, given in zip((pixels, sure, seen), old, strict=True):
             moved = given[rows, source]
             new[:, view] = moved[:, list(MIRROR)] if setup.sides[view] else moved
-        seen[:, view] &= (points.frame[rows] == wanted)[:, None]
+        seen[:, view] &= there[:, None]
         if setup.mirrored[view]:
             pixels[:, view, :, 0] = setup.width[view] - 1 - pixels[:, view, :, 0]
     names = tuple(cameras.names[source] for source in setup.source)

@@ -37,6 +37,10 @@ class Setup:
     """Whether left and right joints are exchanged."""
     width: tuple[float, ...]
     """Of the images, pixels."""
+    rate: tuple[float, ...]
+    """How many times as fast as the others' the numbers of its frames count."""
+    unit_mm: float | None
+    """mm: what the file's unit was taken for, where it does not say; else None."""
 
     def __len__(self) -> int:
         return len(self.shift)
@@ -60,8 +64,9 @@ def as_filed(cameras: CameraFile) -> Setup:
     width = 2 * cameras.K[:, 0, 2] + 1 if cameras.size is None else cameras.size[:, 0].double()
     off = (False,) * views
     return Setup(
-        cameras.K, cameras.distortion, rig.R, rig.t, tuple(range(views)), (0,) * views, off, off, tuple(width.tolist())
-    )
+        cameras.K, cameras.distortion, rig.R, rig.t, tuple(range(views)), (0,) * views, off, off,
+        tuple(width.tolist()), (1.0,) * views, None if cameras.unit_known else cameras.unit_mm,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -111,11 +116,15 @@ class Look:
 
     @staticmethod
     def _key(setup: Setup, view: int, shift: int) -> tuple:
-        how = setup.source[view], shift, setup.mirrored[view], setup.sides[view]
+        how = setup.source[view], shift, setup.mirrored[view], setup.sides[view], setup.rate[view]
         return (*how, *setup.K[view].flatten().tolist(), *setup.lens[view].tolist())
 
     def _pixels(self, setup: Setup, view: int, at: int | slice) -> tuple[Tensor, Tensor]:
-        pixels, seen = (x[setup.source[view]][at] for x in (self.evidence.pixels, self.evidence.seen))
+        source, evidence = setup.source[view], self.evidence
+        if setup.rate[view] == 1 or evidence.at_rate is None:
+            pixels, seen = evidence.pixels[source][at], evidence.seen[source][at]
+        else:
+            pixels, seen = (values[at] for values in evidence.at_rate(source, setup.rate[view]))
         if setup.mirrored[view]:
             pixels = torch.stack((setup.width[view] - 1 - pixels[..., 0], pixels[..., 1]), dim=-1)
         if setup.sides[view]:

@@ -1,13 +1,14 @@
 """People's own camera files: Pose2Sim, aniposelib, caliscope, freemocap, OpenCV, EasyMocap, Panoptic, Human3.6M and
 COLMAP.
 
-All are read as world to camera, mm; the TOML and yml formats are in metres, Panoptic in centimetres, Human3.6M in mm;
-COLMAP's models have a unit of their own.
+All are read as world to camera, mm. Pose2Sim's and caliscope's TOML are in metres, Panoptic in
+centimetres, Human3.6M in mm. COLMAP's models have a unit of their own, aniposelib's and OpenCV's
+files that of the calibration board: they are taken to be in metres until the size of the person
+tells (``ghpt.checkup.units``).
 """
 
 from __future__ import annotations
 
-import logging
 import re
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -50,7 +51,6 @@ _FORMATS = (
     "Known: TOML of Pose2Sim, aniposelib, caliscope or freemocap; intri.yml (with extri.yml beside it) of OpenCV or "
     "EasyMocap; calibration JSON of CMU Panoptic; camera-parameters.json of Human3.6M; a folder with a COLMAP model."
 )
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -72,6 +72,8 @@ class CameraFile:
     t: Float[Tensor, "V 3"] | None
     unit_known: bool = True
     """False where the file has no unit of length and nobody gave one: then ``t`` is in mm by a guess."""
+    unit_mm: float = 1.0
+    """Length of the file's own unit, given, the format's or guessed."""
 
     def __len__(self) -> int:
         return len(self.names)
@@ -109,33 +111,32 @@ class _Entry:
 def read_cameras(path: str | Path, subject: Name = None, unit_mm: int | float | None = None) -> CameraFile:
     """The cameras of a file, or of a folder with intri.yml or a COLMAP model; the format is recognised by content.
 
-    ``subject`` chooses of a Human3.6M file, which has other extrinsics for each. ``unit_mm`` is the length of the
-    file's unit where that is not the format's own: COLMAP's models have none, and are taken to be in metres with a
-    warning. Raises GhptDataError, naming file, field and mend, for anything that is not a pinhole camera with the lens
-    of ``ghpt.data.lens``: fisheye lenses among it.
+    ``subject`` chooses of a Human3.6M file, which has other extrinsics for each. ``unit_mm`` is the
+    length of the file's unit where that is not the format's own, or where the format has none.
+    Raises GhptDataError, naming file, field and mend, for anything that is not a pinhole camera with
+    the lens of ``ghpt.data.lens``: fisheye lenses among it.
     """
     path = Path(path)
     if unit_mm is not None and not 0 < unit_mm < float("inf"):
         raise GhptDataError(path, "unit_mm", f"is {unit_mm}", "Give the length of the file's unit in mm.")
     given = None if unit_mm is None else float(unit_mm)
     if path.is_dir() and is_colmap(path):
-        if unit_mm is None:
-            _log.warning("%s: a COLMAP model has no unit of length: it is taken to be in metres; unit_mm= says how "
-                         "many mm its unit is.", path)  # fmt: skip
         entries = [_Entry(c.name, c.other, c.K, c.distortion, c.size, c.R, c.t) for c in read_colmap(path)]
-        return replace(_checked(path, "COLMAP", entries, given or _MM_PER_M), unit_known=unit_mm is not None)
+        return replace(_checked(path, "COLMAP", entries, given or _MM_PER_M), unit_known=given is not None)
     if path.is_dir():
         path = path / "intri.yml"
     with open_input(path) as handle:
         start = handle.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
     if start.startswith(b"%YAML"):
-        return _checked(path, "OpenCV", _opencv(path), given or _MM_PER_M)
+        file = _checked(path, "OpenCV", _opencv(path), given or _MM_PER_M)
+        return replace(file, unit_known=given is not None)
     if start.startswith((b"{", b"\xff\xfe{", b"\xfe\xff\0{")):
         content = read_json(path, SMALL_JSON)
         if isinstance(content, dict) and "intrinsics" in content:
             return _checked(path, "Human3.6M", _human36m(path, content, subject), given or 1.0)
         return _checked(path, "Panoptic", _panoptic(path, content), given or _MM_PER_CM)
-    return _checked(path, *_toml(path), given or _MM_PER_M)
+    file = _checked(path, *_toml(path), given or _MM_PER_M)
+    return replace(file, unit_known=given is not None or file.format != "aniposelib")
 
 
 def _toml(path: Path) -> tuple[str, list[_Entry]]:
@@ -262,7 +263,7 @@ def _checked(path: Path, form: str, entries: Sequence[_Entry], mm_per_unit: floa
         path=str(path), format=form, names=names, other_names=tuple(entry.other for entry in entries),
         K=cameras.K, distortion=torch.from_numpy(distortion),
         size=None if None in sizes else torch.tensor(sizes, dtype=torch.int64),
-        R=cameras.R if known else None, t=cameras.t if known else None,
+        R=cameras.R if known else None, t=cameras.t if known else None, unit_mm=mm_per_unit,
     )  # fmt: skip
 
 

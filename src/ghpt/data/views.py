@@ -25,6 +25,8 @@ from ghpt.skeleton import JOINTS
 _log = logging.getLogger(__name__)
 _MEND = "Rename them, say which is which (match={view: camera}), or name the views to use (views=[...])."
 _MOST_OUTSIDE = 0.25
+_NORMALISED, _NEARLY_ALL = 1.5, 0.99
+"""Nearly all coordinates of a view within this are no pixels: of the image's size, with a joint or two beyond it."""
 _WORDS = r"[ _.-](json|openpose|pose|keypoints|kpts|body|2d)\b"
 
 
@@ -73,17 +75,30 @@ def look_through(
     every camera its view. ``match`` gives the camera of a view where names do not tell. Of several people that one is
     taken who `who` says. Raises GhptDataError.
     """
-    pairs = matched(points.path, points.views, cameras, match or {}, views)
-    at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
-    if isinstance(points, People):
-        points = points.pick(who(points, ordered, at, person))
+    points, at, ordered = as_one_person(points, cameras, match, views, person)
     pixels, seen = np.zeros(points.key_points[:, at].shape, np.float32), points.seen[:, at].copy()
+    check_pixels(points.path, points.key_points[:, at], seen, ordered)
     _check_sizes(points.path, points.key_points[:, at], seen, ordered)
     for view in range(len(at)):
         K, lens = ordered.K[view].numpy(), ordered.distortion[view].numpy()
         pixels[:, view], seen[:, view] = undistorted(points.key_points[:, at[view]], seen[:, view], K, lens)
     values = joints17(points.path, points.joints, pixels, points.confidence[:, at], seen)
     return Views(ordered, *values, frame=points.frame, rate_hz=points.rate_hz)
+
+
+def as_one_person(
+    points: KeyPoints | People,
+    cameras: CameraFile,
+    match: Mapping[str, str] | None,
+    views: Sequence[str] | None,
+    person: int,
+) -> tuple[KeyPoints, list[int], CameraFile]:
+    """One person's key points, which of their views have a camera, and these cameras in the order of the views."""
+    pairs = matched(points.path, points.views, cameras, match or {}, views)
+    at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
+    if isinstance(points, People):
+        points = points.pick(who(points, ordered, at, person))
+    return points, at, ordered
 
 
 def who(people: People, cameras: CameraFile, at: Sequence[int], person: int = 0) -> Int[np.ndarray, "T V"]:
@@ -204,17 +219,59 @@ def _unmatched(where: str, views: Sequence[str], cameras: CameraFile, problem: s
     return GhptDataError(where, "views", f"{problem} ({sides})", _MEND)
 
 
+def image_size(cameras: CameraFile) -> Float[np.ndarray, "V 2"]:
+    """Width and height of the images; where the file does not say, twice the principal point."""
+    if cameras.size is not None:
+        return cameras.size.numpy().astype(np.float64)
+    return (2 * cameras.K[:, :2, 2] + 1).numpy()
+
+
+def check_pixels(
+    where: str, pixels: Float[np.ndarray, "T V K 2"], seen: Bool[np.ndarray, "T V K"], cameras: CameraFile
+) -> None:
+    """Raise GhptDataError for key points in [0, 1] or [-1, 1], as shares of the image, where pixels are wanted."""
+    size = image_size(cameras)
+    for view, name in enumerate(cameras.names):
+        own = pixels[:, view][seen[:, view]]
+        own = own[np.isfinite(own).all(-1)]
+        # a detector that gives (0, 0) for what it does not see says nothing of the unit
+        if not len(own) or not own.any() or size[view].min() < 20 * _NORMALISED:
+            continue
+        if np.quantile(np.abs(own), _NEARLY_ALL) > _NORMALISED:
+            continue
+        width, height = size[view]
+        signed = (own < 0).any(-1).mean() > 1 - _NEARLY_ALL
+        bounds = "-1 and 1" if signed else "0 and 1"
+        problem = f"key points lie between {bounds} in an image of {width:.0f} x {height:.0f}: they are normalised"
+        scaled = f"multiply x by {width:.0f} and y by {height:.0f}"
+        if signed:
+            scaled = f"add 1, then multiply x by {width / 2:g} and y by {height / 2:g}"
+        mend = f"Give pixels: {scaled}; or detect again (OpenPose: --keypoint_scale 0)."
+        raise GhptDataError(where, f"view {name}", problem, mend)
+
+
 def _check_sizes(where: str, pixels: np.ndarray, seen: np.ndarray, cameras: CameraFile) -> None:
     """Detectors place some joints beyond the image's edge; many there are those of an image of another size."""
     if cameras.size is None:
         return
-    size = cameras.size.numpy()
-    outside = seen & ((pixels < -0.5) | (pixels > size[:, None] - 0.5)).any(-1)
-    share = outside.sum((0, 2)) / seen.sum((0, 2)).clip(1)
+    size = image_size(cameras)
+    share = _outside(pixels, seen, size)
+    turned = _outside(pixels, seen, size[:, ::-1])
     for view in np.flatnonzero(share > _MOST_OUTSIDE):
         width, height = size[view]
         reach = pixels[:, view][seen[:, view]].max(0)
-        image = f"its image of {width} x {height}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
+        image = f"its image of {width:.0f} x {height:.0f}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
         problem = f"{share[view]:.0%} of the key points lie outside {image}"
         mend = "Give the intrinsics of the resolution that the key points were detected in."
+        if turned[view] < 1 - _NEARLY_ALL:
+            problem += f", as in an image of {height:.0f} x {width:.0f}: turned by 90 degrees, or x and y exchanged"
+            mend = "Detect in images that are turned as the calibration's, or calibrate the turned ones."
         raise GhptDataError(where, f"view {cameras.names[view]}", problem, mend)
+
+
+def _outside(
+    pixels: Float[np.ndarray, "T V K 2"], seen: Bool[np.ndarray, "T V K"], size: Float[np.ndarray, "V 2"]
+) -> Float[np.ndarray, " V"]:
+    """The share of each view's key points beyond images of this size."""
+    outside = seen & ((pixels < -0.5) | (pixels > size[:, None] - 0.5)).any(-1)
+    return outside.sum((0, 2)) / seen.sum((0, 2)).clip(1)

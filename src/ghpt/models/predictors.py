@@ -13,6 +13,7 @@ from ghpt.geometry.normal_equations import usable_views
 from ghpt.geometry.triangulation import Status, Triangulation
 from ghpt.models.baselines import Baseline, poses_of
 from ghpt.models.quality import JointQuality, Quality
+from ghpt.models.rejection import Rejection
 from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.models.view_weights import ViewWeights
 from ghpt.reconstruction import Reconstruction, State
@@ -41,28 +42,31 @@ class Classical:
     """A classical estimator with what it can say of its joints.
 
     A view counts as one of those that made a joint if its residual is within the estimator's ``reach``; where fewer
-    than two views are, all that were given to it count, and the error and covariance say so. ``reject``: a joint on
-    which no two views agree so is REJECTED; false: kept with its large error and covariance. ``swaps``: how exchanged
-    sides are looked for and undone; null: they are not.
+    than two views are, all that were given to it count, and the error and covariance say so. ``reject``: which joints
+    are REJECTED because no two views explain them; null: none. ``swaps``: how exchanged sides are looked for and
+    undone; null: they are not.
     """
 
-    def __init__(self, estimator: Baseline, quality: Quality, swaps: Swaps | None, reject: bool) -> None:
+    def __init__(self, estimator: Baseline, quality: Quality, swaps: Swaps | None, reject: Rejection | None) -> None:
         self.estimator, self.quality, self.swaps, self.reject = estimator, quality, swaps, reject
 
     def fitted(self, batch: KeyPointBatch) -> Classical:
         clean, _, _, result = _prepared(batch, self.swaps, self.estimator)
         views, _ = self.estimator.agreeing(clean, result.points, result.placed)
         quality = self.quality.fitted(clean, result.points, views)
-        return Classical(self.estimator, quality, self.swaps, self.reject)
+        reject = self.reject and self.reject.fitted(clean, result.points, result.placed)
+        return Classical(self.estimator, quality, self.swaps, reject)
+
+    def rejecting_nothing(self) -> Classical:
+        """The same, with all its joints: what it is compared with others by."""
+        return Classical(self.estimator, self.quality, self.swaps, None)
 
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> Reconstruction:
         clean, spoilt, swapped, result = _prepared(batch, self.swaps, self.estimator)
         state = _states(result.status, spoilt)
-        views, agreed = self.estimator.agreeing(clean, result.points, state == State.OBSERVED)
-        if self.reject:
-            state = torch.where((state == State.OBSERVED) & ~agreed, int(State.REJECTED), state).to(torch.int8)
-            views &= (state == State.OBSERVED)[:, None]
+        state = _rejected(self.reject, clean, result.points, state)
+        views, _ = self.estimator.agreeing(clean, result.points, state == State.OBSERVED)
         found = self.quality(clean, result.points, views)
         score = torch.zeros(len(batch), dtype=torch.float32)
         return _reconstruction(batch, result.points, state, views, found, score, swapped)
@@ -73,17 +77,25 @@ class Learned:
 
     The views that made a joint are those on which the consensus of ``view_weights`` agrees, and error and covariance
     are theirs. The score is the mean logit of the hypotheses under their weights, before ``limit_spread``, which
-    centres each frame's. ``swaps`` as in Classical.
+    centres each frame's. ``swaps`` and ``reject`` as in Classical.
     """
 
-    def __init__(self, view_weights: ViewWeights, quality: Quality, swaps: Swaps | None) -> None:
-        self.view_weights, self.quality, self.swaps = view_weights, quality, swaps
+    def __init__(
+        self, view_weights: ViewWeights, quality: Quality, swaps: Swaps | None, reject: Rejection | None
+    ) -> None:
+        self.view_weights, self.quality, self.swaps, self.reject = view_weights, quality, swaps, reject
 
     def fitted(self, batch: KeyPointBatch) -> Learned:
         clean, _, _, robust = _prepared(batch, self.swaps, self.view_weights.consensus)
         weighed = self.view_weights.weigh(clean, robust)
-        quality = self.quality.fitted(clean, weighed.triangulation.points, weighed.views)
-        return Learned(self.view_weights, quality, self.swaps)
+        found = weighed.triangulation
+        quality = self.quality.fitted(clean, found.points, weighed.views)
+        reject = self.reject and self.reject.fitted(clean, found.points, found.placed)
+        return Learned(self.view_weights, quality, self.swaps, reject)
+
+    def rejecting_nothing(self) -> Learned:
+        """The same, with all its joints: what it is compared with others by."""
+        return Learned(self.view_weights, self.quality, self.swaps, None)
 
     @torch.no_grad()
     def __call__(self, batch: KeyPointBatch) -> Reconstruction:
@@ -91,6 +103,7 @@ class Learned:
         weighed = self.view_weights.weigh(clean, robust)
         points = weighed.triangulation.points
         state = _states(weighed.triangulation.status, spoilt)
+        state = _rejected(self.reject, clean, points, state)
         views = weighed.views & (state == State.OBSERVED)[:, None]
         found = self.quality(clean, points, views)
         score = (weighed.weights * weighed.logits).sum(-1)
@@ -129,6 +142,20 @@ def _states(status: Int8[Tensor, "B J"], spoilt: Bool[Tensor, "B V J"]) -> Int8[
     table = torch.tensor([int(_STATE[s]) for s in Status], dtype=torch.int8, device=status.device)
     state = table[status.long()]
     return torch.where((state == State.FEW_VIEWS) & spoilt.any(1), int(State.BAD_INPUT), state).to(torch.int8)
+
+
+def _rejected(
+    reject: Rejection | None,
+    batch: KeyPointBatch,
+    points: Float[Tensor, "B J 3"],
+    state: Int8[Tensor, "B J"],
+) -> Int8[Tensor, "B J"]:
+    """The states, REJECTED where a joint has a position that no two views explain."""
+    if reject is None:
+        return state
+    placed = state == State.OBSERVED
+    unexplained = placed & ~reject.explained(batch, points, placed)
+    return torch.where(unexplained, int(State.REJECTED), state).to(torch.int8)
 
 
 def _reconstruction(

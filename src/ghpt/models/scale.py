@@ -38,21 +38,33 @@ SEGMENTS = tuple(map(_name, BONES))
 same of the left, lumbar, thorax, neck (to the head's top), head_top_nose, right_clavicle, right_upper_arm,
 right_forearm, and of the left."""
 
+STATURES = (1000.0, 2300.0)
+"""mm: from a child of four years to the tallest; a measured stature beyond is worth a look."""
+
+HUMAN = (600.0, 2800.0)
+"""mm: beyond, a measured stature is nobody's: the unit of length is wrong."""
+
 LIMBS = ("shank", "thigh", "upper_arm", "forearm")
 """The parts whose ends detectors define alike."""
 
 
 @cache
-def average_lengths() -> tuple[float, ...]:
-    """The limbs' lengths of an average adult in statures, in the order of BONES; 0 for other parts."""
+def typical_lengths() -> tuple[float, ...]:
+    """The lengths of an average adult's parts in statures, in the order of BONES."""
     one, other = np.array(BONES).T
     lengths = []
     for number in range(256):  # the median of many people is the model's average, whatever a person is made of
         adult = random_body(np.random.default_rng(number))
         standing = pose(adult, np.zeros((1, len(body.SEGMENTS), 3)))[0] / adult.stature
         lengths.append(np.linalg.norm(standing[one] - standing[other], axis=-1))
-    limb = [name.split("_", 1)[-1] in LIMBS for name in SEGMENTS]
-    return tuple(np.where(limb, np.median(lengths, axis=0), 0.0).tolist())
+    return tuple(np.median(lengths, axis=0).tolist())
+
+
+@cache
+def average_lengths() -> tuple[float, ...]:
+    """The same of the limbs alone; 0 for other parts, whose ends each detector puts elsewhere."""
+    lengths = zip(SEGMENTS, typical_lengths(), strict=True)
+    return tuple(length if name.split("_", 1)[-1] in LIMBS else 0.0 for name, length in lengths)
 
 
 def part_scales(
@@ -136,7 +148,9 @@ class BodyHeight(BodyScale):
     """The limbs of an average adult of this height (mm): proportions differ by about 3 % between people."""
 
     def __init__(self, mm: float) -> None:
-        check(mm > 0, "mm", f"is {mm}", "Give the person's height in millimetres.")
+        low, high = HUMAN
+        mend = f"Give the person's height in millimetres, {low:g} to {high:g}."
+        check(low <= mm <= high, "mm", f"is {mm}, which is nobody's height", mend)
         self.lengths = tuple(mm * length for length in average_lengths())
 
 

@@ -13,12 +13,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ghpt.checkup.units import decide_unit
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.views import Views
 from ghpt.errors import GhptDataError
 from ghpt.export import Evidence
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import local_cameras
+from ghpt.models.baselines import Baseline
 from ghpt.prediction.shards import Shards
 from ghpt.reconstruction import Reconstruction
 from ghpt.recording import KeyPointBatch
@@ -32,12 +34,24 @@ away they pass 0.01 mm, and reach half a metre in national grids (5,000 km). Nea
 because their scores would change in the last digit, for nothing."""
 _WHOLE = 1000.0
 """The origin of a rig farther away has whole metres, so that people can read it and add it."""
+_MEASURED = 64
+"""Frames by which the person tells the unit of length."""
 _STAMPED = 4096
 """Frames that are read at a time for the stamp."""
 _MEND = "Calibrate first (python calibrate.py keypoints=... cameras=...), and give the rig.toml that it writes."
 
 Seen = tuple[Float[np.ndarray, "N V J 2"], Float[np.ndarray, "N V J"], Bool[np.ndarray, "N V J"]]
 """Undistorted pixels (float32), confidences and what is seen, of the 17 joints."""
+
+
+@dataclass(frozen=True)
+class Detected:
+    """The recording as the detector and the camera file have it."""
+
+    cameras: CameraFile
+    """Of the views, in their order, in mm."""
+    read: Callable[[Int[np.ndarray, " N"]], Seen]
+    """Pixels through the lens, confidences and what is seen, of some rows, which rise."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +69,8 @@ class Frames:
     rate_hz: float | None
     read: Callable[[Int[np.ndarray, " N"]], Seen]
     """The key points of some rows, which rise."""
+    detected: Detected | None = None
+    """The same through the lenses, as the camera check needs them; None for recordings without."""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -109,8 +125,18 @@ def frames_of_views(views: Views, source: str, title: str) -> Frames:
         return views.key_points[rows], views.confidence[rows], views.seen[rows]
 
     rate = None if views.rate_hz is None or math.isnan(views.rate_hz) else float(views.rate_hz)
-    rig = calibrated(source, views.cameras)
-    return Frames(title, source, views.cameras.names, rig, views.frame.astype(np.int64), rate, read)
+    cameras = views.cameras
+    rig = calibrated(source, cameras)
+    detected = Detected(replace(cameras, distortion=torch.zeros_like(cameras.distortion)), read)
+    return Frames(title, source, cameras.names, rig, views.frame.astype(np.int64), rate, read, detected)
+
+
+def in_unit(frames: Frames, estimator: Baseline) -> Frames:
+    """With cameras in mm where their file does not say its unit (``ghpt.checkup.units.decide_unit``)."""
+    if frames.detected is None or frames.detected.cameras.unit_known:
+        return frames
+    file = decide_unit(frames.detected.cameras, frames.batch(frames.spread(_MEASURED)), estimator, ask=True)
+    return replace(frames, cameras=file.cameras, detected=replace(frames.detected, cameras=file))
 
 
 def calibrated(where: str, cameras: CameraFile) -> Cameras:

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ghpt.models.scale import SEGMENTS
+from ghpt.prediction.verdict import verdict_lines
 from ghpt.report.escape import code, escaped, plain
 from ghpt.report.tables import NAMES, NONE, markdown
 
@@ -29,6 +30,8 @@ def summary_lines(numbers: Numbers) -> list[str]:
     swapped = {view: n for view, n in numbers["swapped"].items() if n}
     if swapped:
         lines.append("Left and right exchanged in " + ", ".join(f"{n} frames of {v}" for v, n in swapped.items()) + ".")
+    if numbers["stature_mm"]:
+        lines.append(f"The person measures {numbers['stature_mm'] / 1000:.2f} m.")
     if numbers["smooth_hz"]:
         lines.append(f"Smoothed: zero-phase Butterworth, {numbers['smooth_hz']:g} Hz.")
     return lines
@@ -70,6 +73,13 @@ def print_prediction(numbers: Numbers, console: Console | None = None) -> None:
         console.print(plain(line), soft_wrap=True)
 
 
+def print_verdict(verdict: Numbers, console: Console | None = None) -> None:
+    """The last words in the terminal."""
+    console = console or Console()
+    for line in verdict_lines(verdict):
+        console.print(line, highlight=False, soft_wrap=True, markup=False)
+
+
 def prediction_report(numbers: Numbers) -> str:
     """The Markdown report."""
     evaluation, origin = numbers["evaluation"], numbers["provenance"]
@@ -82,6 +92,8 @@ def prediction_report(numbers: Numbers) -> str:
         f"ghpt {origin['ghpt']}, commit `{origin['commit'] or NONE}`, seed {origin['seed']}: "
         f"{code(origin['command'])}.",
         "\n".join(f"- {escaped(line)}" for line in summary_lines(numbers)),
+        "## Verdict",
+        *_verdict(numbers["verdict"]),
         "## Errors by view",
         f"On {evaluation['frames']} frames, evenly spread; median and 90 %, pixels. *Reprojection* is the distance of "
         "every key point from its joint, set aside or not; *left out*, from the joint that "
@@ -99,6 +111,18 @@ def prediction_report(numbers: Numbers) -> str:
         markdown(["segment", *(NAMES.get(n, n.replace("_", " ")) for n in estimators)], segments),
     ]  # fmt: skip
     return "\n\n".join(parts) + "\n"
+
+
+def _verdict(verdict: Numbers) -> list[str]:
+    """Paragraphs of the report."""
+    parts = [f"**{verdict['level']}**"]
+    for finding in verdict["findings"]:
+        against = f" ({finding['value']:.3g}, limit {finding['limit']:g})" if finding["limit"] else ""
+        parts.append(f"- {finding['level']}, `{finding['code']}`: {escaped(finding['text'])}{against}.\n"
+                     f"  Next: {code(finding['command'])}")  # fmt: skip
+    if verdict["undecidable"]:
+        parts.append(f"Not decidable: {escaped('; '.join(verdict['undecidable']))}.")
+    return parts
 
 
 def number(value: float | None, digits: int, factor: int = 1) -> str:

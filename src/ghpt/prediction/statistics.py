@@ -11,7 +11,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.geometry.cameras import reprojection_error
-from ghpt.models.scale import SEGMENTS
+from ghpt.models.baselines import person_size
+from ghpt.models.scale import SEGMENTS, stature
 from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.prediction.frames import Frames
 from ghpt.reconstruction import Reconstruction, State
@@ -20,6 +21,8 @@ from ghpt.report.rig_comparison import segment_variation
 
 Estimate = Callable[[KeyPointBatch], PoseEstimate]
 Numbers = dict[str, Any]
+_LEAST = 20
+"""Key points for a median that a verdict may rest on."""
 
 
 def counts(chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: tuple[str, ...]) -> Numbers:
@@ -63,6 +66,9 @@ def evaluate(
             "segments": {"median": float(variation[known].median()) if known.any() else None,
                          "each": dict(zip(SEGMENTS, lengths, strict=True))},
             "placed": float(placed.double().mean()),
+            "stature_mm": float(stature(torch.cat([found.points for found in own[name]]), placed)) or None,
+            "scales": _scales(parts, error, measured, [e for e, _ in held[name]], [c for _, c in held[name]],
+                              frames.camera_names),
         }  # fmt: skip
     return {"frames": len(rows), "estimators": result}
 
@@ -96,6 +102,25 @@ def _held_out(batch: KeyPointBatch, estimate: Estimate) -> tuple[Float[Tensor, "
         errors.append(error)
         counted.append(batch.seen[:, view] & found.estimated & error.isfinite())
     return torch.stack(errors, dim=1), torch.stack(counted, dim=1)
+
+
+def _scales(
+    parts: list[KeyPointBatch], error: Float[Tensor, "T V J"], measured: Bool[Tensor, "T V J"],
+    held: list[Tensor], counted: list[Tensor], names: tuple[str, ...],
+) -> Numbers:  # fmt: skip
+    """Median errors in left-out views, in sizes of the person in the image; where two views leave none, ``all`` is None
+    and those of the views are reprojection errors. None for fewer than ``_LEAST`` key points."""
+    size = torch.cat([person_size(part.key_points, part.seen) for part in parts])[..., None].double()
+    left_out, there = torch.cat(held), torch.cat(counted) & (size > 0)
+    some = int(there.sum()) >= _LEAST
+    values, known = (left_out, there) if some else (error, measured & (size > 0))
+    relative = values / size.clamp(min=1e-12)
+
+    def middle(of: Tensor) -> float | None:
+        return float(of.median()) if len(of) >= _LEAST else None
+
+    views = {name: middle(relative[:, v][known[:, v]]) for v, name in enumerate(names)}
+    return {"all": middle(relative[known]) if some else None, "views": views}
 
 
 def _by_view(errors: Float[Tensor, "T V J"], counted: Bool[Tensor, "T V J"], names: tuple[str, ...]) -> Numbers:

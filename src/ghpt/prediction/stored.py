@@ -18,7 +18,7 @@ from ghpt.data.skeletons import joints17, recognise
 from ghpt.data.validate import check_view_count, frame_rate
 from ghpt.data.views import look_through, matched
 from ghpt.errors import GhptDataError
-from ghpt.prediction.frames import Frames, Seen, calibrated
+from ghpt.prediction.frames import Detected, Frames, Seen, calibrated
 from ghpt.report.stored_npz import Member, members_of, read_rows, text_table
 
 _CHECKED = 2000
@@ -126,7 +126,12 @@ def frames_of_stored(
             pixels[:, view], seen[:, view] = undistorted(part.key_points[:, of], seen[:, view], K, lens)
         return joints17(path, part.joints, pixels, part.confidence[:, at], seen)
 
-    return Frames(title, path, ordered.names, rig, stored.frame, stored.rate_hz, read)
+    def detected(rows: Int[np.ndarray, " N"]) -> Seen:
+        part = stored.part(rows)
+        return joints17(path, part.joints, part.key_points[:, at], part.confidence[:, at], part.seen[:, at])
+
+    frame, rate = stored.frame, stored.rate_hz
+    return Frames(title, path, ordered.names, rig, frame, rate, read, Detected(ordered, detected))
 
 
 def _check_names(path: Path, names: Mapping[str, tuple[tuple[str, ...], int]], frame: Int[np.ndarray, " T"]) -> None:

@@ -29,7 +29,7 @@ def explains(recordings: Mapping[str, Recording], estimator: Baseline, frames: i
     """How well each calibration of the same key points explains them: name -> held-out-view errors (pixels) over the
     joints that all of them estimate, overall and by view, and the variation of the segments' lengths; over at most so
     many ``frames``, evenly spread."""
-    recordings = {name: _spread(recording, frames) for name, recording in recordings.items()}
+    recordings = {name: spread(recording, frames) for name, recording in recordings.items()}
     if not recordings:
         return {}
     held_out = {name: held_out_errors(recording, estimator) for name, recording in recordings.items()}
@@ -154,7 +154,8 @@ def _segment_rows(explained: Numbers) -> list[list[str]]:
     return [[name.replace("_", " "), *(_number(of[name], 1, 100) for of in each)] for name in SEGMENTS]
 
 
-def _spread(recording: Recording, frames: int) -> Recording:
+def spread(recording: Recording, frames: int) -> Recording:
+    """At most so many of its frames, evenly spread."""
     rows = np.unique(np.linspace(0, len(recording) - 1, min(frames, len(recording))).astype(int))
     arrays = ("key_points", "confidence", "seen", "truth", "truth_seen", "frame")
     return replace(recording, **{name: getattr(recording, name)[rows] for name in arrays})
