@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from markdown_it import MarkdownIt
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rich.console import Console
 
 from ghpt.doctor import _print as print_checkup
@@ -121,5 +122,5 @@ def test_a_dollar_in_a_camera_s_name_is_no_formula():
     same = Similarity(torch.eye(3).double(), 1.0, torch.zeros(3).double())
     points, estimated = torch.zeros(1, 17, 3).double(), torch.zeros(1, 17).bool()
     figure = rig_figure(r"$\a$", (r"$\b$",), rig, torch.zeros(1, 6, 6).double(), points, estimated, same)
-    figure.canvas.draw()
+    FigureCanvasAgg(figure).draw()
     assert np.isfinite(figure.get_size_inches()).all()

@@ -111,6 +111,13 @@ def test_a_jump_costs_twice_its_distance_in_sizes():
         assert follow(frames).tolist() == [0, chosen]
 
 
+def test_of_two_people_the_larger_is_followed_whoever_is_listed_first(tmp_path):
+    for view in ("a", "b"):
+        write(tmp_path / view, [[person(900, 0.3), person()]] * 2)
+    found = read_key_points(tmp_path, **JOINTS)
+    np.testing.assert_allclose(found.key_points, np.broadcast_to(BODY, (2, 2, 25, 2)))
+
+
 def test_person_ids_count_where_everybody_has_one(tmp_path):
     def write_ids(view, ids):
         (tmp_path / view).mkdir(exist_ok=True)
