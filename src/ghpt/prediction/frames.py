@@ -22,7 +22,7 @@ from ghpt.prediction.shards import Shards
 from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import JOINTS
 
-_MEASURED = 64
+MEASURED = 64
 """Frames by which the person tells the unit of length."""
 _STAMPED = 4096
 """Frames that are read at a time for the stamp."""
@@ -107,7 +107,7 @@ def in_unit(frames: Frames, estimator: Baseline) -> Frames:
     """With cameras in mm where their file does not say its unit (``ghpt.checkup.units.decide_unit``)."""
     if frames.detected is None or frames.detected.cameras.unit_known:
         return frames
-    file = decide_unit(frames.detected.cameras, frames.batch(frames.spread(_MEASURED)), estimator, ask=True)
+    file = decide_unit(frames.detected.cameras, frames.batch(frames.spread(MEASURED)), estimator, ask=True)
     return replace(frames, cameras=file.cameras, detected=replace(frames.detected, cameras=file))
 
 
