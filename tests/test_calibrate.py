@@ -7,21 +7,26 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import hydra
 import numpy as np
 import pytest
 import torch
 
 from ghpt.calibrate import COMMAND, people_note
 from ghpt.calibration.diagnosis import Diagnosis
+from ghpt.config import plain
 from ghpt.data.camera_files import read_cameras
 from ghpt.data.camera_writers import write_pose2sim
 from ghpt.data.embedded import motion
 from ghpt.data.key_points import KeyPoints, write_key_points
 from ghpt.data.lens import distort
 from ghpt.data.rigs import human36m_rig
+from ghpt.doctor import examine
 from ghpt.geometry.cameras import Cameras, project
+from ghpt.predict import predict
 from ghpt.report.rig_comparison import rig_difference
 from ghpt.skeleton import JOINT, JOINTS
+from predicting import config
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUTS = {
@@ -103,6 +108,17 @@ def test_intrinsics_and_a_height_give_the_rig_in_every_format(command, scene, tm
     assert np.median(limb) == pytest.approx(thigh, rel=0.02)
     image = cv2.imread(str(output / "rig.png"))
     assert image.shape[0] > 500
+
+
+def test_a_height_comes_back_from_every_command(command, scene, tmp_path):
+    keypoints, *words = write(tmp_path, scene)
+    assert command(keypoints, *words, "scale.height=1750")[0] == 0
+    again = f"cameras={tmp_path / 'rig' / 'rig.toml'}"
+    with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        checked = examine(plain(hydra.compose("cameras", [keypoints, again])), tmp_path)
+    assert checked["stature_mm"] == pytest.approx(1750, rel=0.01)
+    predicted = predict(config(keypoints, again, "evaluated_frames=80", "formats=[npz]"), tmp_path / "out")
+    assert predicted["stature_mm"] == pytest.approx(1750, rel=0.01)
 
 
 def test_extrinsics_in_the_file_are_compared_with_and_not_used(command, scene, tmp_path):

@@ -1,9 +1,12 @@
 """Millimetres per unit: the known length, a body height, measured segments."""
 
+import math
+
 import numpy as np
 import pytest
 import torch
 
+from ghpt.calibration.millimetres import read_scale
 from ghpt.data import body
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
@@ -110,3 +113,48 @@ def test_bad_lengths_are_named(lengths):
 def test_bad_height_is_named():
     with pytest.raises(GhptConfigError, match="mm"):
         BodyHeight(0.0)
+
+
+NOTHING = {"height": None, "segments": None, "baseline": None, "assumed_height": 1730.0}
+
+
+@pytest.mark.parametrize(
+    ("given", "mm"), [(1750, 1750.0), (1.75, 1750.0), (175, 1750.0), (1.1, 1100.0), (205.0, 2050.0)]
+)
+def test_a_height_in_metres_or_centimetres_is_taken_for_one(given, mm):
+    assert read_scale(NOTHING | {"height": given}, "ab")["height"] == pytest.approx(mm)
+    assert read_scale(NOTHING | {"assumed_height": given}, "ab")["assumed_height"] == pytest.approx(mm)
+
+
+@pytest.mark.parametrize("given", [-1, 0, math.nan, math.inf, 17500, 5.9, 69, 17.5, 0.175, True])
+@pytest.mark.parametrize("key", ["height", "assumed_height"])
+def test_a_height_that_is_nobodys_is_an_error(key, given):
+    with pytest.raises(GhptConfigError, match=rf"scale\.{key}: is .*1750"):
+        read_scale(NOTHING | {key: given}, "ab")
+
+
+@pytest.mark.parametrize(
+    ("given", "mm"),
+    [({"thigh": 430, "forearm": 250}, 430.0), ({"thigh": 43, "forearm": 25.0}, 430.0), ({"thigh": 0.43}, 430.0)],
+)
+def test_segments_are_all_of_one_unit(given, mm):
+    assert read_scale(NOTHING | {"segments": given}, "ab")["segments"]["thigh"] == pytest.approx(mm)
+
+
+@pytest.mark.parametrize(
+    "given", [{"thigh": 430, "forearm": 0.25}, {"thigh": 4.3}, {"thigh": 4300}, {"thigh": -43}, {"thigh": math.nan}]
+)
+def test_segments_that_are_nobodys_are_an_error(given):
+    with pytest.raises(GhptConfigError, match=r"scale\.segments"):
+        read_scale(NOTHING | {"segments": given}, "ab")
+
+
+@pytest.mark.parametrize(("given", "mm"), [(3000, 3000.0), (3.2, 3200.0), (0.4, 400.0)])
+def test_a_baseline_in_metres_is_taken_for_one(given, mm):
+    assert read_scale(NOTHING | {"baseline": ["a", "b", given]}, "ab")["baseline"] == ["a", "b", pytest.approx(mm)]
+
+
+@pytest.mark.parametrize("given", [30, 100, 0.01, -3, math.nan, "3000"])
+def test_a_baseline_that_could_be_of_any_unit_is_an_error(given):
+    with pytest.raises(GhptConfigError, match=r"scale\.baseline"):
+        read_scale(NOTHING | {"baseline": ["a", "b", given]}, "ab")

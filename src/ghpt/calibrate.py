@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -17,6 +17,7 @@ from ghpt.app import Command
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.millimetres import in_millimetres, of_scale, read_scale
 from ghpt.calibration.rig import RigEstimate
+from ghpt.checkup.units import decide_unit
 from ghpt.config import build, check_type, suggest
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.chosen import InputSettings, own_cameras, own_key_points, recording_of
@@ -26,6 +27,8 @@ from ghpt.data.views import Views, look_through
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
+from ghpt.models.baselines import Baseline
+from ghpt.prediction.frames import MEASURED, frames_of_views
 from ghpt.outputs import Files, check_apart, input_paths
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
@@ -91,7 +94,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
           suggest(config["triangulation"], config["baselines"]))  # fmt: skip
     calibration = build(config["calibration"], "calibration")
     estimator = build(config["baselines"][config["triangulation"]], f"baselines.{config['triangulation']}")
-    case = from_files(config) if config["keypoints"] else from_data(config)
+    case = in_unit(from_files(config), estimator) if config["keypoints"] else from_data(config)
     cameras, views = case.views.cameras, case.views
     lengths = read_scale(config["scale"], cameras.names)
     sweep_temporaries(output)
@@ -160,6 +163,16 @@ def from_files(config: Mapping[str, Any]) -> Case:
     return Case(
         title, str(Path(config["keypoints"]).resolve()), views, "the file's own calibration", people_note(points)
     )
+
+
+def in_unit(case: Case, estimator: Baseline) -> Case:
+    """With the file's own extrinsics in mm where the person tells their unit: they are compared with."""
+    file = case.views.cameras
+    if file.unit_known or file.cameras is None or len(file) < 2:
+        return case
+    frames = frames_of_views(case.views, case.source, case.title)
+    file = decide_unit(file, frames.batch(frames.spread(MEASURED)), estimator, ask=False)
+    return replace(case, views=replace(case.views, cameras=file))
 
 
 def people_note(points: KeyPoints) -> tuple[Diagnosis, ...]:

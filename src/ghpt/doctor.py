@@ -21,6 +21,7 @@ from ghpt.checkup.evidence import Evidence, choose, gather
 from ghpt.checkup.examination import Checkup, Doctor
 from ghpt.checkup.mending import MENDED, write_mended
 from ghpt.checkup.setup import Setup, as_filed
+from ghpt.checkup.units import UNITS_MM
 from ghpt.config import build, check_type, suggest
 from ghpt.data.camera_files import CameraFile
 from ghpt.data.chosen import InputSettings, own_cameras, own_key_points, recording_of
@@ -162,7 +163,8 @@ def _numbers(patient: Patient, checkup: Checkup) -> dict[str, Any]:
     errors = zip(patient.evidence.names, checkup.given_px.tolist(), checkup.error_px.tolist(), strict=True)
     return {
         "title": patient.title, "source": patient.source, "frames": len(patient.evidence.frame),
-        "stature_mm": checkup.stature or None, "findings": [vars(finding) for finding in checkup.findings],
+        "stature_mm": checkup.stature or None, "unit_mm": checkup.unit_mm,
+        "findings": [vars(finding) for finding in checkup.findings],
         "cameras": [{"name": name, "error_px": given, "mended_px": after} for name, given, after in errors],
     }  # fmt: skip
 
@@ -197,8 +199,11 @@ def _sentence(finding: Mapping[str, Any]) -> str:
 
 
 def _stature(numbers: dict[str, Any]) -> str:
-    height = numbers["stature_mm"]
-    return f"The person measures {height / 1000:.2f} m." if height else "The person's size cannot be told."
+    height, unit = numbers["stature_mm"], numbers["unit_mm"]
+    if not height:
+        return "The person's size cannot be told."
+    said = f"The person measures {height / 1000:.2f} m"
+    return f"{said}, which tells the file's unit: {UNITS_MM[unit]} (unit_mm={unit:g})." if unit else f"{said}."
 
 
 COMMAND = Command("cameras", examine, summary, files)

@@ -126,10 +126,11 @@ def test_d6_30_percent_outliers_still_work(far, record_row):
 
 def test_d6_a_wrong_unit_of_the_scale_is_warned_of():
     estimate = people().calibrate(CALIBRATE)
-    lengths = {mm: torch.tensor(BodyHeight(mm).lengths, dtype=torch.float64) for mm in (1.75, 175.0, 1750.0)}
-    factors = {mm: float(body_scale(estimate.points, estimate.estimated, x)) for mm, x in lengths.items()}
-    codes = {mm: {d.code for d in estimate.scaled(factor).diagnoses} for mm, factor in factors.items()}
-    assert codes == {1.75: {"stature"}, 175.0: {"stature"}, 1750.0: set()}
+    lengths = torch.tensor(BodyHeight(1750.0).lengths, dtype=torch.float64)
+    right = float(body_scale(estimate.points, estimate.estimated, lengths))
+    found = {off: estimate.scaled(off * right).diagnoses for off in (0.001, 0.1, 0.5, 1.0)}
+    severities = {off: [d.severity for d in diagnoses if d.code == "stature"] for off, diagnoses in found.items()}
+    assert severities == {0.001: ["error"], 0.1: ["error"], 0.5: ["warning"], 1.0: []}
 
 
 def test_d6_no_success_with_a_wrong_scale(nightly, record_row):

@@ -58,6 +58,8 @@ class Checkup:
     """... and as the files had it."""
     stature: float
     """Of the person, mm; 0 where it was not measured."""
+    unit_mm: float | None = None
+    """The unit of the file, where it does not say it and the person tells."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +111,11 @@ class Doctor:
             findings = [*findings, self._finding(look, setup, candidate, now, after)]
             setup, now = candidate.setup, after
         findings += self._left(look, setup, now)
-        setup, unit, height = self._unit(setup, self._stature(look, setup, now))
+        height = self._stature(look, setup, now)
+        setup, height, told = self._told(setup, height)
+        setup, unit, height = self._unit(setup, height)
         pixels = self._pixels(look, setup, now.error)
-        return Checkup((*merged(findings), *unit), setup, pixels, given, height)
+        return Checkup((*merged(findings), *unit), setup, pixels, given, height, told)
 
     def _agreement(self, look: Look, setup: Setup) -> Agreement:
         return agreement(look, setup, self.estimator, self.level, self.pairs)
@@ -269,12 +273,17 @@ class Doctor:
         points, known = triangulated(look.all(setup), setup, now.core[None], self.consensus)
         return float(stature(points[0], known[0]))
 
+    @staticmethod
+    def _told(setup: Setup, height: float) -> tuple[Setup, float, float | None]:
+        """The setup and the person in mm, and the unit that the person tells where the file does not say it."""
+        unit = unit_of(height / setup.unit_mm) if height and setup.unit_mm is not None else None
+        if unit is None:
+            return setup, height, None
+        factor = unit / setup.unit_mm
+        return replace(setup, t=factor * setup.t, unit_mm=None), factor * height, unit
+
     def _unit(self, setup: Setup, height: float) -> tuple[Setup, list[Finding], float]:
         low, high = STATURES
-        if height and setup.unit_mm is not None:
-            unit = unit_of(height / setup.unit_mm) or setup.unit_mm
-            factor = unit / setup.unit_mm
-            setup, height = replace(setup, t=factor * setup.t, unit_mm=None), factor * height
         if not height or low <= height <= high:
             return setup, [], height
         for factor, words in UNITS.items():

@@ -41,7 +41,7 @@ def commands_on(config: Mapping[str, Any], output: Path) -> Commands:
 def setting(key: str, value: object) -> str:
     """``key=value`` as a shell and Hydra's grammar take it, lists and mappings among the values."""
     if isinstance(value, Mapping):
-        pairs = (f"{_element(name)}: {_element(of)}" for name, of in value.items())
+        pairs = (f"{_key(str(name))}: {_element(of)}" for name, of in value.items())
         return shlex.quote(f"{key}={{{', '.join(pairs)}}}")
     if isinstance(value, list | tuple):
         return shlex.quote(f"{key}={_list(value)}")
@@ -52,6 +52,11 @@ def setting(key: str, value: object) -> str:
 
 def _list(values: Iterable[object]) -> str:
     return f"[{','.join(map(_element, values))}]"
+
+
+def _key(name: str) -> str:
+    """A mapping's key, which Hydra's grammar has no quotes for."""
+    return re.sub(r"([^\w.-])", r"\\\1", name)
 
 
 def _element(value: object) -> str:

@@ -34,7 +34,7 @@ away they pass 0.01 mm, and reach half a metre in national grids (5,000 km). Nea
 because their scores would change in the last digit, for nothing."""
 _WHOLE = 1000.0
 """The origin of a rig farther away has whole metres, so that people can read it and add it."""
-_MEASURED = 64
+MEASURED = 64
 """Frames by which the person tells the unit of length."""
 _STAMPED = 4096
 """Frames that are read at a time for the stamp."""
@@ -135,7 +135,7 @@ def in_unit(frames: Frames, estimator: Baseline) -> Frames:
     """With cameras in mm where their file does not say its unit (``ghpt.checkup.units.decide_unit``)."""
     if frames.detected is None or frames.detected.cameras.unit_known:
         return frames
-    file = decide_unit(frames.detected.cameras, frames.batch(frames.spread(_MEASURED)), estimator, ask=True)
+    file = decide_unit(frames.detected.cameras, frames.batch(frames.spread(MEASURED)), estimator, ask=True)
     return replace(frames, cameras=file.cameras, detected=replace(frames.detected, cameras=file))
 
 

@@ -124,7 +124,7 @@ class Judge:
             return
         human = HUMAN[0] <= height <= HUMAN[1]
         text = (
-            f"the person measures {height / 1000:.3g} m, and people measure {low / 1000:g} to {high / 1000:g} m: "
+            f"the person measures {height / 1000:,.2f} m, and people measure {low / 1000:g} to {high / 1000:g} m: "
             "the cameras' unit of length is another, or their scale is wrong"
         )
         command = commands.predict(unit_mm=unit_for(height / unit_mm))

@@ -1,0 +1,288 @@
+"""What predict.py says of its own result: good recordings are good, and each way to spoil one is said."""
+
+from __future__ import annotations
+
+import json
+import shlex
+from functools import cache
+from pathlib import Path
+
+import hydra
+import numpy as np
+import pytest
+import torch
+from hydra.core.override_parser.overrides_parser import OverridesParser
+
+from ghpt.checkup.units import unit_for, unit_of
+from ghpt.config import build, plain
+from ghpt.data.camera_files import read_cameras
+from ghpt.data.camera_writers import write_aniposelib, write_pose2sim
+from ghpt.data.key_points import KeyPoints, write_key_points
+from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.data.views import look_through
+from ghpt.doctor import examine
+from ghpt.errors import GhptConfigError, GhptDataError
+from ghpt.export import read_reconstruction
+from ghpt.geometry.cameras import Cameras, project
+from ghpt.predict import predict
+from ghpt.prediction.commands import commands_on, setting
+from ghpt.prediction.verdict import Commands, Judge, Level
+from ghpt.skeleton import JOINT, JOINTS
+from predicting import CONF, cameras_file, config, walk
+
+RIG = human36m_rig("S9")
+QUICKLY = ("evaluated_frames=40", "fitted_frames=40", "doctor.frames=24", "doctor.shift=12", "formats=[npz]")
+NAMES = tuple(f"cam_{i:02d}" for i in range(4))
+
+
+@cache
+def pixels(noise: float = 4.0) -> np.ndarray:
+    """The walk as a detector finds it: [T, V, J, 2], with noise in pixels."""
+    exact = project(RIG.cameras, walk()[:160])[0].numpy()
+    return exact + noise * np.random.default_rng(0).standard_normal(exact.shape)
+
+
+def points_file(path: Path, values: np.ndarray, joints: list[int] | None = None) -> Path:
+    """Key points as ghpt's own npz; of these joints alone, the others unseen."""
+    seen = np.isfinite(values).all(-1)
+    if joints is not None:
+        seen &= np.isin(np.arange(values.shape[2]), joints)
+    values = np.where(seen[..., None], values, 0.0)
+    names = NAMES[: values.shape[1]]
+    frame = np.arange(len(values))
+    points = KeyPoints("", names, JOINTS, frame, values, seen.astype(float), seen, 50.0, (0,) * len(names))
+    write_key_points(path, points)
+    return path
+
+
+def rig_file(path: Path, unit_mm: float, write=write_aniposelib) -> Path:
+    """The rig with a translation in this unit, in a format whose writer takes mm and writes metres."""
+    cameras = Cameras(RIG.cameras.K, RIG.cameras.R, RIG.cameras.t * 1000 / unit_mm)
+    write(path, Rig(NAMES, cameras, 0 * RIG.distortion, RIG.size), {})
+    if write is write_aniposelib:  # which writes no such line itself, and says no unit
+        path.write_text(path.read_text().replace("fisheye = false\n", ""))
+    return path
+
+
+def judged(folder: Path, values: np.ndarray, cameras: Path | None = None, *more: str, joints=None) -> dict:
+    """What predict.py makes of these key points."""
+    points = points_file(folder / "points.npz", values, joints)
+    words = [f"keypoints={points}", f"cameras={cameras or cameras_file(folder)}"]
+    return predict(config(*QUICKLY, *words, *more), folder / "out")
+
+
+def codes(numbers: dict) -> list[str]:
+    return [finding["code"] for finding in numbers["verdict"]["findings"]]
+
+
+def late(values: np.ndarray, view: int, by: int) -> np.ndarray:
+    """A view whose frame n + by shows what the others' frame n shows."""
+    moved = values.copy()
+    moved[by:, view] = values[:-by, view]
+    moved[:by, view] = np.nan
+    return moved
+
+
+def half_rate(values: np.ndarray, view: int) -> np.ndarray:
+    """A view that has every second frame, numbered without gaps."""
+    thinned = values.copy()
+    count = (len(values) + 1) // 2
+    thinned[:count, view] = values[::2, view]
+    thinned[count:, view] = np.nan
+    return thinned
+
+
+def test_a_good_recording_is_good(tmp_path):
+    numbers = judged(tmp_path, pixels(), None, "strict=true")
+    assert numbers["verdict"] == {"level": "good", "findings": [], "undecidable": []}
+    assert json.loads((tmp_path / "out" / "prediction.json").read_text())["verdict"] == numbers["verdict"]
+    assert "**good**" in (tmp_path / "out" / "report.md").read_text()
+
+
+@pytest.mark.parametrize(("frames", "views"), [(10, 4), (160, 2)])
+def test_little_to_go_by_is_no_alarm(frames, views, tmp_path):
+    used = ",".join(NAMES[:views])
+    numbers = judged(tmp_path, pixels()[:frames, :views], None, f"views=[{used}]")
+    assert numbers["verdict"]["level"] == "good"
+    assert any("left-out views" in text for text in numbers["verdict"]["undecidable"]) == (views == 2)
+
+
+def test_an_upper_body_is_good_and_measured_by_its_arms(tmp_path):
+    arms = [JOINT[name] for name in JOINTS if not name.endswith(("hip", "knee", "ankle", "pelvis"))]
+    numbers = judged(tmp_path, pixels(2.0), joints=arms)
+    assert numbers["verdict"]["level"] == "good"
+    assert 1650 < numbers["stature_mm"] < 2000
+
+
+@pytest.mark.parametrize("unit_mm", [1.0, 10.0, 1000.0])
+def test_the_person_tells_the_unit_of_a_file_that_does_not_say_it(unit_mm, tmp_path):
+    numbers = judged(tmp_path, pixels(), rig_file(tmp_path / "rig.toml", unit_mm))
+    assert numbers["unit_mm"] == unit_mm
+    assert numbers["verdict"]["level"] == "good"
+    _, parts = read_reconstruction(tmp_path / "out" / "poses.npz")
+    apart = (next(iter(parts)).points.double() - walk()[:160]).norm(dim=-1)
+    assert float(apart.nanmedian()) < 30
+
+
+def test_a_unit_that_fits_nobody_is_asked_for(tmp_path):
+    rig = rig_file(tmp_path / "rig.toml", 237.0)
+    with pytest.raises(GhptDataError, match=r"unit_mm: the file does not say .* unit_mm=2\d\d"):
+        judged(tmp_path, pixels(), rig)
+    assert judged(tmp_path, pixels(), rig, "unit_mm=237")["verdict"]["level"] == "good"
+
+
+def test_a_unit_that_no_limb_tells_is_asked_for(tmp_path):
+    trunk = [JOINT[name] for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "nose", "thorax")]
+    with pytest.raises(GhptDataError, match="of whom no limb is seen"):
+        judged(tmp_path, pixels(), rig_file(tmp_path / "rig.toml", 1000.0), joints=trunk)
+
+
+def test_a_stated_unit_that_makes_a_giant_is_not_to_be_used_and_the_command_mends_it(tmp_path):
+    rig = rig_file(tmp_path / "rig.toml", 1.0, write_pose2sim)
+    assert read_cameras(rig).unit_known
+    numbers = judged(tmp_path, pixels(), rig)
+    assert numbers["verdict"]["level"] == "do not use"
+    (finding,) = numbers["verdict"]["findings"]
+    assert finding["code"] == "size"
+    assert finding["value"] > 1e6
+    words = shlex.split(finding["command"])
+    assert words[:2] == ["python", "predict.py"]
+    assert "unit_mm=1" in words
+    again = predict(config(*QUICKLY, *words[2:]), tmp_path / "again")
+    assert again["verdict"]["level"] == "good"
+
+
+def test_a_view_that_is_late_is_said_with_a_command_and_strict_fails_after_writing(tmp_path):
+    values = late(pixels(), 3, 10)
+    with pytest.raises(GhptDataError, match=r"verdict: .*cam_03 is 10 frames late.* Next: python cameras\.py"):
+        judged(tmp_path, values, None, "strict=true")
+    numbers = json.loads((tmp_path / "out" / "prediction.json").read_text())
+    assert codes(numbers) == ["out_of_sync"]
+    assert (tmp_path / "out" / "poses.npz").exists()
+
+
+def test_most_views_out_of_time_are_not_to_be_used(tmp_path):
+    numbers = judged(tmp_path, late(late(late(pixels(), 1, 12), 2, 25), 3, 40))
+    assert numbers["verdict"]["level"] == "do not use"
+    assert "left_out_error" in codes(numbers)
+
+
+def cameras_settings(points: Path, cameras: Path) -> dict:
+    words = [f"keypoints={points}", f"cameras={cameras}", "output=unused"]
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return plain(hydra.compose("cameras", words))
+
+
+def test_another_frame_rate_is_named_by_both_commands_and_matched_by_time(tmp_path):
+    numbers = judged(tmp_path, half_rate(pixels(), 2))
+    assert codes(numbers) == ["frame_rate"]
+    assert numbers["verdict"]["findings"][0]["value"] == 0.5
+    assert "cam_02" in numbers["verdict"]["findings"][0]["text"]
+    checked = tmp_path / "checked"
+    checked.mkdir()
+    with pytest.raises(GhptDataError, match="cam_02: frame_rate"):
+        examine(cameras_settings(tmp_path / "points.npz", cameras_file(tmp_path)), checked)
+    words = [f"keypoints={checked / 'keypoints.npz'}", f"cameras={checked / 'cameras.toml'}"]
+    assert predict(config(*QUICKLY, *words), tmp_path / "again")["verdict"]["level"] == "good"
+
+
+SIZE = RIG.size.numpy()[:, None]
+SCALES = {"0 and 1": pixels() / SIZE, "-1 and 1": 2 * pixels() / SIZE - 1}
+
+
+@pytest.mark.parametrize("bounds", SCALES)
+def test_normalised_key_points_are_an_error_in_every_command(bounds, tmp_path):
+    points = points_file(tmp_path / "points.npz", SCALES[bounds])
+    cameras = cameras_file(tmp_path)
+    with pytest.raises(GhptDataError, match=f"between {bounds} in an image of 1000 x 100"):
+        judged(tmp_path, SCALES[bounds])
+    with pytest.raises(GhptDataError, match="normalised"):
+        examine(cameras_settings(points, cameras), tmp_path)
+    assert not list((tmp_path / "out").glob("poses.*"))
+
+
+def test_without_an_image_size_twice_the_principal_point_is_one(tmp_path):
+    values = SCALES["0 and 1"]
+    cameras = read_cameras(cameras_file(tmp_path))
+    points = KeyPoints("", NAMES, JOINTS, np.arange(len(values)), values, np.ones(values.shape[:-1]),
+                       np.ones(values.shape[:-1], bool), 50.0, (0,) * 4)  # fmt: skip
+    with pytest.raises(GhptDataError, match="normalised"):
+        look_through(points, type(cameras)(**{**vars(cameras), "size": None}))
+
+
+def test_images_that_are_turned_are_named(tmp_path):
+    wide = Cameras(RIG.cameras.K, RIG.cameras.R, RIG.cameras.t)
+    K = wide.K.clone()
+    K[:, 0, 2] += 600
+    size = RIG.size + torch.tensor([1200, 0])
+    write_pose2sim(tmp_path / "wide.toml", Rig(NAMES, Cameras(K, wide.R, wide.t), 0 * RIG.distortion, size), {})
+    values = (pixels() + np.array([600.0, 0.0]))[..., ::-1]
+    with pytest.raises(GhptDataError, match="turned by 90 degrees"):
+        judged(tmp_path, values, tmp_path / "wide.toml")
+
+
+def judge() -> Judge:
+    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
+        return build(plain(hydra.compose("predict", []))["verdict"], "verdict")
+
+
+def said(height: float | None = 1730.0, error: float = 0.01, rejected: float = 0.0, unit_mm: float = 1000.0):
+    views = dict.fromkeys(NAMES, error)
+    numbers = {"stature_mm": height, "scales": {"all": error, "views": views}, "cameras": list(NAMES),
+               "share": {"rejected": rejected, "observed": 1 - rejected}}  # fmt: skip
+    commands = Commands("cameras", "calibrate", lambda **more: f"predict {more}")
+    return judge()(numbers, None, unit_mm, commands)
+
+
+@pytest.mark.parametrize(
+    ("height", "level"),
+    [(1100.0, Level.GOOD), (2150.0, Level.GOOD), (900.0, Level.LOOK), (2500.0, Level.LOOK), (173.0, Level.DO_NOT_USE),
+     (17300.0, Level.DO_NOT_USE), (1.66e6, Level.DO_NOT_USE), (1.73, Level.DO_NOT_USE), (None, Level.GOOD)],
+)  # fmt: skip
+def test_the_size_of_the_person_decides(height, level):
+    assert said(height).level == level
+
+
+def test_left_out_errors_and_rejected_joints_decide():
+    assert [said(error=error).level for error in (0.02, 0.04, 0.08)] == [Level.GOOD, Level.LOOK, Level.DO_NOT_USE]
+    assert [said(rejected=part).level for part in (0.01, 0.1, 0.5)] == [Level.GOOD, Level.LOOK, Level.DO_NOT_USE]
+
+
+def test_a_unit_is_suggested_in_which_the_person_is_one():
+    assert said(1.66e6).findings[0].command == "predict {'unit_mm': 1.0}"
+    assert [unit_for(height) for height in (1.7, 170.0, 1700.0, 67.0)] == [1000.0, 10.0, 1.0, 25.4]
+    assert 1100 < 4.2 * unit_for(4.2) < 2300
+    assert [unit_of(height) for height in (1.7, 170.0, 1700.0, 17.0)] == [1000.0, 10.0, 1.0, None]
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("views", ["cam01", "54138969", "c 1", 'a"b']), ("match", {"front json": "cam01"}), ("keypoints", "/a b/c,d/(e)"),
+     ("person", 2), ("unit_mm", 25.4), ("cameras", "Calib.toml")],
+)  # fmt: skip
+def test_a_setting_comes_back_through_the_shell_and_hydra(key, value):
+    (word,) = shlex.split(setting(key, value))
+    override = OverridesParser.create().parse_override(word)
+    assert override.key_or_group == key
+    found = override.value()
+    if isinstance(found, list):
+        found = [str(one) for one in found]
+    if isinstance(found, dict):
+        found = {str(name): str(of) for name, of in found.items()}
+    assert (str(found) if isinstance(value, str) else found) == value
+
+
+def test_commands_hold_what_was_given(tmp_path):
+    given = config("keypoints=/my data/pose", "cameras=Calib.toml", "views=[a,b]", "person=1", "skeleton=coco_17")
+    commands = commands_on(given, tmp_path / "out")
+    assert shlex.split(commands.predict(unit_mm=1.0))[2:] == [
+        "keypoints='/my data/pose'", "cameras=Calib.toml", "views=[a,b]", "skeleton=coco_17", "person=1", "unit_mm=1",
+        f"output={tmp_path / 'out'}_again",
+    ]  # fmt: skip
+    assert "person" not in commands.cameras
+    assert "scale.height=1750" in commands.calibrate
+
+
+def test_bad_settings_of_the_judge_are_named():
+    with pytest.raises(GhptConfigError, match="wrong"):
+        Judge(**{**vars(judge()), "wrong": 0.001})
