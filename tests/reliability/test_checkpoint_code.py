@@ -349,6 +349,22 @@ def test_a_configuration_of_another_shape_is_refused(tmp_path: Path, trained: Pa
 
 
 @pytest.mark.parametrize(
+    ("shape", "reason"),
+    [
+        ("a class under a name of nobody", r"model\.another: is no place for a class"),
+        ("registered for another part", r"model\.problem\._target_: .* is no class that a checkpoint may name here"),
+        ("not partial", r"model\.scorer\._partial_: is not True"),
+        ("partial", r"model\.problem\._partial_: is not False"),
+    ],
+)
+def test_a_class_stands_only_in_its_place(tmp_path: Path, trained: Path, shape: str, reason: str) -> None:
+    path = tmp_path / "evil.ckpt"
+    save_with(trained, path, **SHAPES[shape])
+    with pytest.raises(GhptCheckpointError, match=reason):
+        load_model(path)
+
+
+@pytest.mark.parametrize(
     "model",
     [
         b"]" * 50_000 + b"a" * 49_999,

@@ -393,6 +393,7 @@ BAD: dict[str, Bad] = {
     "version 99": ours("format_version", 99),
     "version is text": ours("format_version", "2"),
     "version is true": ours("format_version", True),
+    "version is 2.0": ours("format_version", 2.0),
     "version is a tensor": ours("format_version", torch.tensor(2)),
     "no version": changed(lambda c: c[FIELD].pop("format_version")),
     "no config": changed(lambda c: c[FIELD].pop("config")),
