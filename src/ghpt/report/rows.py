@@ -42,7 +42,8 @@ class RowWriter:
         self.layout = layout | {f"weights_{summary}": ("<f4", ()) for summary in WEIGHTS}
         self.folder.mkdir(parents=True, exist_ok=True)
         for name, (dtype, shape) in (self.layout | {"written": ("|b1", ())}).items():
-            with open(self.folder / name, "ab") as handle:  # a second process finds it at its full size
+            file = self.folder / name
+            with errors_name(file), open(file, "ab") as handle:  # a second process finds it at its full size
                 handle.truncate(count * np.dtype(dtype).itemsize * int(np.prod(shape)))
 
     def check(self, estimates: Mapping[str, Any], weights: Mapping[str, Any]) -> None:
