@@ -17,6 +17,7 @@ from ghpt import predict as prediction
 from ghpt.models.baselines import Linear
 from ghpt.prediction.frames import Frames
 from ghpt.prediction.shards import MANIFEST, Shards
+from ghpt.signals import stop as handler
 from ghpt.signals import stopped_by_signals
 from ghpt.train import train
 from predicting import config, frames_of
@@ -159,12 +160,32 @@ def test_a_stopped_prediction_goes_on_to_the_same_bytes(predict, tmp_path, monke
     assert outputs(tmp_path / "stopped") == outputs(tmp_path / "whole")
 
 
+def test_a_prediction_has_our_handler(predict, monkeypatch):
+    """Lightning's would have several processes wait for each other."""
+    write, handlers = Shards.write, set()
+
+    def noted(*args):
+        handlers.add(signal.getsignal(signal.SIGTERM))
+        write(*args)
+
+    monkeypatch.setattr(Shards, "write", noted)
+    predict("out")
+    assert handlers == {handler}
+
+
 def test_a_stopped_test_leaves_no_rows(tmp_path, monkeypatch):
     train(toys.TRAIN, tmp_path / "model")
     baselines = {"linear": {"_target_": "ghpt.models.baselines.Linear"}}
     settings = toys.TRAIN | {"ckpt": str(tmp_path / "model" / "last.ckpt"), "hypotheses": None, "baselines": baselines}
-    monkeypatch.setattr(Linear, "__call__", lambda self, batch: send("SIGTERM"))
+    handlers = []
+
+    def stopped(self, batch):
+        handlers.append(signal.getsignal(signal.SIGTERM))
+        send("SIGTERM")
+
+    monkeypatch.setattr(Linear, "__call__", stopped)
     with pytest.raises(SystemExit) as stop:
         testing.test(settings, tmp_path / "test")
     assert stop.value.code == 143
+    assert handlers == [handler]  # Lightning's would have several processes wait for each other
     assert not {".predictions", "predictions.npz", "metrics.json"} & set(os.listdir(tmp_path / "test"))

@@ -60,7 +60,7 @@ def rig_file(path: Path, unit_mm: float, write=write_aniposelib) -> Path:
     cameras = Cameras(RIG.cameras.K, RIG.cameras.R, RIG.cameras.t * 1000 / unit_mm)
     write(path, Rig(NAMES, cameras, 0 * RIG.distortion, RIG.size), {})
     if write is write_aniposelib:  # which writes no such line itself, and says no unit
-        path.write_text(path.read_text().replace("fisheye = false\n", ""))
+        path.write_text(path.read_text(encoding="utf-8").replace("fisheye = false\n", ""), encoding="utf-8")
     return path
 
 

@@ -28,8 +28,8 @@ from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.baselines import Baseline
-from ghpt.prediction.frames import MEASURED, frames_of_views
 from ghpt.outputs import Files, check_apart, input_paths
+from ghpt.prediction.frames import MEASURED, frames_of_views
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
 from ghpt.report.calibration import differences, explains, print_calibration, spread

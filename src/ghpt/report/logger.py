@@ -3,13 +3,28 @@
 import functools
 import logging
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from lightning.fabric.loggers import TensorBoardLogger as EventsOnly
 from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.summary.writer import event_file_writer
+
+from ghpt.files import errors_name
 
 _log = logging.getLogger(__name__)
+
+
+class _QuietThread(event_file_writer._AsyncWriterThread):  # type: ignore[misc]
+    """What writes the events. Its failure is raised again at the next event, where it is forgiven and said."""
+
+    def run(self) -> None:
+        with suppress(Exception):
+            super().run()
+
+
+event_file_writer._AsyncWriterThread = _QuietThread
 
 
 def _forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
@@ -35,6 +50,12 @@ class ForgivingTensorBoard(TensorBoardLogger):
     def __init__(self, folder: Path) -> None:
         super().__init__(save_dir=folder, name="", version="", default_hp_metric=False)
         self.failures = 0
+
+    @property
+    def experiment(self) -> Any:
+        """The writer. An event file that cannot even be begun stops the training: its folder is of no use."""
+        with errors_name(Path(self.log_dir)):
+            return super().experiment
 
     log_metrics = _forgiving(TensorBoardLogger.log_metrics)
     log_hyperparams = _forgiving(TensorBoardLogger.log_hyperparams)
