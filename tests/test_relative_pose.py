@@ -109,6 +109,16 @@ def test_points_behind_do_not_count():
         assert result.coverage.item() == 50 / 51
 
 
+def test_a_point_behind_the_true_cameras_does_not_count_though_the_estimate_has_it_in_front():
+    """The estimated baseline points the other way, which changes the sign of every depth."""
+    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(2, 3, 3)
+    R = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
+    t = torch.tensor([[0.0, 0, 0], [-500, 0, 0]], dtype=torch.float64)
+    errors, counted = error_3d(Cameras(K, R, -t), Cameras(K, R, t), POINTS - torch.tensor([0.0, 0.0, 4000.0]))
+    assert not counted.any()
+    assert (errors == 0).all()
+
+
 def test_mean_error_over_uneven_processes():
     turns, truth = rotations(97, 3)[1], rotations(97, 4)[1]
     whole, shares = MeanError(rotation_deg), [MeanError(rotation_deg) for _ in range(2)]

@@ -348,3 +348,11 @@ def test_a_subset_s_point_is_in_front_of_every_camera_of_it():
     assert torch.equal(ok[..., 3], ~subsets[:, :, 3, 0])
     assert ok[..., :3].all()
     assert (found[..., 3, :][~ok[..., 3]] == 0).all()
+
+
+def test_the_smallest_depth_is_over_the_used_views():
+    scene = random_scene(25, frames=2, views=4)
+    depth = project(scene.cameras, scene.points)[1]
+    nearest = depth == depth.amin(1, keepdim=True)
+    result = triangulate(scene.cameras, scene.key_points, (~nearest).double())
+    torch.testing.assert_close(result.depth_min, depth.masked_fill(nearest, torch.inf).amin(1))
