@@ -77,6 +77,19 @@ def test_few_views_are_shrunk_towards_the_recordings_noise():
     torch.testing.assert_close(wide[..., [0, 3, 5]], torch.full_like(wide[..., :3], 9.0), rtol=1e-3, atol=0)
 
 
+@pytest.mark.parametrize("views", [2, 4])
+def test_a_joint_s_own_residuals_count_as_their_degrees_of_freedom(views):
+    scene = random_scene(4, frames=2, views=views).noisy(5, 0)
+    batch = scene.batch()
+    points = Linear()(batch).points
+    own, noise = Quality(noise=0.01, prior=3.0, shared=0.0), 0.01
+    alone = replace(own, prior=1e12)(batch, points, batch.seen).covariance
+    size = person_size(batch.key_points, batch.seen)[..., None]
+    square = (reprojection_error(batch.cameras, batch.key_points, points) / size).square().sum(1)
+    expected = alone / noise**2 * ((3 * noise**2 + square) / (3 + 2 * views - 3))[..., None]
+    torch.testing.assert_close(own(batch, points, batch.seen).covariance, expected, rtol=1e-6, atol=0)
+
+
 @pytest.mark.parametrize(
     ("split", "bands"),
     [("validation", ((0.7, 0.9), (0.95, 1.0), (0.97, 1.0))), ("test", ((0.35, 0.65), (0.75, 0.95), (0.82, 0.98)))],

@@ -55,6 +55,17 @@ def test_every_scale_finds_the_true_length():
         torch.testing.assert_close(scale(many, problem), expected, rtol=1e-6, atol=0)
 
 
+def test_a_joint_that_one_of_two_views_sees_measures_nothing():
+    problem, R, t, scene = batch()
+    length = t.norm(dim=-1)
+    estimate = RelativePoseEstimate(R, t / length[:, None], torch.ones(2, dtype=torch.bool))
+    segments = SegmentLengths({SEGMENTS[0]: float(bones(scene.points)[0])})
+    end = BONES[0][0]
+    problem.seen[:, 0, :15, end] = False
+    problem.key_points[:, 0, :15, end] = 0
+    torch.testing.assert_close(segments(estimate, problem), length, rtol=1e-6, atol=0)
+
+
 def test_what_is_not_estimated_has_no_scale():
     problem, R, t, _ = batch()
     estimate = RelativePoseEstimate(R, t, torch.tensor([True, False]))

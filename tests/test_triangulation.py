@@ -261,7 +261,8 @@ def test_two_cameras_at_one_place_fix_no_point_though_a_third_is_elsewhere():
     R, t = scene.cameras.R.clone(), scene.cameras.t.clone()
     R[:, 1], t[:, 1] = turn @ R[:, 0], t[:, 0] @ turn.mT
     cameras = Cameras(scene.cameras.K, R, t)
-    key_points = project(cameras, scene.points)[0]
+    noise = 5 * torch.randn(scene.key_points.shape, generator=torch.Generator().manual_seed(0))
+    key_points = project(cameras, scene.points)[0] + noise  # without it the two rays are one
     weights = ones(scene)
     weights[:, 2, :9] = 0
     status = triangulate(cameras, key_points, weights).status
