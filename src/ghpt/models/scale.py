@@ -44,6 +44,9 @@ STATURES = (1000.0, 2300.0)
 HUMAN = (600.0, 2800.0)
 """mm: beyond, a measured stature is nobody's: the unit of length is wrong."""
 
+MEASURED_FRAMES = 300
+"""At most so many, evenly spread, give the stature of the person in a recording, in every command."""
+
 LIMBS = ("shank", "thigh", "upper_arm", "forearm")
 """The parts whose ends detectors define alike."""
 
