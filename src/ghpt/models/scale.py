@@ -38,8 +38,8 @@ SEGMENTS = tuple(map(_name, BONES))
 same of the left, lumbar, thorax, neck (to the head's top), head_top_nose, right_clavicle, right_upper_arm,
 right_forearm, and of the left."""
 
-STATURES = (1000.0, 2300.0)
-"""mm: from a child of four years to the tallest; a measured stature beyond is worth a look."""
+STATURES = (900.0, 2300.0)
+"""mm: from a child of four years, whose limbs are short for its height, to the tallest; what is measured beyond is worth a look."""
 
 HUMAN = (600.0, 2800.0)
 """mm: beyond, a measured stature is nobody's: the unit of length is wrong."""
