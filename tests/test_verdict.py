@@ -236,7 +236,7 @@ def said(height: float | None = 1730.0, error: float = 0.01, rejected: float = 0
 
 @pytest.mark.parametrize(
     ("height", "level"),
-    [(1100.0, Level.GOOD), (2150.0, Level.GOOD), (900.0, Level.LOOK), (2500.0, Level.LOOK), (173.0, Level.DO_NOT_USE),
+    [(1100.0, Level.GOOD), (2150.0, Level.GOOD), (850.0, Level.LOOK), (2500.0, Level.LOOK), (173.0, Level.DO_NOT_USE),
      (17300.0, Level.DO_NOT_USE), (1.66e6, Level.DO_NOT_USE), (1.73, Level.DO_NOT_USE), (None, Level.GOOD)],
 )  # fmt: skip
 def test_the_size_of_the_person_decides(height, level):

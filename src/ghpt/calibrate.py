@@ -28,6 +28,7 @@ from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.baselines import Baseline
+from ghpt.models.scale import MEASURED_FRAMES
 from ghpt.outputs import Files, check_apart, input_paths
 from ghpt.prediction.frames import MEASURED, frames_of_views
 from ghpt.provenance import provenance
@@ -109,7 +110,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
 
     def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
         used = torch.nonzero(usable_cameras(estimate))[:, 0].tolist() or placed
-        recording = spread(_through(case, used, rig), config["evaluated_frames"])
+        recording = spread(_through(case, used, rig), MEASURED_FRAMES)
         return triangulate_recording(recording, estimator)
 
     estimate, scale = in_millimetres(estimate, lengths, measure)

@@ -145,7 +145,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
             settings = {"trc": config["trc"], "html": {"scene": scene}, "rerun": {"scene": scene}}
             for name in formats:
                 WRITERS[name].write(output / WRITERS[name].file, about, chunks, **settings.get(name, {}))
-            found = counts(chunks(), about.joints, about.camera_names)
+            found = counts(chunks(), about.joints, about.camera_names, len(frames))
     estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor.rejecting_nothing())}
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
     evaluation = evaluate(frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"])
@@ -155,7 +155,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
         "data": frames.title, "source": frames.source, "cameras": list(frames.camera_names),
         "estimator": chosen.name, "estimator_text": chosen.text, "rate_hz": frames.rate_hz,
         "fill_frames": gaps.longest, "smooth_hz": gaps.cut_off_hz, **found,
-        "stature_mm": own["stature_mm"], "scales": own["scales"], "unit_mm": unit, "evaluation": evaluation,
+        "scales": own["scales"], "unit_mm": unit, "evaluation": evaluation,
         "formats": formats, "provenance": about.provenance,
     }  # fmt: skip
     checkup = check_cameras(frames, doctor) if judge.asks(own["scales"]["views"]) else None

@@ -38,11 +38,14 @@ SEGMENTS = tuple(map(_name, BONES))
 same of the left, lumbar, thorax, neck (to the head's top), head_top_nose, right_clavicle, right_upper_arm,
 right_forearm, and of the left."""
 
-STATURES = (1000.0, 2300.0)
-"""mm: from a child of four years to the tallest; a measured stature beyond is worth a look."""
+STATURES = (900.0, 2300.0)
+"""mm: from a child of four years, whose limbs are short for its height, to the tallest; what is measured beyond is worth a look."""
 
 HUMAN = (600.0, 2800.0)
 """mm: beyond, a measured stature is nobody's: the unit of length is wrong."""
+
+MEASURED_FRAMES = 300
+"""At most so many, evenly spread, give the stature of the person in a recording, in every command."""
 
 LIMBS = ("shank", "thigh", "upper_arm", "forearm")
 """The parts whose ends detectors define alike."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.baselines import person_size
-from ghpt.models.scale import SEGMENTS, stature
+from ghpt.models.scale import MEASURED_FRAMES, SEGMENTS, stature
 from ghpt.models.swaps import Swaps, undo_swaps
 from ghpt.prediction.frames import Frames
 from ghpt.reconstruction import Reconstruction, State
@@ -25,18 +25,29 @@ _LEAST = 20
 """Key points for a median that a verdict may rest on."""
 
 
-def counts(chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: tuple[str, ...]) -> Numbers:
-    """Over all frames: how many, what share of the joints is in each state, and how many views were exchanged."""
+def counts(chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: tuple[str, ...], total: int) -> Numbers:
+    """Over all ``total`` frames: how many, what share of the joints is in each state, how many views were exchanged,
+    and the person's stature (mm; None where no limb is observed)."""
     frames, states = 0, torch.zeros(len(joints), len(State), dtype=torch.int64)
     swapped = torch.zeros(len(cameras), dtype=torch.int64)
+    every = max(1, -(-total // MEASURED_FRAMES))
+    points, observed = [], []
     for chunk in chunks:
+        measured = slice(-frames % every, None, every)
+        points.append(chunk.points[measured].double())
+        observed.append(chunk.state[measured] == State.OBSERVED)
         frames += len(chunk)
         states += torch.stack([(chunk.state == state).sum(0) for state in State], dim=1)
         swapped += chunk.swapped.sum(0)
     share = {state.name.lower(): float(states[:, state].sum()) / max(frames * len(joints), 1) for state in State}
     each = (states[:, State.OBSERVED].double() / max(frames, 1)).tolist()
-    return {"frames": frames, "share": share, "observed": dict(zip(joints, each, strict=True)),
-            "swapped": dict(zip(cameras, swapped.tolist(), strict=True))}  # fmt: skip
+    return {
+        "frames": frames,
+        "share": share,
+        "observed": dict(zip(joints, each, strict=True)),
+        "swapped": dict(zip(cameras, swapped.tolist(), strict=True)),
+        "stature_mm": float(stature(torch.cat(points), torch.cat(observed))) or None,
+    }
 
 
 @torch.no_grad()
@@ -66,7 +77,6 @@ def evaluate(
             "segments": {"median": float(variation[known].median()) if known.any() else None,
                          "each": dict(zip(SEGMENTS, lengths, strict=True))},
             "placed": float(placed.double().mean()),
-            "stature_mm": float(stature(torch.cat([found.points for found in own[name]]), placed)) or None,
             "scales": _scales(parts, error, measured, [e for e, _ in held[name]], [c for _, c in held[name]],
                               frames.camera_names),
         }  # fmt: skip
