@@ -39,7 +39,7 @@ same of the left, lumbar, thorax, neck (to the head's top), head_top_nose, right
 right_forearm, and of the left."""
 
 STATURES = (900.0, 2300.0)
-"""mm: from a child of four years, whose limbs are short for its height, to the tallest; what is
+"""mm: from a child of four years, whose limbs are short for its height, to the tallest. What is
 measured beyond is worth a look."""
 
 HUMAN = (600.0, 2800.0)
