@@ -14,6 +14,7 @@ import ghpt
 import ghpt.test as testing
 import toys
 from ghpt import predict as prediction
+from ghpt import provenance as origin
 from ghpt.models.baselines import Linear
 from ghpt.prediction.frames import Frames
 from ghpt.prediction.shards import MANIFEST, Shards
@@ -189,3 +190,18 @@ def test_a_stopped_test_leaves_no_rows(tmp_path, monkeypatch):
     assert stop.value.code == 143
     assert handlers == [handler]  # Lightning's would have several processes wait for each other
     assert not {".predictions", "predictions.npz", "metrics.json"} & set(os.listdir(tmp_path / "test"))
+
+
+def test_git_is_asked_without_its_lock(monkeypatch):
+    """A command that is stopped kills git, and the lock would stay in the user's repository."""
+    asked = []
+
+    def run(command, **options):
+        asked.append(command)
+        return subprocess.CompletedProcess(command, 0, "abc\n", "")
+
+    monkeypatch.setattr(origin.subprocess, "run", run)
+    origin.provenance(0)
+    statuses = [command for command in asked if "status" in command]
+    assert statuses
+    assert all("--no-optional-locks" in command for command in statuses)

@@ -32,7 +32,10 @@ def commit() -> str:
     try:
         options = {"cwd": folder, "capture_output": True, "text": True, "timeout": 10, "check": True}
         head = subprocess.run(["git", "rev-parse", "HEAD"], **options).stdout.strip()
-        changed = subprocess.run(["git", "status", "--porcelain", "-uno"], **options).stdout.strip()
+        # A command that is stopped here kills git, whose lock would then stay in the user's repository.
+        changed = subprocess.run(
+            ["git", "--no-optional-locks", "status", "--porcelain", "-uno"], **options
+        ).stdout.strip()
     except (OSError, subprocess.SubprocessError):
         return ""
     return head + ("+" if changed else "")
