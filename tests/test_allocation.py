@@ -7,7 +7,7 @@ import pytest
 
 from ghpt.export.stream import part
 from ghpt.files import allocate
-from ghpt.predict import predict, summary
+from ghpt.predict import COMMAND
 from ghpt.prediction import gaps as module
 from ghpt.prediction.gaps import Gaps, after
 from ghpt.prediction.shards import Shards
@@ -135,13 +135,13 @@ def test_a_prediction_that_stops_so_is_one_line_and_goes_on(tmp_path, monkeypatc
     given = [*words(tmp_path, points_file(tmp_path)), *QUICK, "fill=3", "formats=[npz]"]
     with monkeypatch.context() as patch:
         patch.setattr(module, "allocate", full_disk)
-        status, _, errors = typed(CONF, "predict", given, predict, summary)
+        status, _, errors = typed(CONF, COMMAND, given)
     assert status == 1
     last = errors.strip().splitlines()[-1]
     assert last.endswith(f"No space left on device: '{tmp_path / 'out'}'")
     assert "Traceback" not in errors
     assert not list((tmp_path / "out").glob("poses.*"))
-    assert typed(CONF, "predict", given, predict, summary)[0] == 0
+    assert typed(CONF, COMMAND, given)[0] == 0
     assert len(result(tmp_path)[1]) == 40
 
 

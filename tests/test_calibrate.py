@@ -125,22 +125,22 @@ def test_extrinsics_in_the_file_are_compared_with_and_not_used(command, scene, t
     rig, _, _ = scene
     write(tmp_path, scene)
     words = write(tmp_path, scene)
-    status, said, errors = command(*words, "scale.baseline=[cam_00,cam_03,3000]")
+    status, said, errors = command(*words, "scale.baseline=[cam_00,cam_03,8000]")
     assert status == 0, errors
     numbers = json.loads((tmp_path / "rig" / "calibration.json").read_text())
     assert numbers["reference"] == "the file's own calibration"
     assert max(numbers["difference"]["rotation_deg"].values()) < 0.3
     true = float((rig.cameras.centre[0] - rig.cameras.centre[3]).norm())
-    assert numbers["difference"]["scale"] == pytest.approx(true / 3000, rel=0.02)
+    assert numbers["difference"]["scale"] == pytest.approx(true / 8000, rel=0.02)
     centre = np.array([camera["centre_mm"] for camera in numbers["cameras"]])
-    assert np.linalg.norm(centre[0] - centre[3]) == pytest.approx(3000, rel=1e-6)
+    assert np.linalg.norm(centre[0] - centre[3]) == pytest.approx(8000, rel=1e-6)
     ours, own = (numbers["explains"][n]["held_out"] for n in ("estimated", "the file's own calibration"))
     assert ours["count"] == own["count"] > 0
     assert ours["median"] < 1.1 * own["median"]
     # the same key points with no extrinsics in the file: the same rig, but for the world
     other = tmp_path / "other"
     other.mkdir()
-    assert command(*write(other, scene, extrinsics=False), "scale.baseline=[cam_00,cam_03,3000]")[0] == 0
+    assert command(*write(other, scene, extrinsics=False), "scale.baseline=[cam_00,cam_03,8000]")[0] == 0
     apart = rig_difference(*(read_cameras(folder / "rig" / "rig.toml").cameras for folder in (tmp_path, other)))
     assert float(apart.rotation_deg.max()) < 1e-5
     assert float(apart.centre_mm.max()) < 1e-3
@@ -161,7 +161,7 @@ def test_an_assumed_scale_is_said_everywhere(command, scene, tmp_path):
         (["cameras=null"], "cameras: is missing"),
         (["keypoints=nowhere"], "nowhere: : |there is no such file"),
         (["cameras=nowhere.toml"], "there is no such file"),
-        (["scale.height=1750", "scale.baseline=[cam_00,cam_03,3000]"], "scale: has height and baseline"),
+        (["scale.height=1750", "scale.baseline=[cam_00,cam_03,8000]"], "scale: has height and baseline"),
         (["scale.baseline=[cam_00,cam_00,3000]"], "scale.baseline: is"),
         (["scale.baseline=[cam_00,front,3000]"], "Give two of cam_00"),
         (["scale.segments={tail: 30}"], r"scale\.segments: names 'tail', which is no part of the body"),

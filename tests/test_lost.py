@@ -24,7 +24,7 @@ from ghpt.errors import GhptConfigError
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
 from ghpt.reproduction import pool
-from ghpt.train import summary, train
+from ghpt.train import COMMAND
 from toy_cells import cell
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -41,7 +41,7 @@ def training(typed, tmp_path):
     shutil.copytree(ROOT / "conf", tmp_path / "conf")
     (tmp_path / "conf" / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
     words = (*SMALL, f"output={tmp_path / 'run'}")
-    return lambda *more: typed(tmp_path / "conf", "train", [*words, *more], train, summary)
+    return lambda *more: typed(tmp_path / "conf", COMMAND, [*words, *more])
 
 
 def in_step(monkeypatch, number, happens):

@@ -281,7 +281,7 @@ def test_the_commands_take_trust(
     for command in ("test", "predict"):
         module = importlib.import_module(f"ghpt.{command}")
         words = (f"ckpt={path}", "trust=[mine.scorers]", f"output={tmp_path / 'out'}", "progress_bar=false")
-        said = typed(CONF, command, words, getattr(module, command), module.summary)[2]
+        said = typed(CONF, module.COMMAND, words)[2]
         # Its weights are those of another scorer: it has been built.
         assert "does not fit its own model (weights scorer" in said
 

@@ -15,7 +15,9 @@ import ghpt.test as testing
 import toys
 from ghpt import predict as prediction
 from ghpt import provenance as origin
+from ghpt.app import Command
 from ghpt.models.baselines import Linear
+from ghpt.outputs import Files
 from ghpt.prediction.frames import Frames
 from ghpt.prediction.shards import MANIFEST, Shards
 from ghpt.signals import stop as handler
@@ -47,7 +49,7 @@ def test_a_signal_ends_a_command_with_its_status_and_no_word(typed, tmp_path, na
         send(name)
         time.sleep(60)
 
-    status, said, errors = typed(CONF, "cameras", [f"output={tmp_path}"], task, str)
+    status, said, errors = typed(CONF, Command("cameras", task, str, lambda settings: Files()), [f"output={tmp_path}"])
     assert (status, said, errors) == (STATUS[name], "", "")
 
 

@@ -451,6 +451,6 @@ def test_a_command_ends_in_one_line(
     BAD[name](path, (trained / LAST).read_bytes())
     module = importlib.import_module(f"ghpt.{command}")
     words = (f"ckpt={path}", f"output={tmp_path / 'out'}", "progress_bar=false")
-    status, out, said = typed(CONF, command, words, getattr(module, command), module.summary)
+    status, out, said = typed(CONF, module.COMMAND, words)
     assert (status, out) == (1, "")
     assert re.fullmatch(rf"error: {re.escape(str(path))}: .+\n", said)

@@ -17,7 +17,7 @@ from ghpt.models.checkpoint import read_checkpoint
 from ghpt.prediction.shards import MANIFEST, Shards
 from ghpt.report.rows import RowWriter
 from ghpt.reproduction.pool import perform_all
-from ghpt.train import summary, train
+from ghpt.train import COMMAND
 from predicting import frames_of
 from reconstructions import random_reconstruction
 from toy_cells import cell
@@ -62,7 +62,7 @@ def conf(tmp_path_factory):
 @pytest.fixture
 def train_command(typed, conf, tmp_path):
     output = f"output={tmp_path / 'out'}"
-    return lambda *words: typed(conf, "train", [*SMALL, output, *words], train, summary)
+    return lambda *words: typed(conf, COMMAND, [*SMALL, output, "overwrite=true", *words])
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_command(typed, conf, tmp_path, train_command):
     assert train_command(f"output={tmp_path / 'model'}")[0] == 0
     words = ("data=toy", f"ckpt={tmp_path / 'model' / 'last.ckpt'}", f"output={tmp_path / 'out'}")
     quiet = ("progress_bar=false", "trainer.accelerator=cpu")
-    return lambda *more: typed(conf, "test", [*words, *quiet, *more], testing.test, testing.summary)
+    return lambda *more: typed(conf, testing.COMMAND, [*words, *quiet, *more])
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def predict_command(typed, tmp_path, monkeypatch):
     monkeypatch.setattr(prediction, "_from_data", lambda _: frames_of(400))
     words = ("triangulation=linear", "shard_frames=100", "formats=[npz,csv]", "evaluated_frames=4", "data=cmu1")
     quiet = ("progress_bar=false", "trainer.accelerator=cpu", f"output={tmp_path / 'out'}")
-    return lambda *more: typed(ROOT / "conf", "predict", [*words, *quiet, *more], prediction.predict, lambda n: "")
+    return lambda *more: typed(ROOT / "conf", prediction.COMMAND, [*words, *quiet, *more])
 
 
 LIMITS = {"train_command": (12_000,), "test_command": (12_000,), "predict_command": (12_000, 60_000)}
