@@ -107,7 +107,8 @@ def slow(diary):
 def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_path, stop, status):
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent), "OMP_NUM_THREADS": "1"}
+    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
     command = [sys.executable, str(program), str(diary), str(tmp_path / "cells")]
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as run:
         until(lambda: {2, 3} <= set(numbers(diary)), 300)
