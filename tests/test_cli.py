@@ -61,7 +61,7 @@ def test_train_then_test_as_typed(command, tmp_path):
     assert written == [
         ".ghpt/finished.json", ".ghpt/lock", ".ghpt/manifest.json",
         ".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml",
-        "best.ckpt", "events.out.tfevents", "last.ckpt", "train.log",
+        "best.ckpt", "events.out.tfevents", "last.ckpt", "previous.ckpt", "train.log",
     ]  # fmt: skip
     assert re.search(
         r"Validation on embedded \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n", said
