@@ -119,7 +119,8 @@ def test_the_person_tells_the_unit_of_a_file_that_does_not_say_it(unit_mm, tmp_p
     numbers = judged(tmp_path, pixels(), rig_file(tmp_path / "rig.toml", unit_mm))
     assert numbers["unit_mm"] == unit_mm
     assert numbers["verdict"]["level"] == "good"
-    _, parts = read_reconstruction(tmp_path / "out" / "poses.npz")
+    about, parts = read_reconstruction(tmp_path / "out" / "poses.npz")
+    assert about.provenance["camera_unit_mm"] == unit_mm
     apart = (next(iter(parts)).points.double() - walk()[:160]).norm(dim=-1)
     assert float(apart.nanmedian()) < 30
 

@@ -123,12 +123,14 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     frames = in_unit(from_files(config), doctor.consensus) if config["keypoints"] else _from_data(config)
     hertz = None if config["smooth"] is None else float(config["smooth"])
     gaps = Gaps(gap_frames(config["fill"], frames.rate_hz), config["interpolation"], hertz, frames.rate_hz)
+    unit = frames.detected.cameras.unit_mm if frames.detected else 1.0
     origin = provenance(config["seed"])
     about = About(
         name=frames.title, source=frames.source, estimator=chosen.name, joints=JOINTS, camera_names=frames.camera_names,
         rate_hz=frames.rate_hz, smoothed=config["smooth"] is not None,
         provenance=origin | {"estimator": chosen.text, "settings": chosen.identity, "fill_frames": gaps.longest,
-                             "interpolation": gaps.interpolation, "smooth_hz": gaps.cut_off_hz},
+                             "interpolation": gaps.interpolation, "smooth_hz": gaps.cut_off_hz,
+                             "camera_unit_mm": unit},
         origin=tuple(frames.origin.tolist()),
     )  # fmt: skip
     formats = _formats(config, frames)
@@ -150,7 +152,6 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
     evaluation = evaluate(frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"])
     own = evaluation["estimators"][chosen.name]
-    unit = frames.detected.cameras.unit_mm if frames.detected else 1.0
     numbers = {
         "data": frames.title, "source": frames.source, "cameras": list(frames.camera_names),
         "estimator": chosen.name, "estimator_text": chosen.text, "rate_hz": frames.rate_hz,
