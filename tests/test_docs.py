@@ -76,6 +76,8 @@ class Page:
         self.folder, self.typed, self.monkeypatch = documented.workplace(folder), typed, monkeypatch
         self.conf = documented.own_conf(folder)
         self.names: dict[str, Any] = {"detect": documented.detected}
+        self.laid_out: set[str] = set()
+        """Trained models that lie here although the page has not trained them."""
 
     def execute(self, block: Block) -> None:
         """Write the file that the first line names, or run the code."""
@@ -107,6 +109,10 @@ class Page:
         more = SMALL[command.script] + (SMALL_PAIRS if "model=camera" in words else ())
         words += [word for word in more if word.split("=")[0] not in given]
         main, files = MAINS[command.script]
+        output = next((word.split("=")[1].rstrip("/") for word in words if word.startswith("output=")), None)
+        if command.script == "train.py" and output in self.laid_out and "resume=true" not in words:
+            shutil.rmtree(self.folder / output)  # the page's reader has no such folder yet
+            self.laid_out.discard(output)
         if "resume=true" in words:  # what was stopped was begun by the same command
             self.typed(self.conf, main, [word for word in words if word != "resume=true"])
         status, said, errors = self.typed(self.conf, main, words)
@@ -115,7 +121,6 @@ class Page:
             assert (status, spoilt in errors) == (1, True), f"{command.where}\n{said}{errors}"
         else:
             assert status == 0, f"{command.where}\n{said}{errors}"
-        output = next((word.split("=")[1] for word in words if word.startswith("output=")), None)
         if output and "-m" not in words:
             assert {path.name for path in (self.folder / output).iterdir()} >= files, command.where
 
@@ -227,8 +232,10 @@ def lay_out(runner: Page, models: Path) -> None:
             words = ("python", "train.py", f"data={data}", f"model={kind}", f"output={output}")
             runner.run(Command(PAGES[0], 0, words))
             shutil.copytree(runner.folder / output, models / output)
+            runner.laid_out.add(output)
         elif not (runner.folder / output).exists():
             shutil.copytree(models / output, runner.folder / output)
+            runner.laid_out.add(output)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))

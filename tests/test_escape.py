@@ -14,7 +14,7 @@ from ghpt.doctor import _print as print_checkup
 from ghpt.doctor import report as checkup_report
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.scale import SEGMENTS
-from ghpt.prediction.report import prediction_report, print_prediction
+from ghpt.prediction.report import prediction_report, print_prediction, print_verdict
 from ghpt.report.calibration import calibration_report, print_calibration
 from ghpt.report.escape import Markdown, code, code_block, escaped, plain
 from ghpt.report.rig_comparison import Similarity
@@ -76,6 +76,14 @@ def prediction() -> dict:
         "data": BAD, "cameras": [BAD], "estimator": "linear", "estimator_text": BAD, "frames": 3, "smooth_hz": None,
         "share": {"observed": 1.0, "filled": 0.0}, "swapped": {BAD: 2}, "observed": {BAD: 1.0},
         "evaluation": {"frames": 3, "estimators": {"linear": found, "x": found}}, "provenance": PROVENANCE,
+        "stature_mm": 1700.0,
+        "verdict": {
+            "level": "look at this", "undecidable": [BAD],
+            "findings": [
+                {"level": "look at this", "code": "moved", "text": f"{BAD} is off", "value": 0.1, "limit": 0.0,
+                 "command": f"python cameras.py {BAD}"},
+            ],
+        },
     }  # fmt: skip
 
 
@@ -92,14 +100,14 @@ def calibration() -> dict:
 def checkup() -> dict:
     finding = {"code": "x", "text": BAD, "before_px": 2.0, "after_px": 1.0, "mended": True}
     return {
-        "title": BAD, "frames": 3, "stature_mm": 1700.0, "findings": [finding],
+        "title": BAD, "frames": 3, "stature_mm": 1700.0, "unit_mm": None, "findings": [finding],
         "cameras": [{"name": BAD, "error_px": 1.0, "mended_px": 1.0}],
     }  # fmt: skip
 
 
 @pytest.mark.parametrize(
     ("numbers", "report", "times"),
-    [(prediction, prediction_report, 5), (calibration, calibration_report, 6), (checkup, checkup_report, 3)],
+    [(prediction, prediction_report, 8), (calibration, calibration_report, 6), (checkup, checkup_report, 3)],
 )
 def test_a_report_shows_names_as_they_are(numbers, report, times):
     shown = [content for _, content in rendered(report(numbers()))]
@@ -108,7 +116,12 @@ def test_a_report_shows_names_as_they_are(numbers, report, times):
 
 @pytest.mark.parametrize(
     ("numbers", "show", "times"),
-    [(prediction, print_prediction, 4), (calibration, print_calibration, 6), (checkup, print_checkup, 3)],
+    [
+        (prediction, print_prediction, 4),
+        (lambda: prediction()["verdict"], print_verdict, 3),
+        (calibration, print_calibration, 6),
+        (checkup, print_checkup, 3),
+    ],
 )
 def test_the_terminal_shows_names_as_they_are(numbers, show, times, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")

@@ -77,7 +77,7 @@ def print_verdict(verdict: Numbers, console: Console | None = None) -> None:
     """The last words in the terminal."""
     console = console or Console()
     for line in verdict_lines(verdict):
-        console.print(line, highlight=False, soft_wrap=True, markup=False)
+        console.print(plain(line), soft_wrap=True)
 
 
 def prediction_report(numbers: Numbers) -> str:
