@@ -45,7 +45,11 @@ SMALL_PAIRS = ("model.problem.draws=1", "model.problem.frames=20")
 
 LAID_OUT = ("runs/cmu2", "runs/camera")
 """Trained models that every page may start from."""
-PLACEHOLDERS = {"/path/to/human36m": "human36m", "ckpt=...": "ckpt=runs/cmu2/last.ckpt"}
+PLACEHOLDERS = {
+    "/path/to/human36m": "human36m",
+    "ckpt=...": "ckpt=runs/cmu2/last.ckpt",
+    "[cam01,cam02,3000]": "[cam01,cam02,10053]",  # mm between the cameras of the pages' recording
+}
 
 
 class Accepted(Exception):

@@ -5,7 +5,7 @@ from typing import get_type_hints
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from ghpt.calibration.millimetres import check_scale
+from ghpt.calibration.millimetres import read_scale
 from ghpt.config import check_type
 from ghpt.data.chosen import InputSettings
 from ghpt.data.names import chosen_name
@@ -40,9 +40,9 @@ def test_match_takes_such_names_on_both_sides(name):
 @pytest.mark.parametrize("name", STRANGE)
 def test_a_baseline_takes_such_names(name):
     scale = {"height": None, "segments": None, "assumed_height": 1730}
-    check_scale(scale | {"baseline": typed(f"x=[{name},cam,3000]")}, (name, "cam"))
+    read_scale(scale | {"baseline": typed(f"x=[{name},cam,3000]")}, (name, "cam"))
     with pytest.raises(GhptConfigError, match=r"scale\.baseline"):
-        check_scale(scale | {"baseline": typed("x=[5,cam,3000]")}, (name, "cam"))
+        read_scale(scale | {"baseline": typed("x=[5,cam,3000]")}, (name, "cam"))
 
 
 def test_a_leading_zero_of_yaml_is_found_and_an_exact_name_comes_first():

@@ -190,8 +190,9 @@ def test_a_manifest_without_an_entry_is_none(tmp_path, whole, content):
     assert shards(tmp_path).missing() == [0, 1, 2]
 
 
-@pytest.mark.parametrize("number", [-1, 3])
-def test_a_shard_beyond_the_recording_is_none_even_if_it_is_whole(tmp_path, whole, number):
+@pytest.mark.parametrize(("number", "left"), [(-1, True), (3, False)])
+def test_a_shard_beyond_the_recording_is_none_even_if_it_is_whole(tmp_path, whole, number, left):
+    """A file with a name that no shard has is left alone."""
     opened = filled(tmp_path, whole)
     opened.close()
     opened.path(number).write_bytes(opened.path(0).read_bytes())
@@ -200,7 +201,7 @@ def test_a_shard_beyond_the_recording_is_none_even_if_it_is_whole(tmp_path, whol
         handle.write(json.dumps(line) + "\n")
     again = shards(tmp_path)
     assert sorted(again.kept) == [0, 1, 2]
-    assert not again.path(number).exists()
+    assert again.path(number).exists() is left
 
 
 def test_looking_takes_in_only_what_is_whole_and_keeps_what_it_knows(tmp_path, whole):

@@ -22,6 +22,8 @@ from ghpt.errors import GhptConfigError, GhptError
 
 LAUNCHER = "hydra/launcher"
 _LAUNCHERS = ("basic", "submitit_local", "submitit_slurm")
+_PARENT = os.getppid()
+"""The process that started this one, which may be gone by the time that one asks."""
 _PATIENCE = 10.0
 """Seconds that interrupted jobs have to save their state."""
 
@@ -180,7 +182,7 @@ def first_of_several_ends() -> bool:
     """Whether this is one of a training's several processes, but the first, and that one ends too: it says why."""
     if is_first_process():
         return False
-    first, end = os.getppid(), time.monotonic() + _PATIENCE / 2
-    while os.getppid() == first and time.monotonic() < end:
+    end = time.monotonic() + _PATIENCE / 2
+    while os.getppid() == _PARENT and time.monotonic() < end:
         time.sleep(0.05)
-    return os.getppid() != first
+    return os.getppid() != _PARENT

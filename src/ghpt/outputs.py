@@ -19,7 +19,7 @@ from filelock import BaseFileLock
 from hydra.experimental.callback import Callback
 
 from ghpt.errors import GhptConfigError, GhptDataError, GhptError, one_line
-from ghpt.files import acquire, atomic_write, digest, guarded, sweep_temporaries
+from ghpt.files import acquire, digest, guarded, sweep_temporaries, write_json
 
 STATE = ".ghpt"
 """The folder, within the output folder, of the manifest, the lock and the record of a finished run."""
@@ -135,8 +135,7 @@ class OutputFolder:
         """Note that the run with these settings has finished, and what it ``said``."""
         there = [name for name in self._digests if (self.path / name).is_file()]
         record = {"version": _VERSION, "run": self._run(settings), "files": there, "said": said}
-        with atomic_write(self.path / STATE / _FINISHED, "w") as handle:
-            json.dump(record, handle, indent=1, allow_nan=False)
+        write_json(self.path / STATE / _FINISHED, record)
 
     def _run(self, settings: Mapping[str, Any]) -> str:
         """A digest of the settings that matter and of the inputs as they are now."""
@@ -208,8 +207,7 @@ class OutputFolder:
             "files": self._digests,
             "growing": sorted(self._growing),
         }
-        with atomic_write(self.path / STATE / _MANIFEST, "w") as handle:
-            json.dump(content, handle, indent=1)
+        write_json(self.path / STATE / _MANIFEST, content)
 
     def _release(self) -> None:
         if self._lock is not None:
