@@ -114,7 +114,7 @@ class Page:
         words += [word for word in more if word.split("=")[0] not in given]
         main, files = MAINS[command.script]
         output = next((word.split("=")[1].rstrip("/") for word in words if word.startswith("output=")), None)
-        if command.script == "train.py" and output in self.laid_out and "resume=true" not in words:
+        if command.script == "train.py" and output in self.laid_out:
             shutil.rmtree(self.folder / output)  # the page's reader has no such folder yet
             self.laid_out.discard(output)
         if "resume=true" in words:  # what was stopped was begun by the same command
