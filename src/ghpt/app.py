@@ -19,7 +19,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ghpt.config import plain
-from ghpt.errors import GhptConfigError, GhptError, one_line
+from ghpt.errors import GhptConfigError, GhptError, one_line, out_of_memory
 from ghpt.files import atomic_write
 from ghpt.jobs import (
     Job,
@@ -30,7 +30,6 @@ from ghpt.jobs import (
     own_command,
     take_signals,
 )
-from ghpt.lost import out_of_memory
 from ghpt.outputs import Files, OutputFolder, SweepFolder
 from ghpt.overrides import check_overrides
 from ghpt.signals import stopped_by_signals

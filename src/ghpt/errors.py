@@ -1,6 +1,9 @@
 """The errors that a user can cause and mend. Each names where, what is wrong and the mend."""
 
+import re
 from typing import Any
+
+_NO_MEMORY = re.compile(r"can't allocate memory|out of memory")
 
 
 class GhptError(ValueError):
@@ -48,6 +51,16 @@ class GhptCheckpointError(GhptError):
 def one_line(error: BaseException) -> str:
     """An error's text without its line breaks."""
     return " ".join(str(error).split())
+
+
+def out_of_memory(error: Exception) -> GhptConfigError | None:
+    """The error in words, if it is that there was no more memory."""
+    torch_s = isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))
+    if not (isinstance(error, MemoryError) or torch_s):
+        return None
+    lines = str(error).splitlines() or ["an allocation failed"]
+    mend = "Give smaller batches or fewer hypotheses, or close other programs."
+    return GhptConfigError("memory", f"there is not enough ({lines[0][:200].rstrip('.')})", mend)
 
 
 def check(condition: bool, key: str, problem: str, mend: str) -> None:

@@ -22,7 +22,6 @@ _WAIT = 5.0
 """Seconds in which a process that others wait for is seen to have ended."""
 _DEAD_WORKER = re.compile(r"DataLoader worker \(pid")
 _DEAD_PEER = re.compile(r"gloo|NCCL|[Cc]onnection (closed|reset) by peer")
-_NO_MEMORY = re.compile(r"can't allocate memory|out of memory")
 _WHY = "the system does so where memory is short"
 
 
@@ -62,16 +61,6 @@ def told(trainer: L.Trainer) -> Iterator[None]:
             if lost is None:
                 raise
             raise lost from error
-
-
-def out_of_memory(error: Exception) -> GhptConfigError | None:
-    """The error in words, if it is that there was no more memory."""
-    torch_s = isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))
-    if not (isinstance(error, MemoryError) or torch_s):
-        return None
-    lines = str(error).splitlines() or ["an allocation failed"]
-    mend = "Give smaller batches or fewer hypotheses, or close other programs."
-    return GhptConfigError("memory", f"there is not enough ({lines[0][:200].rstrip('.')})", mend)
 
 
 def _lost(trainer: L.Trainer, text: str) -> GhptConfigError | None:
