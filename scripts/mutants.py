@@ -56,7 +56,8 @@ TESTS = {
     ],
     "src/ghpt/prediction/shards.py": ["test_shards.py"],
     "src/ghpt/prediction/gaps.py": ["test_gaps.py"],
-    "src/ghpt/files.py": ["test_files.py"],
+    "src/ghpt/files.py": ["test_files.py", "test_outputs.py"],
+    "src/ghpt/outputs.py": ["test_outputs.py"],
     "src/ghpt/data/openpose.py": ["test_openpose.py"],
 }
 """What may be mutated, and for each file the tests that must notice it."""
