@@ -144,6 +144,16 @@ def test_a_launcher_that_is_not_there(typed, monkeypatch, tmp_path, launcher, in
     assert said.startswith(f"error: hydra/launcher: {message}")
 
 
+@pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK"])
+def test_one_process_of_a_run_writes_its_files(monkeypatch, name):
+    monkeypatch.delenv(name, raising=False)
+    assert ghpt.jobs.is_first_process()
+    monkeypatch.setenv(name, "0")
+    assert ghpt.jobs.is_first_process()
+    monkeypatch.setenv(name, "1")
+    assert not ghpt.jobs.is_first_process()
+
+
 def test_slurm_s_settings_compose_where_there_is_no_slurm(typed):
     settings = {"partition": "gpu", "gpus_per_node": 1, "timeout_min": 120, "cpus_per_task": 4}
     words = ["hydra/launcher=submitit_slurm", *(f"hydra.launcher.{k}={v}" for k, v in settings.items()), "--cfg=hydra"]

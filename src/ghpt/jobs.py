@@ -24,6 +24,8 @@ LAUNCHER = "hydra/launcher"
 _LAUNCHERS = ("basic", "submitit_local", "submitit_slurm")
 _PARENT = os.getppid()
 """The process that started this one, which may be gone by the time that one asks."""
+_RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK")
+"""The variables by which launchers number a run's processes, as Lightning reads them."""
 _PATIENCE = 10.0
 """Seconds that interrupted jobs have to save their state."""
 
@@ -174,13 +176,13 @@ def own_command(script: str, added: Sequence[str] = ()) -> Iterator[None]:
 
 
 def is_first_process() -> bool:
-    """Whether this is not one of the further processes that Lightning starts for a training."""
-    return os.environ.get("LOCAL_RANK", "0") == "0" and os.environ.get("NODE_RANK", "0") == "0"
+    """Whether this is the process of a run that writes its files: the only one, or the first of several."""
+    return all(os.environ.get(name, "0") == "0" for name in _RANKS)
 
 
 def first_of_several_ends() -> bool:
     """Whether this is one of a training's several processes, but the first, and that one ends too: it says why."""
-    if is_first_process():
+    if os.environ.get("LOCAL_RANK", "0") == "0":
         return False
     end = time.monotonic() + _PATIENCE / 2
     while os.getppid() == _PARENT and time.monotonic() < end:
