@@ -20,7 +20,8 @@ from ghpt.prediction.frames import Frames, Seen
 from ghpt.skeleton import JOINTS
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-QUICK = ("trainer.accelerator=cpu", "progress_bar=false", "evaluated_frames=4")
+QUICK = ("trainer.accelerator=cpu", "progress_bar=false", "evaluated_frames=4", "verdict.clean=1.0")
+"""The camera check, which takes seconds, is not asked: tests/test_verdict.py asks it."""
 
 
 def config(*words: str) -> dict:

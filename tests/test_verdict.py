@@ -31,7 +31,14 @@ from ghpt.skeleton import JOINT, JOINTS
 from predicting import CONF, cameras_file, config, walk
 
 RIG = human36m_rig("S9")
-QUICKLY = ("evaluated_frames=40", "fitted_frames=40", "doctor.frames=24", "doctor.shift=12", "formats=[npz]")
+QUICKLY = (
+    "verdict.clean=0.004",
+    "evaluated_frames=40",
+    "fitted_frames=40",
+    "doctor.frames=24",
+    "doctor.shift=12",
+    "formats=[npz]",
+)
 NAMES = tuple(f"cam_{i:02d}" for i in range(4))
 
 
