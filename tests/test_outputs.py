@@ -14,7 +14,7 @@ import yaml
 import ghpt.calibrate
 import ghpt.doctor
 import ghpt.test as testing
-from ghpt import predict, train
+from ghpt import files, predict, train
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.files import atomic_write, remove
 from ghpt.outputs import STATE, Files, OutputFolder, check_apart, input_paths, stamp
@@ -81,6 +81,14 @@ def test_a_file_that_appears_meanwhile_is_neither_replaced_nor_removed(tmp_path)
             assert (tmp_path / name).read_text() == "mine"
         remove(tmp_path / "absent.txt")
     assert sorted(path.name for path in tmp_path.iterdir()) == [STATE, "a.txt", "not_announced.txt"]
+
+
+def test_what_a_writer_that_died_left_is_swept(tmp_path):
+    nobody = 2**22  # Linux has no process of this number
+    left = tmp_path / f".a.txt.{files._HOST}-{nobody}-0123abcd.tmp"
+    left.write_text("half")
+    with OutputFolder(tmp_path, WRITES):
+        assert not left.exists()
 
 
 def test_overwrite_insists_but_never_on_an_input(tmp_path):
