@@ -71,6 +71,7 @@ def test_an_ignored_signal_stays_ignored(name):
     try:
         with stopped_by_signals():
             send(name)
+            assert signal.getsignal(getattr(signal, name)) is signal.SIG_IGN
     finally:
         signal.signal(getattr(signal, name), before)
 
