@@ -17,9 +17,11 @@ import lightning as L
 import pytest
 import torch
 import yaml
+from torch.utils.data import get_worker_info
 
 import toys
 from ghpt import lost
+from ghpt.data.frames import Frames
 from ghpt.errors import GhptConfigError
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
@@ -56,26 +58,49 @@ def in_step(monkeypatch, number, happens):
     monkeypatch.setattr(StochasticEstimator, "training_step", step)
 
 
-def kill_a_worker():
-    multiprocessing.active_children()[0].kill()
+@pytest.fixture
+def forks():
+    """Processes that load data start as copies of this one, with what a test has changed in it."""
+    before = multiprocessing.get_start_method()
+    multiprocessing.set_start_method("fork", force=True)
+    yield
+    multiprocessing.set_start_method(before, force=True)
 
 
-def no_memory():
+def kill_the_next_worker(patch):
+    """The worker of the next epoch, a fork of this process, kills itself before it loads anything.
+
+    A worker that is killed from outside may have loaded all that the epoch still needs: the run
+    then rightly goes on.
+    """
+    original = Frames.__getitem__
+
+    def kill_a_worker(self, samples):
+        if get_worker_info() is not None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return original(self, samples)
+
+    patch.setattr(Frames, "__getitem__", kill_a_worker)
+
+
+def no_memory(_):
     raise MemoryError
 
 
-def no_memory_in_torch():
+def no_memory_in_torch(_):
     torch.empty(1 << 60, dtype=torch.uint8)
 
 
 @pytest.mark.parametrize(("happens", "says"), [
-    (kill_a_worker, "error: data.workers: a process that loads batches was killed"),
+    (kill_the_next_worker, "error: data.workers: a process that loads batches was killed"),
     (no_memory, "error: memory: there is not enough (an allocation failed). Give smaller batches"),
     (no_memory_in_torch, "error: memory: there is not enough ("),
 ])  # fmt: skip
-def test_what_is_lost_in_a_step_is_named_in_a_line_and_the_run_goes_on(training, monkeypatch, tmp_path, happens, says):
+def test_what_is_lost_in_a_step_is_named_in_a_line_and_the_run_goes_on(
+    training, monkeypatch, forks, tmp_path, happens, says
+):
     with monkeypatch.context() as patch:
-        in_step(patch, 7, happens)
+        in_step(patch, 7, lambda: happens(patch))
         status, _, said = training("data.workers=1")
     *_, stopped, how, error = said.splitlines()
     assert "Traceback" not in said
