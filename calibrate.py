@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from ghpt.app import run
-from ghpt.calibrate import COMMAND
+from ghpt.commands.app import run
+from ghpt.commands.calibrate import COMMAND
 
 if __name__ == "__main__":
     run(Path(__file__).parent / "conf", COMMAND)

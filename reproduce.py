@@ -3,8 +3,8 @@
 import sys
 from pathlib import Path
 
-from ghpt.app import run
-from ghpt.reproduce import command, spread
+from ghpt.commands.app import run
+from ghpt.commands.reproduce import command, spread
 
 CONF = Path(__file__).parent / "conf"
 

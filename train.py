@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from ghpt.app import run
-from ghpt.train import COMMAND
+from ghpt.commands.app import run
+from ghpt.commands.train import COMMAND
 
 if __name__ == "__main__":
     run(Path(__file__).parent / "conf", COMMAND)

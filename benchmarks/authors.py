@@ -23,7 +23,7 @@ import scene
 import torch
 from measure import configuration, machine, settings, show
 
-from ghpt.train import train
+from ghpt.commands.train import train
 
 HYPOTHESES = 200
 

@@ -47,7 +47,7 @@ def test_scene(checkpoint: str, folder: str, frames: int, hypotheses: int) -> No
     import scene
     from measure import configuration
 
-    from ghpt.test import test
+    from ghpt.commands.test import test
 
     config = configuration("test", "progress_bar=false", f"ckpt={checkpoint}", f"hypotheses={hypotheses}")
     lengths = {"train": 16, "validation": 16, "test": frames}

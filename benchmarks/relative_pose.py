@@ -20,8 +20,8 @@ from measure import configuration, machine, settings, show
 
 from ghpt import randomness
 from ghpt.config import build
-from ghpt.data.pairs import Pairs, PairSettings
-from ghpt.models.pair_baselines import Robust, size_in_image
+from ghpt.data.datasets.pairs import Pairs, PairSettings
+from ghpt.models.relative_pose.baselines import Robust, size_in_image
 from ghpt.recording import PairBatch
 
 THEIRS = ("usac_accurate", "poselib")

@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ghpt.data.datamodule import KeyPointDataModule
+from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.recording import Recording
 

@@ -19,8 +19,8 @@ import scene
 import torch
 from measure import configuration, machine, settings, show
 
+from ghpt.commands.train import train
 from ghpt.models.module import StochasticEstimator
-from ghpt.train import train
 
 
 class TimedEstimator(StochasticEstimator):

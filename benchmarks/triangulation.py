@@ -23,11 +23,11 @@ from torch import Tensor
 
 from ghpt import randomness
 from ghpt.config import build
-from ghpt.data.frames import Frames
+from ghpt.data.datasets.frames import Frames
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.baselines import person_size
-from ghpt.models.lo_ransac import pycolmap_cameras
+from ghpt.models.estimators.classical import person_size
+from ghpt.models.estimators.lo_ransac import pycolmap_cameras
 from ghpt.recording import KeyPointBatch
 
 HYPOTHESES = 200

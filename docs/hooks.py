@@ -32,10 +32,13 @@ def on_page_content(html: str, **_: Any) -> str:
 
 
 def _entries(package: str) -> Iterator[str]:
-    """One ``:::`` for the package, where it says something, and each public module in it."""
-    folder = ROOT / "src" / package.replace(".", "/")
-    for path in sorted(folder.glob("*.py"), key=lambda path: (path.stem != "__init__", path.stem)):
+    """One ``:::`` for each package within, where it says something, and for each public module."""
+    source = ROOT / "src"
+    folder = source / package.replace(".", "/")
+    paths = folder.glob("*.py") if package == "ghpt" else folder.rglob("*.py")
+    for path in sorted(paths, key=lambda path: (path.parent, path.stem != "__init__", path.stem)):
+        name = ".".join(path.relative_to(source).with_suffix("").parts)
         if path.stem == "__init__" and path.read_text(encoding="utf-8").strip():
-            yield f"::: {package}"
+            yield f"::: {name.removesuffix('.__init__')}"
         elif not path.stem.startswith("_"):
-            yield f"::: {package}.{path.stem}"
+            yield f"::: {name}"

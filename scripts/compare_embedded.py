@@ -22,11 +22,11 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
-from ghpt.data import lens
-from ghpt.data.detector import Detector
-from ghpt.data.embedded import embedded_recordings, takes
+from ghpt.data.synthetic.detector import Detector
+from ghpt.data.synthetic.recordings import embedded_recordings, takes
+from ghpt.geometry import lens
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.models.baselines import MEstimator
+from ghpt.models.estimators.classical import MEstimator
 from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 
@@ -39,7 +39,7 @@ COMMON = (
 COCO = (0, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16)
 MEDIAPIPE = (0, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
 UPPER_ARM = 0.172
-"""In statures, as in ghpt.data.body."""
+"""In statures, as in ghpt.data.synthetic.body."""
 
 
 @dataclass(frozen=True)

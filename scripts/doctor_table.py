@@ -16,15 +16,15 @@ from pathlib import Path
 import hydra
 import torch
 
-from ghpt.checkup.breakages import BREAKAGES, Case
-from ghpt.checkup.evidence import gather
-from ghpt.checkup.examination import Doctor
-from ghpt.checkup.setup import as_filed
+from ghpt.calibration.check.breakages import BREAKAGES, Case
+from ghpt.calibration.check.evidence import gather
+from ghpt.calibration.check.examination import Doctor
+from ghpt.calibration.check.setup import as_filed
+from ghpt.commands.cameras import from_recording
 from ghpt.config import build, plain
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.key_points import read_key_points
-from ghpt.data.store import prepared
-from ghpt.doctor import from_recording
+from ghpt.data.datasets.store import prepared
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.key_points import read_key_points
 from ghpt.report.tables import markdown
 
 ROOT = Path(__file__).resolve().parents[1]

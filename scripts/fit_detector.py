@@ -25,15 +25,15 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import least_squares
 
-from ghpt.data.detector import Detector, Processes
-from ghpt.data.embedded import Take, takes
-from ghpt.data.processes import generator
-from ghpt.data.rigs import ARRANGEMENTS
+from ghpt.data.synthetic.detector import Detector, Processes
+from ghpt.data.synthetic.random_processes import generator
+from ghpt.data.synthetic.recordings import Take, takes
+from ghpt.data.synthetic.rigs import ARRANGEMENTS
 from ghpt.files import atomic_write
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.ransac import Ransac
+from ghpt.models.estimators.ransac import Ransac
 from ghpt.randomness import key
 from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import PELVIS

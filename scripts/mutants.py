@@ -47,18 +47,18 @@ TESTS = {
     "src/ghpt/metrics/pose_prior.py": ["test_pose_prior.py"],
     "src/ghpt/metrics/relative_pose.py": ["test_relative_pose.py"],
     "src/ghpt/models/loss.py": ["test_loss.py"],
-    "src/ghpt/models/quality.py": ["test_quality.py"],
-    "src/ghpt/models/scale.py": ["test_scale.py"],
+    "src/ghpt/models/estimators/uncertainty.py": ["test_quality.py"],
+    "src/ghpt/models/relative_pose/scale.py": ["test_scale.py"],
     "src/ghpt/models/selection.py": ["test_selection.py"],
     "src/ghpt/calibration/observations.py": [
         "test_calibration.py::test_frames_cover_time_and_place",
         "test_calibration.py::test_noise_of_views_and_joints_is_found",
     ],
-    "src/ghpt/prediction/shards.py": ["test_shards.py"],
-    "src/ghpt/prediction/gaps.py": ["test_gaps.py"],
+    "src/ghpt/commands/prediction/shards.py": ["test_shards.py"],
+    "src/ghpt/commands/prediction/gaps.py": ["test_gaps.py"],
     "src/ghpt/files.py": ["test_files.py", "test_outputs.py"],
-    "src/ghpt/outputs.py": ["test_outputs.py"],
-    "src/ghpt/data/openpose.py": ["test_openpose.py"],
+    "src/ghpt/commands/outputs.py": ["test_outputs.py"],
+    "src/ghpt/data/formats/openpose.py": ["test_openpose.py"],
 }
 """What may be mutated, and for each file the tests that must notice it."""
 

@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import yaml
 
-from ghpt.data.detector import Detector
-from ghpt.data.rigs import Rig, panoptic_rig
+from ghpt.data.synthetic.detector import Detector
+from ghpt.data.synthetic.rigs import Rig, panoptic_rig
 from ghpt.files import atomic_folder
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -19,11 +19,11 @@ import hydra
 import numpy as np
 import torch
 
+from ghpt.commands.predict import predict
+from ghpt.commands.prediction.report import comparison_rows
 from ghpt.config import plain
-from ghpt.data.skeletons import SKELETONS
+from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.export import read_reconstruction
-from ghpt.predict import predict
-from ghpt.prediction.report import comparison_rows
 from ghpt.report.tables import markdown
 from ghpt.skeleton import JOINT
 

@@ -15,9 +15,9 @@ from rich.table import Table
 
 from ghpt.config import build, plain
 from ghpt.metrics.pose_error import joint_errors
-from ghpt.models.baselines import MEstimator, WeightedLinear
-from ghpt.models.lo_ransac import LoRansac
-from ghpt.models.ransac import Ransac
+from ghpt.models.estimators.classical import MEstimator, WeightedLinear
+from ghpt.models.estimators.lo_ransac import LoRansac
+from ghpt.models.estimators.ransac import Ransac
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 GRID = (0.005, 0.0075, 0.01, 0.015, 0.02, 0.03, 0.04, 0.06)

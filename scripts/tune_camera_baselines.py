@@ -17,10 +17,10 @@ from rich.table import Table
 from torch import Tensor
 
 from ghpt.config import build, plain
-from ghpt.data.pairs import Pairs, PairSettings
+from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.relative_pose import error_3d
-from ghpt.models.pair_baselines import EightPoint, PairBaseline, PoseLib, Ransac, Usac
+from ghpt.models.relative_pose.baselines import EightPoint, PairBaseline, PoseLib, Ransac, Usac
 from ghpt.recording import PairBatch, RelativePoseEstimate
 
 CONF = Path(__file__).resolve().parents[1] / "conf"

@@ -20,11 +20,11 @@ from rich.table import Column, Table
 
 from ghpt.config import build, plain
 from ghpt.metrics.pose_error import joint_errors
-from ghpt.models.baselines import Linear
 from ghpt.models.checkpoint import load_model
-from ghpt.models.ransac import AdaptiveRansac
-from ghpt.models.view_weights import ViewWeights
-from ghpt.reproduction.perturbation import MissingDetections, Noise, Outliers, RotatedCameras, ShiftedCameras
+from ghpt.models.estimators.classical import Linear
+from ghpt.models.estimators.ransac import AdaptiveRansac
+from ghpt.models.estimators.view_weights import ViewWeights
+from ghpt.paper.robustness.perturbation import MissingDetections, Noise, Outliers, RotatedCameras, ShiftedCameras
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STRIDES = {"h36m": 256, "cmu3": 512}

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from ghpt.app import Command, run
+from ghpt.commands.app import Command, run
 
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if WORKER:  # each of several test processes has its own core, and so have the commands that it runs

@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ghpt.data.camera_writers import write_opencv, write_pose2sim
-from ghpt.data.key_points import KeyPoints, write_key_points
-from ghpt.data.rigs import Rig, human36m_rig
-from ghpt.data.skeletons import SKELETONS
+from ghpt.data.formats.camera_writers import write_opencv, write_pose2sim
+from ghpt.data.formats.key_points import KeyPoints, write_key_points
+from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.synthetic.rigs import Rig, human36m_rig
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import walk, write_people

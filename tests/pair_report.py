@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ghpt.data.pairs import RigOfSplit
+from ghpt.data.datasets.pairs import RigOfSplit
 from ghpt.geometry.cameras import Cameras
+from ghpt.models.relative_pose.predictions import PairPredictions, PairWriter, open_pairs
+from ghpt.models.rows import WEIGHTS
 from ghpt.recording import RelativePoseEstimate
-from ghpt.report.pair_predictions import PairPredictions, PairWriter, open_pairs
-from ghpt.report.rows import WEIGHTS
 from scenes import look_at
 
 META = {

@@ -11,12 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ghpt.commands.prediction.frames import Frames, Seen
 from ghpt.config import plain
-from ghpt.data.camera_writers import write_pose2sim
-from ghpt.data.embedded import motion
-from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.data.formats.camera_writers import write_pose2sim
+from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.rigs import Rig, human36m_rig
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.prediction.frames import Frames, Seen
 from ghpt.skeleton import JOINTS
 
 CONF = Path(__file__).resolve().parents[1] / "conf"

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ghpt.data.labels import LABELS_FILE
-from ghpt.data.lens import distort
-from ghpt.data.panoptic import COCO19, joints17
-from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.data.datasets.labels import LABELS_FILE
+from ghpt.data.datasets.panoptic import COCO19, joints17
+from ghpt.data.synthetic.rigs import Rig, human36m_rig
 from ghpt.geometry.cameras import project
+from ghpt.geometry.lens import distort
 
 Detect = Callable[[Rig, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """(rig, poses [T 17 3] mm) -> ideal pixels [T V 17 2], confidence [T V 17], seen [T V 17]."""

@@ -13,10 +13,10 @@ from torch import Tensor
 
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.config import build
-from ghpt.data.embedded import motion
-from ghpt.data.rigs import Rig, human36m_rig, panoptic_rig
+from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.rigs import Rig, human36m_rig, panoptic_rig
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.models.baselines import person_size
+from ghpt.models.estimators.classical import person_size
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 

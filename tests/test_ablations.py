@@ -7,16 +7,16 @@ from typing import Any
 import pytest
 import torch
 
+from ghpt.commands.train import train
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import load_model
-from ghpt.reproduction.ablation_work import evaluate
-from ghpt.reproduction.ablations import ITEMS
-from ghpt.reproduction.cells import read_json
-from ghpt.reproduction.item import Results, Section
-from ghpt.reproduction.setup import Setup
-from ghpt.train import train
+from ghpt.paper.ablations.tables import ITEMS
+from ghpt.paper.ablations.work import evaluate
+from ghpt.paper.engine.cells import read_json
+from ghpt.paper.engine.item import Results, Section
+from ghpt.paper.engine.setup import Setup
 from toys import DATA, TRAIN
 
 CONF = Path(__file__).resolve().parents[1] / "conf"

@@ -5,13 +5,13 @@ import os
 
 import pytest
 
+from ghpt.commands.predict import COMMAND
+from ghpt.commands.prediction import gaps as module
+from ghpt.commands.prediction.gaps import Gaps, after
+from ghpt.commands.prediction.shards import Shards
 from ghpt.export.stream import part
 from ghpt.files import allocate
-from ghpt.predict import COMMAND
-from ghpt.prediction import gaps as module
-from ghpt.prediction.gaps import Gaps, after
-from ghpt.prediction.shards import Shards
-from ghpt.report.rows import RowWriter
+from ghpt.models.rows import RowWriter
 from predicting import CONF, QUICK
 from reconstructions import random_reconstruction
 from test_predict import points_file, result, words

@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 import yaml
 
-from ghpt.data.association import associate
-from ghpt.data.camera_files import CameraFile
-from ghpt.data.detector import Detector
-from ghpt.data.embedded import motion
-from ghpt.data.key_points import read_people
-from ghpt.data.people import KeyPoints, People, everyone
-from ghpt.data.rigs import Rig, human36m_rig
-from ghpt.data.skeletons import SKELETONS
-from ghpt.data.tracks import tracks
-from ghpt.data.views import look_through, who
+from ghpt.data.formats.camera_files import CameraFile
+from ghpt.data.formats.key_points import read_people
+from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.people.association import associate
+from ghpt.data.people.people import KeyPoints, People, everyone
+from ghpt.data.people.tracks import tracks
+from ghpt.data.people.views import look_through, who
+from ghpt.data.synthetic.detector import Detector
+from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.rigs import Rig, human36m_rig
 from ghpt.errors import GhptDataError
 
 FRAMES = 240
@@ -164,7 +164,7 @@ def test_who_was_seen_beside_another_is_not_that_one():
 
 def test_the_real_recording_keeps_its_person(shared_data):
     """Two or three people in two views, of whom one is in all: every frame of every view is that one's."""
-    from ghpt.data.camera_files import read_cameras
+    from ghpt.data.formats.camera_files import read_cameras
 
     folder = shared_data / "pose2sim_single"
     people = read_people(folder / "pose")

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from ghpt.data.key_points import read_key_points
-from ghpt.data.skeletons import SKELETONS
+from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
 
 RNG = np.random.default_rng(0)

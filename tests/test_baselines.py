@@ -6,9 +6,9 @@ import torch
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import Status
-from ghpt.models.baselines import Linear, MEstimator, WeightedLinear, person_size
-from ghpt.models.lo_ransac import LoRansac
-from ghpt.models.ransac import AdaptiveRansac, Ransac
+from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_size
+from ghpt.models.estimators.lo_ransac import LoRansac
+from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
 from ghpt.recording import KeyPointBatch
 from scenes import random_scene
 

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ghpt.data.body import CAPSULES, SEGMENT, SEGMENTS, Body, pose, random_body
+from ghpt.data.synthetic.body import CAPSULES, SEGMENT, SEGMENTS, Body, pose, random_body
 from ghpt.skeleton import BONES, JOINT, MIRROR
 
 PARENT = {"knee": "hip", "ankle": "knee", "elbow": "shoulder", "wrist": "elbow"}

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.calibrate import COMMAND, people_note
 from ghpt.calibration.diagnosis import Diagnosis
+from ghpt.commands.calibrate import COMMAND, people_note
+from ghpt.commands.cameras import examine
+from ghpt.commands.predict import predict
 from ghpt.config import plain
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.camera_writers import write_pose2sim
-from ghpt.data.embedded import motion
-from ghpt.data.key_points import KeyPoints, write_key_points
-from ghpt.data.lens import distort
-from ghpt.data.rigs import human36m_rig
-from ghpt.doctor import examine
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.camera_writers import write_pose2sim
+from ghpt.data.formats.key_points import KeyPoints, write_key_points
+from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.predict import predict
+from ghpt.geometry.lens import distort
 from ghpt.report.rig_comparison import rig_difference
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import config

@@ -11,9 +11,9 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from damage import damage
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
-from ghpt.data.rigs import Rig, human36m_rig, panoptic_rig
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
+from ghpt.data.synthetic.rigs import Rig, human36m_rig, panoptic_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 

@@ -8,10 +8,10 @@ import pytest
 
 import real_layout as layout
 from ghpt.files import write_json
-from ghpt.reproduction.camera_tables import ITEMS
-from ghpt.reproduction.cells import Cell, perform, read_json, with_needs
-from ghpt.reproduction.item import Item, Results, Section
-from ghpt.reproduction.setup import Setup
+from ghpt.paper.camera.tables import ITEMS
+from ghpt.paper.engine.cells import Cell, perform, read_json, with_needs
+from ghpt.paper.engine.item import Item, Results, Section
+from ghpt.paper.engine.setup import Setup
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SIZES = {
@@ -170,7 +170,7 @@ def metrics(e3d: dict[str, float | None], alone: tuple[float, float]) -> dict[st
     ],
 )
 def test_claims_of_the_tables(tmp_path, monkeypatch, e3d, alone, evaluated, dissected):
-    monkeypatch.setattr("ghpt.reproduction.camera_tables._shapes", lambda results: dict.fromkeys(PAIRS, ("1", "2")))
+    monkeypatch.setattr("ghpt.paper.camera.tables._shapes", lambda results: dict.fromkeys(PAIRS, ("1", "2")))
     content = metrics(dict(zip(PAIRS, e3d, strict=True)), alone)
     sections = [
         made_up([embedded()], BY_LABEL[f"fundamental-{name}"], tmp_path, lambda *_: content, "metrics.json")

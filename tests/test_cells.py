@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from ghpt.errors import GhptDataError
-from ghpt.reproduction.cells import read_json, with_needs
-from ghpt.reproduction.code import code_digest, meaning
-from ghpt.reproduction.pool import perform_all
+from ghpt.paper.engine.cells import read_json, with_needs
+from ghpt.paper.engine.code import code_digest, meaning
+from ghpt.paper.engine.pool import perform_all
 from toy_cells import cell
 
 
@@ -69,7 +69,7 @@ def test_the_key_knows_config_needs_and_code(diary, monkeypatch):
     assert diamond(diary).key == diamond(diary).key
     assert len({diamond(diary).key, diamond(diary, first=9).key, diamond(diary, last=9).key}) == 3
     before = diamond(diary).key
-    monkeypatch.setattr("ghpt.reproduction.cells.code_digest", lambda module: "changed")
+    monkeypatch.setattr("ghpt.paper.engine.cells.code_digest", lambda module: "changed")
     assert diamond(diary).key != before
     assert len(with_needs([diamond(diary), diamond(diary)])) == 4
 
@@ -85,14 +85,14 @@ def test_comments_docstrings_and_layout_are_no_code(tmp_path):
         == plain
     )
     assert digest("c.py", "def f(x):\n    return x + 2\n") != plain
-    assert code_digest("toy_cells") != code_digest("ghpt.reproduction.work")
+    assert code_digest("toy_cells") != code_digest("ghpt.paper.engine.work")
 
 
 PROGRAM = """
 import sys
 from pathlib import Path
 from test_cells import slow
-from ghpt.reproduction.pool import perform_all
+from ghpt.paper.engine.pool import perform_all
 if __name__ == "__main__":
     perform_all(slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
 """

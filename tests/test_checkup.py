@@ -10,21 +10,21 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.checkup.agreement import agreement, errors, median
-from ghpt.checkup.breakages import BREAKAGES
-from ghpt.checkup.candidates import POSES, exchanged
-from ghpt.checkup.evidence import Evidence, choose, gather
-from ghpt.checkup.examination import Finding, merged
-from ghpt.checkup.resection import resect
-from ghpt.checkup.setup import Look, Setup, as_filed
+from ghpt.calibration.check.agreement import agreement, errors, median
+from ghpt.calibration.check.breakages import BREAKAGES
+from ghpt.calibration.check.candidates import POSES, exchanged
+from ghpt.calibration.check.evidence import Evidence, choose, gather
+from ghpt.calibration.check.examination import Finding, merged
+from ghpt.calibration.check.resection import resect
+from ghpt.calibration.check.setup import Look, Setup, as_filed
 from ghpt.config import build, plain
-from ghpt.data.camera_files import CameraFile, read_cameras
-from ghpt.data.embedded import motion
-from ghpt.data.key_points import KeyPoints, read_key_points
-from ghpt.data.lens import distort
-from ghpt.data.rigs import human36m_rig, panoptic_rig
+from ghpt.data.formats.camera_files import CameraFile, read_cameras
+from ghpt.data.formats.key_points import KeyPoints, read_key_points
+from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import project
+from ghpt.geometry.lens import distort
 from ghpt.skeleton import JOINTS
 from rigs_with_people import people
 

@@ -17,12 +17,12 @@ import torch
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import ghpt.test as testing
+import ghpt.commands.test as testing
 import toys
+from ghpt.commands.train import COMMAND, train, typed
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
-from ghpt.train import COMMAND, train, typed
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ("data=toy", "model.hypotheses=5", "model.scorer.layers=[4]", "trainer.accelerator=cpu", "progress_bar=false")

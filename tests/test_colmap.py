@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from damage import damage
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.rigs import human36m_rig
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 
 CAMERAS = [

@@ -16,11 +16,11 @@ import pytest
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-import ghpt.test as testing
+import ghpt.commands.test as testing
 import toys
+from ghpt.commands.train import train
 from ghpt.config import plain
 from ghpt.models.checkpoint import read_checkpoint
-from ghpt.train import train
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ("data=toy", "progress_bar=false", "trainer.accelerator=cpu")

@@ -6,12 +6,12 @@ import pytest
 import torch
 import yaml
 
-from ghpt.data import lens
-from ghpt.data.body import occlusion, random_body, stature, trunk_frame
-from ghpt.data.detector import KINDS, Detector
-from ghpt.data.motion import move
-from ghpt.data.processes import generator, process
-from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.data.synthetic.body import occlusion, random_body, stature, trunk_frame
+from ghpt.data.synthetic.detector import KINDS, Detector
+from ghpt.data.synthetic.motion import move
+from ghpt.data.synthetic.random_processes import generator, process
+from ghpt.data.synthetic.rigs import Rig, human36m_rig
+from ghpt.geometry import lens
 from ghpt.geometry.cameras import project
 from ghpt.skeleton import JOINT, JOINTS, MIRROR
 

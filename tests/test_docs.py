@@ -15,12 +15,13 @@ from typing import Any
 import pytest
 
 import documented
-import ghpt.test as testing
+import ghpt.commands.test as testing
 from documented import PAGES, ROOT, Block, Command
-from ghpt import calibrate, doctor, predict, train
-from ghpt.data import embedded
+from ghpt.commands import calibrate, predict, train
+from ghpt.commands import cameras as doctor
+from ghpt.commands.overrides import check_overrides
+from ghpt.data.synthetic import recordings as embedded
 from ghpt.models import registry
-from ghpt.overrides import check_overrides
 
 MAINS = {
     "train.py": (train.COMMAND, {"last.ckpt", "best.ckpt"}),

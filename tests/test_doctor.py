@@ -6,10 +6,10 @@ from pathlib import Path
 import hydra
 import pytest
 
+from ghpt.commands.cameras import examine
 from ghpt.config import plain
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.rigs import human36m_rig
-from ghpt.doctor import examine
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,8 +8,8 @@ import pytest
 import torch
 import yaml
 
-from ghpt.data.detector import Detector
-from ghpt.data.embedded import HUMAN36M_SUBJECTS, embedded_recordings
+from ghpt.data.synthetic.detector import Detector
+from ghpt.data.synthetic.recordings import HUMAN36M_SUBJECTS, embedded_recordings
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import project
 from ghpt.skeleton import BONES, JOINT

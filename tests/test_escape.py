@@ -10,11 +10,11 @@ from markdown_it import MarkdownIt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from rich.console import Console
 
-from ghpt.doctor import _print as print_checkup
-from ghpt.doctor import report as checkup_report
+from ghpt.commands.cameras import _print as print_checkup
+from ghpt.commands.cameras import report as checkup_report
+from ghpt.commands.prediction.report import prediction_report, print_prediction, print_verdict
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.scale import SEGMENTS
-from ghpt.prediction.report import prediction_report, print_prediction, print_verdict
+from ghpt.models.relative_pose.scale import SEGMENTS
 from ghpt.report.calibration import calibration_report, print_calibration
 from ghpt.report.escape import Markdown, code, code_block, escaped, plain
 from ghpt.report.rig_comparison import Similarity

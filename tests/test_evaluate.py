@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from ghpt.geometry.cameras import Cameras
+from ghpt.models.pose.evaluation import NAMES, evaluate, write_metrics
+from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
 from ghpt.recording import PoseEstimate, Recording
-from ghpt.report.evaluate import NAMES, evaluate, write_metrics
-from ghpt.report.predictions import WEIGHTS, PredictionWriter, open_predictions
 from ghpt.skeleton import JOINTS, PELVIS, SIX_JOINTS
 
 TAKES = ("S9/Greeting-2", "S9/Greeting-1", "S11/Walking-1", "S11/Eating-1")
@@ -100,7 +100,7 @@ def test_without_damaged_only_where_there_are_damaged_takes(tmp_path):
 def test_chunks_do_not_matter(tmp_path, monkeypatch):
     opened = predictions(tmp_path, content())
     whole = evaluate(opened)
-    monkeypatch.setattr("ghpt.report.evaluate._CHUNK", 7)
+    monkeypatch.setattr("ghpt.models.pose.evaluation._CHUNK", 7)
     for name, numbers in evaluate(opened)["selections"].items():
         for mean in MEANS:
             assert numbers[mean] == pytest.approx(whole["selections"][name][mean], rel=1e-12)

@@ -13,16 +13,16 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
-from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.commands.predict import predict
+from ghpt.commands.prediction.frames import Frames
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
+from ghpt.data.formats.stored_npz import add_member
+from ghpt.data.synthetic.rigs import Rig, human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.export import WRITERS, Evidence, Scene, read_reconstruction
-from ghpt.predict import predict
-from ghpt.prediction.frames import Frames
 from ghpt.recording import Recording
 from ghpt.report.rig_files import write_poses
-from ghpt.report.stored_npz import add_member
 from ghpt.skeleton import MIRROR
 from predicting import config, walk
 from reconstructions import about, in_parts, random_reconstruction

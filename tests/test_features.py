@@ -2,7 +2,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ghpt.models.features import body_part_lengths, centre_on_pelvis, normalised_coordinates, torso_normal_to_z
+from ghpt.models.pose.features import body_part_lengths, centre_on_pelvis, normalised_coordinates, torso_normal_to_z
 from ghpt.skeleton import BONES, JOINT, PELVIS
 
 ALL = torch.ones(5, 17, dtype=torch.bool)

@@ -9,10 +9,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.pose_prior import PARTS
+from ghpt.models.pose.evaluation import evaluate
+from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
 from ghpt.recording import PoseEstimate, Recording
 from ghpt.report import figures
-from ghpt.report.evaluate import evaluate
-from ghpt.report.predictions import WEIGHTS, PredictionWriter, open_predictions
 from ghpt.report.tensorboard import SHOWN, write_events
 from ghpt.skeleton import JOINT, JOINTS, PELVIS
 

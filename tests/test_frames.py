@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.frames import BatchOrder, Frames, trainable
+from ghpt.data.datasets.frames import BatchOrder, Frames, trainable
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
 from ghpt.skeleton import PELVIS

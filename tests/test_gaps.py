@@ -8,10 +8,10 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from scipy.signal import butter, sosfiltfilt
 
+from ghpt.commands.prediction.gaps import Gaps, after, frame_step, gap_frames, runs
+from ghpt.commands.prediction.shards import Shards
 from ghpt.errors import GhptConfigError
 from ghpt.export.stream import part
-from ghpt.prediction.gaps import Gaps, after, frame_step, gap_frames, runs
-from ghpt.prediction.shards import Shards
 from ghpt.reconstruction import State
 from predicting import frames_of
 from reconstructions import random_reconstruction
@@ -265,7 +265,7 @@ def test_either_request_is_something_and_none_takes_no_file(tmp_path, monkeypatc
     assert not filling(3).nothing
     assert not smoothing(5.0).nothing
     shards = Shards(tmp_path, "key", 90, 40)
-    monkeypatch.setattr("ghpt.prediction.gaps.allocate", None)
+    monkeypatch.setattr("ghpt.commands.prediction.gaps.allocate", None)
     with after(Gaps(None, "linear", None, None), shards, 17, tmp_path) as chunks:
         assert chunks == shards.chunks
     shards.close()

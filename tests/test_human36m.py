@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import real_layout as layout
-from ghpt.data.detections import in_image, undistorted
-from ghpt.data.human36m import DAMAGED, human36m_files, human36m_recordings
-from ghpt.data.labels import LABELS_FILE
-from ghpt.data.rigs import human36m_rig
+from ghpt.data.datasets.detections import in_image, undistorted
+from ghpt.data.datasets.human36m import DAMAGED, human36m_files, human36m_recordings
+from ghpt.data.datasets.labels import LABELS_FILE
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINTS

@@ -10,10 +10,10 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 
-from ghpt.data import panoptic
-from ghpt.data.key_points import read_key_points
-from ghpt.data.panoptic import COCO19
-from ghpt.data.skeletons import SKELETONS, canonical, joints17
+from ghpt.data.datasets import panoptic
+from ghpt.data.datasets.panoptic import COCO19
+from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.formats.skeletons import SKELETONS, canonical, joints17
 from ghpt.skeleton import BONES, JOINTS, MIRROR, SIX_JOINTS, SYMMETRIC_PARTS
 
 DOCUMENTED = {

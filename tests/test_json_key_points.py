@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from ghpt.data.key_points import FORMATS, read_key_points, read_people
-from ghpt.data.skeletons import SKELETONS, canonical
+from ghpt.data.formats.key_points import FORMATS, read_key_points, read_people
+from ghpt.data.formats.skeletons import SKELETONS, canonical
 from ghpt.errors import GhptDataError
 
 RNG = np.random.default_rng(0)

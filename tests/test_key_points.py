@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from damage import damage
-from ghpt.data.camera_files import CameraFile
-from ghpt.data.key_points import KeyPoints, read_key_points, read_people, write_key_points
-from ghpt.data.lens import distort
-from ghpt.data.skeletons import SKELETONS
-from ghpt.data.views import look_through, matched, normal
+from ghpt.commands.prediction.stored import open_stored
+from ghpt.data.formats.camera_files import CameraFile
+from ghpt.data.formats.key_points import KeyPoints, read_key_points, read_people, write_key_points
+from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.people.views import look_through, matched, normal
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import project
-from ghpt.prediction.stored import open_stored
+from ghpt.geometry.lens import distort
 from scenes import random_scene
 
 

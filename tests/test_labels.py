@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import real_layout as layout
-from ghpt.data import labels as module
-from ghpt.data.labels import read_labels
-from ghpt.data.rigs import human36m_rig
+from ghpt.data.datasets import labels as module
+from ghpt.data.datasets.labels import read_labels
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 
 RNG = np.random.default_rng(0)

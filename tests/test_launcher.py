@@ -15,11 +15,11 @@ import pytest
 import torch
 import yaml
 
-import ghpt.jobs
+import ghpt.commands.jobs
 import toys
+from ghpt.commands.overrides import check_overrides
+from ghpt.commands.train import COMMAND
 from ghpt.models.checkpoint import read_checkpoint
-from ghpt.overrides import check_overrides
-from ghpt.train import COMMAND
 
 ROOT = Path(__file__).resolve().parents[1]
 TOY = [sys.executable, str(ROOT / "tests" / "toy_sweep.py")]
@@ -136,7 +136,7 @@ def test_what_sbatch_refuses_is_said_in_one_line(toy, tmp_path):
     ],
 )
 def test_a_launcher_that_is_not_there(typed, monkeypatch, tmp_path, launcher, installed, message):
-    monkeypatch.setattr(ghpt.jobs, "find_spec", lambda name: installed or None)
+    monkeypatch.setattr(ghpt.commands.jobs, "find_spec", lambda name: installed or None)
     monkeypatch.setenv("PATH", str(tmp_path))
     words = ("-m", "data=cmu1,cmu2", f"hydra/launcher={launcher}")
     status, _, said = typed(ROOT / "conf", COMMAND, words)
@@ -147,11 +147,11 @@ def test_a_launcher_that_is_not_there(typed, monkeypatch, tmp_path, launcher, in
 @pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK"])
 def test_one_process_of_a_run_writes_its_files(monkeypatch, name):
     monkeypatch.delenv(name, raising=False)
-    assert ghpt.jobs.is_first_process()
+    assert ghpt.commands.jobs.is_first_process()
     monkeypatch.setenv(name, "0")
-    assert ghpt.jobs.is_first_process()
+    assert ghpt.commands.jobs.is_first_process()
     monkeypatch.setenv(name, "1")
-    assert not ghpt.jobs.is_first_process()
+    assert not ghpt.commands.jobs.is_first_process()
 
 
 def test_slurm_s_settings_compose_where_there_is_no_slurm(typed):
@@ -169,7 +169,7 @@ def test_the_commands_of_the_page_about_clusters_are_understood():
     launchers = set()
     for _, script, *words in found:
         overrides = check_overrides(ROOT / "conf", script.removesuffix(".py"), [w for w in words if w != "-m"])
-        launchers.add(ghpt.jobs.chosen_launcher(overrides, compose_only=True))
+        launchers.add(ghpt.commands.jobs.chosen_launcher(overrides, compose_only=True))
     assert launchers == {"basic", "submitit_local", "submitit_slurm"}
 
 

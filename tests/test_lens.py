@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.lens import distort, undistort
+from ghpt.geometry.lens import distort, undistort
 
 K = np.array([[1100.0, 0, 510], [0, 1120, 495], [0, 0, 1]])
 LENSES = [

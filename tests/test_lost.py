@@ -20,13 +20,13 @@ import yaml
 from torch.utils.data import get_worker_info
 
 import toys
-from ghpt import lost
-from ghpt.data.frames import Frames
+from ghpt.commands import lost
+from ghpt.commands.train import COMMAND
+from ghpt.data.datasets.frames import Frames
 from ghpt.errors import GhptConfigError
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
-from ghpt.reproduction import pool
-from ghpt.train import COMMAND
+from ghpt.paper.engine import pool
 from toy_cells import cell
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ghpt.data.key_points import read_key_points
-from ghpt.data.mediapipe import read_caliscope
-from ghpt.data.skeletons import SKELETONS
+from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.formats.mediapipe import read_caliscope
+from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
 
 HEADER = "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"

@@ -36,7 +36,7 @@ def child(folder: str, frames: int) -> None:
     import numpy as np
 
     import toys
-    from ghpt.test import test
+    from ghpt.commands.test import test
 
     class Longer(toys.ToyData):
         def make(self, split):
@@ -49,7 +49,7 @@ def child(folder: str, frames: int) -> None:
 
     toys.Longer = Longer
     data = toys.DATA | {"_target_": "toys.Longer", "stride": 1, "batch_size": BATCH, "cache": folder}
-    baselines = {"linear": {"_target_": "ghpt.models.baselines.Linear"}}
+    baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
     config = toys.TRAIN | {"data": data, "ckpt": f"{folder}/last.ckpt", "hypotheses": None, "baselines": baselines}
     peak = [0.0]
 
@@ -66,7 +66,7 @@ def child(folder: str, frames: int) -> None:
 @pytest.mark.skipif(not STATUS.is_file(), reason="needs Linux's /proc")
 def test_testing_holds_one_batch_however_many_frames(tmp_path):
     import toys
-    from ghpt.train import train
+    from ghpt.commands.train import train
 
     train(toys.TRAIN, tmp_path)
     peaks = []

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from ghpt.data.body import random_body
-from ghpt.data.motion import actions, keyframes, move
+from ghpt.data.synthetic.body import random_body
+from ghpt.data.synthetic.motion import actions, keyframes, move
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS
 
 RATE = 50.0

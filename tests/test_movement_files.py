@@ -6,8 +6,8 @@ import types
 import numpy as np
 import pytest
 
-from ghpt.data.key_points import read_key_points, read_people
-from ghpt.data.skeletons import SKELETONS
+from ghpt.data.formats.key_points import read_key_points, read_people
+from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
 
 NAMES = (

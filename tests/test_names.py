@@ -6,10 +6,10 @@ import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from ghpt.calibration.millimetres import read_scale
+from ghpt.commands.inputs import InputSettings
 from ghpt.config import check_type
-from ghpt.data.chosen import InputSettings
-from ghpt.data.names import chosen_name
-from ghpt.data.views import matched
+from ghpt.data.formats.names import chosen_name
+from ghpt.data.people.views import matched
 from ghpt.errors import GhptConfigError, GhptDataError
 from test_key_points import camera_file
 

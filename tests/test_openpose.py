@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from ghpt.data.key_points import read_key_points, read_people
-from ghpt.data.openpose import follow, read_view
-from ghpt.data.skeletons import SKELETONS
+from ghpt.data.formats.key_points import read_key_points, read_people
+from ghpt.data.formats.openpose import follow, read_view
+from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
 
 RNG = np.random.default_rng(0)
@@ -72,7 +72,7 @@ def test_following_is_the_best_of_all_choices():
     """Against every choice of one person a frame, by brute force."""
     from itertools import product
 
-    from ghpt.data.openpose import _JUMP, _jump, _quality
+    from ghpt.data.formats.openpose import _JUMP, _jump, _quality
 
     rng = np.random.default_rng(5)
     people = [np.stack([person(rng.uniform(0, 300), rng.uniform(0.5, 1.5), rng.uniform(0.2, 1)) for _ in range(3)])

@@ -11,13 +11,14 @@ from pathlib import Path
 import pytest
 import yaml
 
-import ghpt.calibrate
-import ghpt.doctor
-import ghpt.test as testing
-from ghpt import files, predict, train
+import ghpt.commands.calibrate
+import ghpt.commands.cameras
+import ghpt.commands.test as testing
+from ghpt import files
+from ghpt.commands import predict, train
+from ghpt.commands.outputs import STATE, Files, OutputFolder, check_apart, input_paths, stamp
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.files import atomic_write, remove
-from ghpt.outputs import STATE, Files, OutputFolder, check_apart, input_paths, stamp
 from predicting import cameras_file
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -180,7 +181,7 @@ def test_with_a_damaged_manifest_nothing_is_ours(tmp_path, damage):
 
 def test_b10_a_second_writer_is_refused_at_once_and_a_dead_ones_lock_is_taken_over(tmp_path):
     script = (
-        "import sys, time; from pathlib import Path; from ghpt.outputs import Files, OutputFolder\n"
+        "import sys, time; from pathlib import Path; from ghpt.commands.outputs import Files, OutputFolder\n"
         "with OutputFolder(Path(sys.argv[1]), Files()):\n"
         "    print('in', flush=True); time.sleep(600)\n"
     )
@@ -249,8 +250,12 @@ def test_the_folder_of_key_points_is_no_output(tmp_path):
 
 COMMANDS = {
     "predict": (predict.COMMAND, [], ["poses.npz", "poses.csv", "report.md", "prediction.json", ".shards/000000.npz"]),
-    "calibrate": (ghpt.calibrate.COMMAND, [], ["extri.yml", "rig.toml", "poses.npz", "calibration.json", "rig.png"]),
-    "cameras": (ghpt.doctor.COMMAND, [], ["cameras.toml", "keypoints.npz", "checkup.json", "report.md"]),
+    "calibrate": (
+        ghpt.commands.calibrate.COMMAND,
+        [],
+        ["extri.yml", "rig.toml", "poses.npz", "calibration.json", "rig.png"],
+    ),
+    "cameras": (ghpt.commands.cameras.COMMAND, [], ["cameras.toml", "keypoints.npz", "checkup.json", "report.md"]),
     "train": (train.COMMAND, ["data=cmu2"], ["last.ckpt", "best.ckpt", "train.log", ".hydra/config.yaml"]),
     "test": (testing.COMMAND, ["ckpt=last.ckpt"], ["metrics.json", "predictions.npz", ".predictions/frame"]),
 }
@@ -281,7 +286,7 @@ def test_a_calibration_beside_its_own_inputs_is_refused_and_leaves_them(typed, t
     before = contents(tmp_path)
     words = [f"keypoints={tmp_path / 'pose'}", f"cameras={tmp_path}", f"output={tmp_path}"]
     for more in ([], ["overwrite=true"]):
-        status, _, said = typed(ROOT / "conf", ghpt.calibrate.COMMAND, [*words, *more])
+        status, _, said = typed(ROOT / "conf", ghpt.commands.calibrate.COMMAND, [*words, *more])
         assert (status, said.count("\n")) == (1, 1)
         assert "intri.yml: is an input of this command. Name another output." in said
         assert contents(tmp_path) == before

@@ -8,7 +8,7 @@ from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.metrics.relative_pose import rotation_deg, translation_deg
-from ghpt.models.pair_baselines import EightPoint, PoseLib, Ransac, Usac, _distinct, size_in_image
+from ghpt.models.relative_pose.baselines import EightPoint, PoseLib, Ransac, Usac, _distinct, size_in_image
 from ghpt.randomness import key, uniform
 from ghpt.recording import PairBatch, RelativePoseEstimate
 from scenes import random_scene

@@ -5,9 +5,9 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from ghpt.models.pose.evaluation import write_metrics
+from ghpt.models.relative_pose.evaluation import ALONE, ERRORS, NAMES, errors_of_pair, evaluate_pairs
 from ghpt.recording import RelativePoseEstimate
-from ghpt.report.evaluate import write_metrics
-from ghpt.report.pair_evaluate import ALONE, ERRORS, NAMES, errors_of_pair, evaluate_pairs
 from pair_report import content, moved, rig, written
 
 RIGS = [rig(9), rig(11)]
@@ -154,7 +154,7 @@ def test_one_part_alone_is_as_if_the_other_were_true(tmp_path):
 def test_chunks_do_not_matter(tmp_path, monkeypatch):
     opened = written(tmp_path, RIGS, content(RIGS, draws=3))
     whole = evaluate_pairs(opened)
-    monkeypatch.setattr("ghpt.report.pair_evaluate._CHUNK", 7)
+    monkeypatch.setattr("ghpt.models.relative_pose.evaluation._CHUNK", 7)
     again = evaluate_pairs(opened)
     for name, numbers in again["selections"].items():
         for error in ERRORS:

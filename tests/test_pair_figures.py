@@ -6,13 +6,13 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+from ghpt.models.relative_pose.evaluation import ERRORS, evaluate_pairs
+from ghpt.models.rows import WEIGHTS
 from ghpt.recording import RelativePoseEstimate
 from ghpt.report import pair_figures
 from ghpt.report.figures import image
-from ghpt.report.pair_evaluate import ERRORS, evaluate_pairs
 from ghpt.report.pair_figures import rig_figure
 from ghpt.report.pair_tensorboard import _typical_draw, write_pair_events
-from ghpt.report.rows import WEIGHTS
 from pair_report import content, moved, rig, true_poses, written
 
 RIGS = [rig(9), rig(11)]

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ghpt.errors import GhptDataError, GhptError
+from ghpt.models.pose.predictions import open_predictions
+from ghpt.models.relative_pose.predictions import PairWriter, open_pairs
 from ghpt.recording import RelativePoseEstimate
-from ghpt.report.pair_predictions import PairWriter, open_pairs
-from ghpt.report.predictions import open_predictions
 from pair_report import META, NAMES, content, rig, written
 from test_predictions import array, changed, write_all
 

@@ -5,9 +5,9 @@ import pytest
 import torch
 from rich.console import Console
 
-from ghpt.data.rigs import human36m_rig
-from ghpt.report import paper
-from ghpt.report.pair_evaluate import ALONE, ERRORS, NAMES
+from ghpt.data.synthetic.rigs import human36m_rig
+from ghpt.models.relative_pose.evaluation import ALONE, ERRORS, NAMES
+from ghpt.paper import published as paper
 from ghpt.report.pair_tables import comparison, dissection, of_paper, pair_report, print_pair_tables
 
 

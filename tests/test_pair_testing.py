@@ -11,17 +11,17 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import toys
+from ghpt.commands.test import summary, test
+from ghpt.commands.train import train
 from ghpt.config import plain
 from ghpt.errors import GhptConfigError
+from ghpt.models.relative_pose.predictions import open_pairs
 from ghpt.models.selection import SELECTIONS
-from ghpt.report.pair_predictions import open_pairs
-from ghpt.test import summary, test
-from ghpt.train import train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SMALL = ["model.hypotheses=6", "model.scorer.layers=[4]", "model.problem.frames=8", "model.problem.draws=2",
          "model.problem.points=20"]  # fmt: skip
-BASELINES = {"eight_point": {"_target_": "ghpt.models.pair_baselines.EightPoint"}}
+BASELINES = {"eight_point": {"_target_": "ghpt.models.relative_pose.baselines.EightPoint"}}
 
 
 def model() -> dict[str, Any]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.pairs import Pairs, PairSettings
+from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import Cameras
 from toys import recording

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import real_layout as layout
-from ghpt.data.panoptic import COCO19, joints17, panoptic_files, panoptic_recordings
-from ghpt.data.rigs import panoptic_rig
-from ghpt.data.store import write_store
+from ghpt.data.datasets.panoptic import COCO19, joints17, panoptic_files, panoptic_recordings
+from ghpt.data.datasets.store import write_store
+from ghpt.data.synthetic.rigs import panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINT, JOINTS

@@ -7,9 +7,8 @@ import torch
 
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.rotations import is_rotation, matrix_to_vector
-from ghpt.models.baselines import person_size
-from ghpt.recording import KeyPointBatch
-from ghpt.reproduction.perturbation import (
+from ghpt.models.estimators.classical import person_size
+from ghpt.paper.robustness.perturbation import (
     FewerCameras,
     MissingDetections,
     MissingViews,
@@ -19,6 +18,7 @@ from ghpt.reproduction.perturbation import (
     RotatedCameras,
     ShiftedCameras,
 )
+from ghpt.recording import KeyPointBatch
 from scenes import random_scene
 
 SEED = 3

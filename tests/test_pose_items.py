@@ -7,16 +7,17 @@ import pytest
 
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.selection import SELECTIONS
-from ghpt.report.paper import (
+from ghpt.paper.engine.item import Compared, Results, Spread
+from ghpt.paper.engine.setup import Setup
+from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
+from ghpt.paper.pose import figures as pose_figures
+from ghpt.paper.published import (
     GENERALIZATION,
     LIMITATION,
     QUANTITATIVE,
     QUANTITATIVE_HYPOTHESES,
     SOTA,
 )
-from ghpt.reproduction import base_dataset, generalization, other_systems, pose_figures, view_weights
-from ghpt.reproduction.item import Compared, Results, Spread
-from ghpt.reproduction.setup import Setup
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SETUP = Setup(CONF, {"human36m": None, "panoptic": None}, {"train": (), "test": ()}, {}, 0)

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt import predict as module
+from ghpt.commands import predict as module
+from ghpt.commands.predict import COMMAND, predict
 from ghpt.config import build, plain
-from ghpt.data.camera_writers import write_pose2sim
-from ghpt.data.key_points import KeyPoints, write_key_points
-from ghpt.data.rigs import Rig, human36m_rig
+from ghpt.data.formats.camera_writers import write_pose2sim
+from ghpt.data.formats.key_points import KeyPoints, write_key_points
+from ghpt.data.synthetic.rigs import Rig, human36m_rig
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.models.checkpoint import FORMAT_VERSION, AtomicCheckpointIO
-from ghpt.predict import COMMAND, predict
 from ghpt.reconstruction import State
 from ghpt.skeleton import JOINTS
 from predicting import CONF, QUICK, cameras_file, config, frames_of, openpose_folders, walk, write_people
@@ -325,12 +325,12 @@ def test_an_output_that_cannot_be_written_is_named(command, tmp_path):
 DISK = """
 import resource, sys
 from pathlib import Path
-import ghpt.predict
+import ghpt.commands.predict
 sys.argv = ["predict.py", *{words!r}]
-from ghpt.app import run
+from ghpt.commands.app import run
 resource.setrlimit(resource.RLIMIT_FSIZE, ({limit}, {limit}))
 import signal; signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-run(Path({conf!r}), ghpt.predict.COMMAND)
+run(Path({conf!r}), ghpt.commands.predict.COMMAND)
 """
 
 

@@ -9,8 +9,8 @@ import torch
 
 from ghpt.errors import GhptDataError, GhptError
 from ghpt.geometry.cameras import Cameras
+from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
 from ghpt.recording import PoseEstimate, Recording
-from ghpt.report.predictions import WEIGHTS, PredictionWriter, open_predictions
 
 NAMES = ("weight", "average", "linear")
 META = {"data": "h36m", "source": "embedded", "split": "test", "seed": 0, "provenance": {"commit": "abc"}}

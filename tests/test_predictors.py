@@ -8,19 +8,19 @@ import yaml
 
 from ghpt.config import build
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.baselines import Linear, MEstimator, WeightedLinear, person_size
-from ghpt.models.lo_ransac import LoRansac
+from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_size
+from ghpt.models.estimators.lo_ransac import LoRansac
+from ghpt.models.estimators.predictors import Classical, Learned
+from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
+from ghpt.models.estimators.rejection import Rejection
+from ghpt.models.estimators.uncertainty import Quality
+from ghpt.models.estimators.view_weights import ViewWeights
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
-from ghpt.models.pose import PoseTriangulation
-from ghpt.models.predictors import Classical, Learned
-from ghpt.models.quality import Quality
-from ghpt.models.ransac import AdaptiveRansac, Ransac
-from ghpt.models.rejection import Rejection
+from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.models.scorer import Scorer
-from ghpt.models.view_weights import ViewWeights
+from ghpt.paper.robustness.perturbation import Outliers
 from ghpt.reconstruction import Reconstruction, State
-from ghpt.reproduction.perturbation import Outliers
 from scenes import random_scene
 
 QUALITY = Quality(noise=0.003, prior=4.0, shared=0.0)

@@ -96,4 +96,4 @@ def test_every_module_is_imported_without_what_windows_lacks() -> None:
     command = [sys.executable, "-c", WITHOUT_POSIX]
     child = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert child.returncode == 0, child.stderr
-    assert "ghpt.prediction.shards" in child.stdout.split()
+    assert "ghpt.commands.prediction.shards" in child.stdout.split()

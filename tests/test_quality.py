@@ -8,14 +8,14 @@ import torch
 import yaml
 
 from ghpt.config import build
-from ghpt.data.detector import Detector
-from ghpt.data.embedded import embedded_recordings
-from ghpt.data.frames import Frames
+from ghpt.data.datasets.frames import Frames
+from ghpt.data.synthetic.detector import Detector
+from ghpt.data.synthetic.recordings import embedded_recordings
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import project, reprojection_error
 from ghpt.geometry.triangulation import triangulate
-from ghpt.models.baselines import Linear, person_size
-from ghpt.models.quality import Quality
+from ghpt.models.estimators.classical import Linear, person_size
+from ghpt.models.estimators.uncertainty import Quality
 from scenes import random_scene
 
 

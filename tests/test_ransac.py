@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ghpt.errors import GhptConfigError
-from ghpt.models.baselines import Linear, person_size
-from ghpt.models.ransac import AdaptiveRansac, Ransac
-from ghpt.reproduction.perturbation import RotatedCameras
+from ghpt.models.estimators.classical import Linear, person_size
+from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
+from ghpt.paper.robustness.perturbation import RotatedCameras
 from scenes import random_scene
 
 FIXED = Ransac(threshold=0.005, pairs=64, seed=0)

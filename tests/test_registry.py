@@ -13,15 +13,15 @@ import pytest
 import torch
 
 import toys
+from ghpt.commands.test import test
+from ghpt.commands.train import train
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.models.checkpoint import FIELD, load_model, read_checkpoint
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.registry import PARTS, build_registered, packages_to_trust
-from ghpt.reproduction.ablations import ITEMS
-from ghpt.reproduction.cells import with_needs
-from ghpt.reproduction.setup import Setup, compose
-from ghpt.test import test
-from ghpt.train import train
+from ghpt.paper.ablations.tables import ITEMS
+from ghpt.paper.engine.cells import with_needs
+from ghpt.paper.engine.setup import Setup, compose
 from signing import save_signed
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -36,7 +36,7 @@ import torch
 from torch import nn
 
 from ghpt.models.loss import LossTerms
-from ghpt.models.pose import PoseTriangulation
+from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.models.scorer import Scorer, Standardise
 
 IMPORTED = []
@@ -177,7 +177,7 @@ def test_a_model_of_one_s_own_trains_and_tests(tmp_path: Path, own: Path, name: 
     config = settings(**OWN[name])
     train(config, tmp_path)
     forget()
-    baselines = {"linear": {"_target_": "ghpt.models.baselines.Linear"}}
+    baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
     again = config | {"ckpt": str(tmp_path / "last.ckpt"), "hypotheses": None, "baselines": baselines}
     metrics = test(again | {"trust": ["mine.scorers"]}, tmp_path / "tested")
     assert metrics["selections"]["weight"]["mpjpe_relative"] > 0
@@ -190,7 +190,7 @@ def test_a_model_of_one_s_own_trains_and_tests(tmp_path: Path, own: Path, name: 
 def test_training_goes_on_and_says_what_to_trust(tmp_path: Path, own: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Its configuration is what the user typed: it needs no trust."""
     config = settings(scorer=SCORER)
-    with caplog.at_level(logging.INFO, "ghpt.train"):
+    with caplog.at_level(logging.INFO, "ghpt.commands.train"):
         train(config, tmp_path)
     assert any("python test.py ckpt=" in said and said.endswith(" 'trust=[mine.scorers]'") for said in caplog.messages)
     config["trainer"]["max_epochs"] = 2
@@ -279,7 +279,7 @@ def test_the_commands_take_trust(
 ) -> None:
     path = checkpoint_of(scorer=SCORER)
     for command in ("test", "predict"):
-        module = importlib.import_module(f"ghpt.{command}")
+        module = importlib.import_module(f"ghpt.commands.{command}")
         words = (f"ckpt={path}", "trust=[mine.scorers]", f"output={tmp_path / 'out'}", "progress_bar=false")
         said = typed(CONF, module.COMMAND, words)[2]
         # Its weights are those of another scorer: it has been built.
@@ -289,7 +289,7 @@ def test_the_commands_take_trust(
 def test_training_warns_of_a_class_that_no_checkpoint_may_name(
     own: Path, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
-    with caplog.at_level(logging.WARNING, "ghpt.train"):
+    with caplog.at_level(logging.WARNING, "ghpt.commands.train"):
         train(settings(scorer=SCORER | {"_target_": "mine.scorers.function", "slope": 1.0}), tmp_path)
     assert any(
         "will not take this model: model.scorer._target_: mine.scorers.function is no class" in said

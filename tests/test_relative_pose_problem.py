@@ -9,8 +9,8 @@ from scipy.spatial.transform import Rotation
 
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.metrics.relative_pose import error_3d, rotation_deg
-from ghpt.models.relative_pose import RelativePose, RelativePoseHypotheses, quantiles, random_subsets
-from ghpt.models.scale import KnownScale
+from ghpt.models.relative_pose.problem import RelativePose, RelativePoseHypotheses, quantiles, random_subsets
+from ghpt.models.relative_pose.scale import KnownScale
 from ghpt.models.selection import SELECTIONS, selection_weights
 from ghpt.recording import PairBatch, RelativePoseEstimate
 from scenes import random_scene

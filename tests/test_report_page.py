@@ -9,9 +9,9 @@ import pytest
 from markdown_it import MarkdownIt
 from matplotlib.figure import Figure
 
+from ghpt.paper.engine.item import Claim, Compared, Item, Section, Spread
+from ghpt.paper.engine.page import Entry, Page, write_page
 from ghpt.report.escape import code
-from ghpt.reproduction.item import Claim, Compared, Item, Section, Spread
-from ghpt.reproduction.page import Entry, Page, write_page
 
 
 def figure():

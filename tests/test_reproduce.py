@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from ghpt import reproduce
+from ghpt.commands import reproduce
+from ghpt.commands.reproduce import ITEMS, chosen, spread
 from ghpt.errors import GhptConfigError
-from ghpt.reproduce import ITEMS, chosen, spread
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SMALL = ("overrides.train=['data.train_samples=16','model.hypotheses=8','data.stride=4096']",

@@ -8,7 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.models.baselines import Linear
+from ghpt.models.estimators.classical import Linear
 from ghpt.recording import Recording
 from ghpt.report.rig_comparison import (
     Similarity,

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.rigs import ARRANGEMENTS, human36m_rig, panoptic_rig
+from ghpt.data.synthetic.rigs import ARRANGEMENTS, human36m_rig, panoptic_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import project
 

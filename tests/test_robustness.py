@@ -7,13 +7,13 @@ from typing import Any
 
 import pytest
 
+from ghpt.commands.train import train
 from ghpt.files import write_json
-from ghpt.reproduction.cells import read_json
-from ghpt.reproduction.item import Results, Section
-from ghpt.reproduction.robustness import ITEMS
-from ghpt.reproduction.robustness_work import curve
-from ghpt.reproduction.setup import Setup
-from ghpt.train import train
+from ghpt.paper.engine.cells import read_json
+from ghpt.paper.engine.item import Results, Section
+from ghpt.paper.engine.setup import Setup
+from ghpt.paper.robustness.curves import ITEMS
+from ghpt.paper.robustness.work import curve
 from toys import DATA, TRAIN
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -24,14 +24,14 @@ SIZES = {
     "missing_detections": [0, 0.5], "missing_views": [0, 2], "shift": [0, 20.0],
 }  # fmt: skip
 BASELINES = {
-    "linear": {"_target_": "ghpt.models.baselines.Linear"},
-    "m_estimator": {"_target_": "ghpt.models.baselines.MEstimator", "loss": "geman_mcclure", "scale": 0.02,
+    "linear": {"_target_": "ghpt.models.estimators.classical.Linear"},
+    "m_estimator": {"_target_": "ghpt.models.estimators.classical.MEstimator", "loss": "geman_mcclure", "scale": 0.02,
                     "iterations": 10, "tolerance": 1.0},
-    "lo_ransac": {"_target_": "ghpt.models.lo_ransac.LoRansac", "threshold": 0.02, "seed": 0},
+    "lo_ransac": {"_target_": "ghpt.models.estimators.lo_ransac.LoRansac", "threshold": 0.02, "seed": 0},
 }  # fmt: skip
 VIEW_WEIGHTS = {
-    "_target_": "ghpt.models.view_weights.ViewWeights", "_partial_": True, "power": 1.5,
-    "consensus": {"_target_": "ghpt.models.ransac.AdaptiveRansac", "threshold": 0.02, "pairs": 64, "seed": 0,
+    "_target_": "ghpt.models.estimators.view_weights.ViewWeights", "_partial_": True, "power": 1.5,
+    "consensus": {"_target_": "ghpt.models.estimators.ransac.AdaptiveRansac", "threshold": 0.02, "pairs": 64, "seed": 0,
                   "adapt": 5.0, "quantile": 0.55, "rounds": 4},
 }  # fmt: skip
 
@@ -46,7 +46,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dic
     def measure(name: str, **levels: list[float]) -> list[dict[str, Any]]:
         ((setting, values),) = levels.items()
         more = {"shortest": 0.1, "longest": 0.5} if name == "Outliers" else {}
-        target = f"ghpt.reproduction.perturbation.{name}"
+        target = f"ghpt.paper.robustness.perturbation.{name}"
         perturbations = [{"_target_": target, setting: v, **more} if v else None for v in values]
         config = {"data": data, "view_weights": VIEW_WEIGHTS, "baselines": BASELINES, "seed": 0}
         config |= {"perturbations": perturbations}

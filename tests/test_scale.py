@@ -7,10 +7,18 @@ import pytest
 import torch
 
 from ghpt.calibration.millimetres import read_scale
-from ghpt.data import body
+from ghpt.data.synthetic import body
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.scale import SEGMENTS, BodyHeight, KnownScale, SegmentLengths, average_lengths, body_scale, stature
+from ghpt.models.relative_pose.scale import (
+    SEGMENTS,
+    BodyHeight,
+    KnownScale,
+    SegmentLengths,
+    average_lengths,
+    body_scale,
+    stature,
+)
 from ghpt.recording import PairBatch, RelativePoseEstimate
 from ghpt.skeleton import BONES, JOINTS
 from rigs_with_people import people, relative

@@ -8,9 +8,9 @@ from dataclasses import fields, replace
 import pytest
 import torch
 
+from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.errors import GhptDataError
 from ghpt.export.stream import part
-from ghpt.prediction.shards import MANIFEST, Shards
 from ghpt.reconstruction import Reconstruction
 from reconstructions import random_reconstruction
 

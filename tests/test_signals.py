@@ -11,18 +11,18 @@ from pathlib import Path
 import pytest
 
 import ghpt
-import ghpt.test as testing
+import ghpt.commands.test as testing
 import toys
-from ghpt import predict as prediction
 from ghpt import provenance as origin
-from ghpt.app import Command
-from ghpt.models.baselines import Linear
-from ghpt.outputs import Files
-from ghpt.prediction.frames import Frames
-from ghpt.prediction.shards import MANIFEST, Shards
+from ghpt.commands import predict as prediction
+from ghpt.commands.app import Command
+from ghpt.commands.outputs import Files
+from ghpt.commands.prediction.frames import Frames
+from ghpt.commands.prediction.shards import MANIFEST, Shards
+from ghpt.commands.train import train
+from ghpt.models.estimators.classical import Linear
 from ghpt.signals import stop as handler
 from ghpt.signals import stopped_by_signals
-from ghpt.train import train
 from predicting import config, frames_of
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -179,7 +179,7 @@ def test_a_prediction_has_our_handler(predict, monkeypatch):
 
 def test_a_stopped_test_leaves_no_rows(tmp_path, monkeypatch):
     train(toys.TRAIN, tmp_path / "model")
-    baselines = {"linear": {"_target_": "ghpt.models.baselines.Linear"}}
+    baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
     settings = toys.TRAIN | {"ckpt": str(tmp_path / "model" / "last.ckpt"), "hypotheses": None, "baselines": baselines}
     handlers = []
 

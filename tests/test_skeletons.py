@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.key_points import read_key_points
-from ghpt.data.skeletons import SKELETONS, joints17, joints_of, parts_of, recognise
-from ghpt.data.views import look_through
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.formats.skeletons import SKELETONS, joints17, joints_of, parts_of, recognise
+from ghpt.data.people.views import look_through
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import triangulate

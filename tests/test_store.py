@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data import store
+from ghpt.data.datasets import store
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording

@@ -5,8 +5,8 @@ import torch
 
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.ransac import AdaptiveRansac
-from ghpt.models.swaps import Swaps, undo_swaps
+from ghpt.models.estimators.flips import Swaps, undo_swaps
+from ghpt.models.estimators.ransac import AdaptiveRansac
 from ghpt.skeleton import MIRROR
 from scenes import random_scene
 

@@ -4,8 +4,8 @@ import pytest
 from rich.console import Console
 
 from ghpt.metrics.pose_prior import PARTS
-from ghpt.report import paper
-from ghpt.report.evaluate import NAMES
+from ghpt.models.pose.evaluation import NAMES
+from ghpt.paper import published as paper
 from ghpt.report.tables import COLUMNS, main_rows, max_difference, print_table, report, words
 
 MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")

@@ -6,12 +6,12 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import toys
-from ghpt.data.frames import Frames
-from ghpt.data.rigs import human36m_rig
+from ghpt.data.datasets.frames import Frames
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
+from ghpt.paper.camera.extrinsics import PARTS, from_pairs, relative, replaced, seen_by, with_true_scale
 from ghpt.recording import PairBatch, RelativePoseEstimate
-from ghpt.reproduction.camera_extrinsics import PARTS, from_pairs, relative, replaced, seen_by, with_true_scale
 
 TRUTH = human36m_rig("S9").cameras
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ghpt.data.validate import check_cameras, check_names, read_json, read_npy, read_npz
+from ghpt.data.formats.validate import check_cameras, check_names, read_json, read_npy, read_npz
 from ghpt.errors import GhptDataError
 
 

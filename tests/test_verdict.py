@@ -13,20 +13,20 @@ import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from ghpt.checkup.units import unit_for, unit_of
+from ghpt.calibration.check.units import unit_for, unit_of
+from ghpt.commands.cameras import examine
+from ghpt.commands.predict import predict
+from ghpt.commands.prediction.next_commands import commands_on, setting
+from ghpt.commands.prediction.verdict import Commands, Judge, Level
 from ghpt.config import build, plain
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.camera_writers import write_aniposelib, write_pose2sim
-from ghpt.data.key_points import KeyPoints, write_key_points
-from ghpt.data.rigs import Rig, human36m_rig
-from ghpt.data.views import look_through
-from ghpt.doctor import examine
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.camera_writers import write_aniposelib, write_pose2sim
+from ghpt.data.formats.key_points import KeyPoints, write_key_points
+from ghpt.data.people.views import look_through
+from ghpt.data.synthetic.rigs import Rig, human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.predict import predict
-from ghpt.prediction.commands import commands_on, setting
-from ghpt.prediction.verdict import Commands, Judge, Level
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import CONF, cameras_file, config, walk
 

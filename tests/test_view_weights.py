@@ -7,13 +7,13 @@ import torch
 from torch import nn
 
 from ghpt.errors import GhptConfigError
-from ghpt.models.baselines import Linear, person_size
+from ghpt.models.estimators.classical import Linear, person_size
+from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
+from ghpt.models.estimators.view_weights import ViewWeights
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
-from ghpt.models.pose import PoseTriangulation
-from ghpt.models.ransac import AdaptiveRansac, Ransac
-from ghpt.models.view_weights import ViewWeights
-from ghpt.reproduction.perturbation import RotatedCameras
+from ghpt.models.pose.problem import PoseTriangulation
+from ghpt.paper.robustness.perturbation import RotatedCameras
 from scenes import random_scene
 
 CONSENSUS = Ransac(threshold=0.03, pairs=64, seed=0)

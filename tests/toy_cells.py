@@ -7,7 +7,7 @@ from typing import Any
 
 from ghpt.errors import GhptDataError
 from ghpt.files import write_json
-from ghpt.reproduction.cells import Cell, read_json
+from ghpt.paper.engine.cells import Cell, read_json
 
 
 def add(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:

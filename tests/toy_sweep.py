@@ -7,10 +7,10 @@ import sys
 import time
 from pathlib import Path
 
-from ghpt.app import Command, run
+from ghpt.commands.app import Command, run
+from ghpt.commands.outputs import Files
 from ghpt.errors import GhptConfigError
 from ghpt.files import atomic_write
-from ghpt.outputs import Files
 
 
 def task(config, output):

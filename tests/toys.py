@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from ghpt.data.datamodule import KeyPointDataModule
+from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.recording import Recording
 
@@ -18,7 +18,7 @@ DATA = {
 
 MODEL = {
     "_target_": "ghpt.models.module.StochasticEstimator",
-    "problem": {"_target_": "ghpt.models.pose.PoseTriangulation", "coordinates": True, "lengths": True},
+    "problem": {"_target_": "ghpt.models.pose.problem.PoseTriangulation", "coordinates": True, "lengths": True},
     "scorer": {
         "_target_": "ghpt.models.scorer.Scorer", "_partial_": True,
         "layers": [32, 16], "clip": 10.0, "bfloat16": False,

@@ -1,7 +1,7 @@
 """Every output is written through here: to a temporary name in the same folder, checked, then moved.
 
 A reader therefore never sees half a file, and a crash at any instant leaves the previous file as it
-was. Within the output folder of a command, `ghpt.outputs` guards what may be replaced or removed.
+was. Within the output folder of a command, `ghpt.commands.outputs` guards what may be replaced or removed.
 """
 
 import errno
@@ -34,7 +34,7 @@ _ABANDONED = 24 * 3600.0
 
 @runtime_checkable
 class Guard(Protocol):
-    """Decides what may happen to the files of a folder; see `ghpt.outputs.OutputFolder`."""
+    """Decides what may happen to the files of a folder; see `ghpt.commands.outputs.OutputFolder`."""
 
     def before_replace(self, path: Path, new: Path) -> None:
         """``new`` is about to take the place of ``path``. Raises GhptDataError if it must not."""

@@ -25,11 +25,11 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from damage import _spoilt as spoil_bytes
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.camera_writers import write_opencv, write_pose2sim
-from ghpt.data.key_points import KeyPoints, read_people, write_key_points
-from ghpt.data.rigs import panoptic_rig
-from ghpt.data.skeletons import SKELETONS
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.camera_writers import write_opencv, write_pose2sim
+from ghpt.data.formats.key_points import KeyPoints, read_people, write_key_points
+from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.synthetic.rigs import panoptic_rig
 from ghpt.errors import GhptDataError
 
 SECONDS, BATCH, MEMORY = 1.0, 200, 1 << 30

@@ -9,7 +9,7 @@ import warnings
 from pathlib import Path
 
 import toys
-from ghpt.train import train
+from ghpt.commands.train import train
 
 
 def main(folder: str, changes: str) -> None:
@@ -20,9 +20,9 @@ def main(folder: str, changes: str) -> None:
         config[part] = config[part] | wanted.get(part, {})
     train(config, Path(folder))
     if wanted.get("test"):
-        from ghpt.test import test
+        from ghpt.commands.test import test
 
-        baselines = {"linear": {"_target_": "ghpt.models.baselines.Linear"}}
+        baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
         again = {**config, "ckpt": str(Path(folder) / "last.ckpt"), "hypotheses": None, "baselines": baselines}
         test(again, Path(folder))
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ghpt.metrics.relative_pose import rotation_deg
-from ghpt.models.scale import BodyHeight, average_lengths, body_scale
+from ghpt.models.relative_pose.scale import BodyHeight, average_lengths, body_scale
 from ghpt.skeleton import BONES, MIRROR
 from rigs_with_people import People, calibration, people, relative
 

@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from hostile import forked
 
-from ghpt.data.camera_files import read_cameras
-from ghpt.data.key_points import read_people
-from ghpt.data.labels import read_labels
+from ghpt.commands.prediction.stored import open_stored
+from ghpt.data.datasets.labels import read_labels
+from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.key_points import read_people
 from ghpt.errors import GhptDataError
-from ghpt.prediction.stored import open_stored
 
 SECONDS, MEBIBYTES = 1.0, 256
 """Of the processor, and of memory."""

@@ -18,10 +18,10 @@ import ghpt.config
 import ghpt.models.checkpoint
 import toys
 from ghpt import files
+from ghpt.commands.train import train
 from ghpt.config import build, locate
 from ghpt.errors import GhptCheckpointError
 from ghpt.models.checkpoint import FIELD, load_model
-from ghpt.train import train
 from signing import checkpoint_around, save_pickle, save_signed, signed, text
 
 WATCHED = (
@@ -131,46 +131,46 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.models.registry.sys.exit": {},
         # ours, which read
         "ghpt.export.npz.read_reconstruction": {"path": str(ckpt)},
-        "ghpt.data.camera_files.read_cameras": {"path": str(ckpt)},
-        "ghpt.data.key_points.read_people": {"path": str(ckpt)},
-        "ghpt.data.store.open_store": {"folder": folder},
-        "ghpt.data.store.cache_root": {},
-        "ghpt.report.predictions.open_predictions": {"path": str(ckpt)},
+        "ghpt.data.formats.camera_files.read_cameras": {"path": str(ckpt)},
+        "ghpt.data.formats.key_points.read_people": {"path": str(ckpt)},
+        "ghpt.data.datasets.store.open_store": {"folder": folder},
+        "ghpt.data.datasets.store.cache_root": {},
+        "ghpt.models.pose.predictions.open_predictions": {"path": str(ckpt)},
         "ghpt.models.checkpoint.read_checkpoint": {"path": str(ckpt)},
         "ghpt.models.checkpoint.load_model": {"path": str(ckpt), "trust": ["evil_module"]},
         # ours, which write and delete
         "ghpt.files.sweep_temporaries": {"folder": folder},
         "ghpt.files.atomic_write": {"path": f"{folder}/keep.txt"},
         "ghpt.files.atomic_folder": {"path": folder},
-        "ghpt.report.evaluate.write_metrics": {"path": f"{folder}/keep.txt", "metrics": {}},
+        "ghpt.models.pose.evaluation.write_metrics": {"path": f"{folder}/keep.txt", "metrics": {}},
         "ghpt.report.tables.write_report": {"path": f"{folder}/keep.txt", "metrics": {}},
         "ghpt.report.tensorboard.write_parts": {"folder": f"{folder}/events", "parts": {}},
-        "ghpt.report.predictions.PredictionWriter": {"folder": folder, "count": 1, "names": ["weight"]},
-        "ghpt.data.store.write_store": {"folder": f"{folder}/store", "recordings": [], "provenance": {}},
+        "ghpt.models.pose.predictions.PredictionWriter": {"folder": folder, "count": 1, "names": ["weight"]},
+        "ghpt.data.datasets.store.write_store": {"folder": f"{folder}/store", "recordings": [], "provenance": {}},
         # ours, which build, start or change something
-        "ghpt.config.build": {"config": {"_target_": "ghpt.prediction.shards._parsed", "line": order}},
+        "ghpt.config.build": {"config": {"_target_": "ghpt.commands.prediction.shards._parsed", "line": order}},
         "ghpt.config._is_module": {"name": "evil_module"},
         "ghpt.models.registry.check_trust": {"trust": ["mine"]},
         "ghpt.models.registry.register": {"part": "model.problem"},
         "ghpt.models.registry.Part": {"kind": {"_target_": "ghpt.config.suggest", "_partial_": True}},
         "ghpt.provenance.commit": {},
         "ghpt.provenance.provenance": {"seed": 0},
-        "ghpt.app._quieten": {},
-        "ghpt.jobs.take_signals": {},
-        "ghpt.jobs.first_of_several_ends": {},
-        "ghpt.train.make_trainer": {"settings": {"logger": False}},
-        "ghpt.train.train": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
-        "ghpt.test.test": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
-        "ghpt.reproduction.cells.read_json": {"path": {"_target_": "ghpt.files.Path"}},
-        "ghpt.reproduction.setup.compose": {"conf": {"_target_": "ghpt.files.Path"}, "name": "x", "overrides": []},
+        "ghpt.commands.app._quieten": {},
+        "ghpt.commands.jobs.take_signals": {},
+        "ghpt.commands.jobs.first_of_several_ends": {},
+        "ghpt.commands.train.make_trainer": {"settings": {"logger": False}},
+        "ghpt.commands.train.train": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
+        "ghpt.commands.test.test": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
+        "ghpt.paper.engine.cells.read_json": {"path": {"_target_": "ghpt.files.Path"}},
+        "ghpt.paper.engine.setup.compose": {"conf": {"_target_": "ghpt.files.Path"}, "name": "x", "overrides": []},
         # our classes, and torch's, that no checkpoint has a use for
         "ghpt.models.checkpoint.AtomicCheckpointIO": {},
         "ghpt.models.callbacks.Progress": {},
         "ghpt.models.callbacks.LogHyperparameters": {"values": {}},
         "ghpt.report.logger.ForgivingTensorBoard": {"folder": {"_target_": "ghpt.files.Path"}},
         "ghpt.errors.GhptConfigError": {"key": "a", "problem": "b", "mend": "c"},
-        "ghpt.models.baselines.Linear": {},
-        "ghpt.data.pairs.PairSettings": {"frames": 8, "draws": 1, "points": 10},
+        "ghpt.models.estimators.classical.Linear": {},
+        "ghpt.data.datasets.pairs.PairSettings": {"frames": 8, "draws": 1, "points": 10},
         "torch.nn.Identity": {},
         "torch.nn.modules.module.Module": {},
         "torch.optim.Optimizer": {"params": [], "defaults": {}},
@@ -308,8 +308,8 @@ SHAPES = {
     "target is empty": {"problem": {"_target_": ""}},
     "target of dots": {"problem": {"_target_": "..."}},
     "target is a module": {"problem": {"_target_": "ghpt.files"}},
-    "target with a newline": {"problem": {"_target_": "ghpt.models.pose.PoseTriangulation\n"}},
-    "target with a space": {"problem": {"_target_": " ghpt.models.pose.PoseTriangulation"}},
+    "target with a newline": {"problem": {"_target_": "ghpt.models.pose.problem.PoseTriangulation\n"}},
+    "target with a space": {"problem": {"_target_": " ghpt.models.pose.problem.PoseTriangulation"}},
     "target relative": {"problem": {"_target_": ".pose.PoseTriangulation"}},
     "registered for another part": {"problem": toys.MODEL["loss"]},
     "an optimizer as the scorer": {"scorer": ADAM},

@@ -20,11 +20,11 @@ import torch
 
 import toys
 from ghpt import files
+from ghpt.commands.train import resumable, train
 from ghpt.config import build
 from ghpt.errors import GhptCheckpointError
 from ghpt.models import checkpoint as module_of_checkpoints
 from ghpt.models.checkpoint import FIELD, AtomicCheckpointIO, load_model, read_checkpoint
-from ghpt.train import resumable, train
 from signing import save_signed, signed
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -261,7 +261,7 @@ def test_b6_a_run_with_a_damaged_checkpoint_ends_with_the_same_numbers(
     path.unlink()
     if damage != "gone":
         path.write_bytes(flipped(whole, 80_000) if damage == "bit" else b"")
-    with caplog.at_level(logging.WARNING, "ghpt.train"):
+    with caplog.at_level(logging.WARNING, "ghpt.commands.train"):
         train(settings(resume=True), stopped)
     said = [message for message in caplog.messages if PREVIOUS in message]
     assert len(said) == 1
@@ -449,7 +449,7 @@ def test_a_command_ends_in_one_line(
 ) -> None:
     path = tmp_path / "bad.ckpt"
     BAD[name](path, (trained / LAST).read_bytes())
-    module = importlib.import_module(f"ghpt.{command}")
+    module = importlib.import_module(f"ghpt.commands.{command}")
     words = (f"ckpt={path}", f"output={tmp_path / 'out'}", "progress_bar=false")
     status, out, said = typed(CONF, module.COMMAND, words)
     assert (status, out) == (1, "")

@@ -19,8 +19,8 @@ import numpy as np
 import pytest
 
 import real_layout as layout
-from ghpt.data.labels import read_labels
-from ghpt.data.validate import read_npy, read_npz
+from ghpt.data.datasets.labels import read_labels
+from ghpt.data.formats.validate import read_npy, read_npz
 from ghpt.errors import GhptDataError
 
 WATCHED = ("exec", "import", "subprocess.", "socket.", "os.system", "os.exec", "os.posix_spawn", "os.fork",

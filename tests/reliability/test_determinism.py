@@ -12,14 +12,14 @@ import pytest
 import torch
 
 import toys
+from ghpt.commands.test import test as run_test
+from ghpt.commands.train import train
 from ghpt.models.checkpoint import read_checkpoint
-from ghpt.test import test as run_test
-from ghpt.train import train
 
 SCRIPT = Path(__file__).with_name("run_toy.py")
 BASELINES = {
-    "linear": {"_target_": "ghpt.models.baselines.Linear"},
-    "ransac": {"_target_": "ghpt.models.ransac.Ransac", "threshold": 0.02, "pairs": 4, "seed": 0},
+    "linear": {"_target_": "ghpt.models.estimators.classical.Linear"},
+    "ransac": {"_target_": "ghpt.models.estimators.ransac.Ransac", "threshold": 0.02, "pairs": 4, "seed": 0},
 }
 
 

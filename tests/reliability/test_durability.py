@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
-from ghpt.data.key_points import KeyPoints, write_key_points
-from ghpt.data.rigs import human36m_rig
-from ghpt.data.store import write_store
+from ghpt.commands.prediction.shards import MANIFEST, Shards
+from ghpt.data.datasets.store import write_store
+from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
+from ghpt.data.formats.key_points import KeyPoints, write_key_points
+from ghpt.data.formats.stored_npz import members_of
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import WRITERS, Scene
 from ghpt.files import atomic_write
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO
-from ghpt.prediction.shards import MANIFEST, Shards
-from ghpt.report.evaluate import write_metrics
-from ghpt.report.rows import RowWriter
-from ghpt.report.stored_npz import members_of
-from ghpt.reproduction.cells import Cell, perform
+from ghpt.models.pose.evaluation import write_metrics
+from ghpt.models.rows import RowWriter
+from ghpt.paper.engine.cells import Cell, perform
 from ghpt.skeleton import JOINTS
 from reconstructions import about, in_parts, random_reconstruction, rig
 from toys import recording

@@ -10,14 +10,14 @@ import pytest
 import yaml
 from tensorboard.summary.writer.record_writer import RecordWriter
 
-import ghpt.test as testing
+import ghpt.commands.test as testing
 import toys
-from ghpt import predict as prediction
+from ghpt.commands import predict as prediction
+from ghpt.commands.prediction.shards import MANIFEST, Shards
+from ghpt.commands.train import COMMAND
 from ghpt.models.checkpoint import read_checkpoint
-from ghpt.prediction.shards import MANIFEST, Shards
-from ghpt.report.rows import RowWriter
-from ghpt.reproduction.pool import perform_all
-from ghpt.train import COMMAND
+from ghpt.models.rows import RowWriter
+from ghpt.paper.engine.pool import perform_all
 from predicting import frames_of
 from reconstructions import random_reconstruction
 from toy_cells import cell

@@ -9,13 +9,13 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from ghpt.data.lens import distort, undistort
 from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.lens import distort, undistort
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import Status, triangulate, triangulate_subsets
-from ghpt.models.baselines import Linear, MEstimator, WeightedLinear
-from ghpt.models.lo_ransac import LoRansac
-from ghpt.models.ransac import Ransac
+from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear
+from ghpt.models.estimators.lo_ransac import LoRansac
+from ghpt.models.estimators.ransac import Ransac
 from ghpt.randomness import key
 from scenes import Scene, random_scene
 

@@ -36,7 +36,7 @@ def child(folder: str, steps: int) -> None:
     import lightning as L
 
     import toys
-    from ghpt import train as training
+    from ghpt.commands import train as training
 
     class Probe(L.Callback):
         def on_train_batch_end(self, trainer, *_):

@@ -9,7 +9,7 @@ import numpy as np
 
 READ = """
 import resource, sys, time
-from ghpt.data.key_points import read_people
+from ghpt.data.formats.key_points import read_people
 before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
 people = read_people(sys.argv[1], "body_25")
 seconds = time.process_time() - start

@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.rigs import human36m_rig
+from ghpt.commands.prediction.gaps import Gaps, after
+from ghpt.commands.prediction.shards import Shards
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import WRITERS, read_reconstruction
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.models.baselines import Linear
-from ghpt.models.predictors import Classical
-from ghpt.models.quality import Quality
-from ghpt.prediction.gaps import Gaps, after
-from ghpt.prediction.shards import Shards
+from ghpt.models.estimators.classical import Linear
+from ghpt.models.estimators.predictors import Classical
+from ghpt.models.estimators.uncertainty import Quality
 from ghpt.reconstruction import About, State
 from ghpt.recording import KeyPointBatch
 from ghpt.skeleton import JOINTS

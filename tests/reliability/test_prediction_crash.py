@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ghpt import predict as command
-from ghpt.prediction.shards import MANIFEST
+from ghpt.commands import predict as command
+from ghpt.commands.prediction.shards import MANIFEST
 from predicting import config, frames_of
 
 OUTPUTS = ("poses.npz", "poses.csv", "poses.trc", "prediction.json", "report.md")

@@ -10,8 +10,8 @@ sys.path.insert(0, {tests!r})
 import torch
 from pathlib import Path
 from predicting import config, frames_of
-from ghpt import predict as command
-from ghpt.prediction import run
+from ghpt.commands import predict as command
+from ghpt.commands.prediction import run
 
 def anonymous():
     with open("/proc/self/status") as handle:

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.data.rigs import human36m_rig
+from ghpt.commands.predict import predict
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import project
-from ghpt.predict import predict
 from ghpt.reconstruction import State
 from predicting import cameras_file, config, openpose_folders, walk, write_people
 

@@ -15,7 +15,7 @@ from ghpt.calibration.observations import Observations
 from ghpt.calibration.pairs import PairTable
 from ghpt.calibration.repair import find_repair
 from ghpt.calibration.resection import Resection, Rig
-from ghpt.models.scale import HUMAN, STATURES, stature
+from ghpt.models.relative_pose.scale import HUMAN, STATURES, stature
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from ghpt.calibration.observations import typical_size
 from ghpt.calibration.resection import Rig
 from ghpt.calibration.uncertainty import Uncertainty
 from ghpt.errors import check_positive
-from ghpt.models.scale import average_lengths, part_scales
+from ghpt.models.relative_pose.scale import average_lengths, part_scales
 
 
 @dataclass(frozen=True)

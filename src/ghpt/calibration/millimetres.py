@@ -14,10 +14,10 @@ from torch import Tensor
 
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.rig import RigEstimate
-from ghpt.data.names import chosen_name
+from ghpt.data.formats.names import chosen_name
 from ghpt.errors import GhptConfigError, check
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.scale import SEGMENTS, BodyHeight, SegmentLengths, body_scale, typical_lengths
+from ghpt.models.relative_pose.scale import SEGMENTS, BodyHeight, SegmentLengths, body_scale, typical_lengths
 
 UNITS = {"millimetres": 1.0, "centimetres": 10.0, "metres": 1000.0}
 _HEIGHTS = (800.0, 2600.0)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.epipolar import normalise
-from ghpt.models.baselines import person_size
+from ghpt.models.estimators.classical import person_size
 
 
 @dataclass(frozen=True)

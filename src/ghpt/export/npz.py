@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from ghpt.data.formats.stored_npz import Member, add_member, members_of, read_rows, text_table
 from ghpt.errors import GhptDataError
 from ghpt.export.stream import PIECE, Chunks, pieces
 from ghpt.files import atomic_write
 from ghpt.reconstruction import About, Reconstruction, State
-from ghpt.report.stored_npz import Member, add_member, members_of, read_rows, text_table
 
 FORMAT_VERSION = 2
 _POINTS = {1: "<f4", 2: "<f8"}

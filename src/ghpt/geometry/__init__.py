@@ -1,0 +1,1 @@
+"""Pure functions on tensors: cameras, rotations, lenses, triangulation, epipolar geometry."""

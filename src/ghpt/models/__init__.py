@@ -1,0 +1,1 @@
+"""The loop (module, problem, scorer, selection, loss, checkpoint) and the estimators."""

@@ -19,10 +19,10 @@ from ghpt.config import build, locate, suggest
 from ghpt.errors import GhptConfigError
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
-from ghpt.models.pose import PoseTriangulation
+from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.models.problem import Problem
-from ghpt.models.relative_pose import RelativePose
-from ghpt.models.scale import BodyHeight, KnownScale, Scale, SegmentLengths
+from ghpt.models.relative_pose.problem import RelativePose
+from ghpt.models.relative_pose.scale import BodyHeight, KnownScale, Scale, SegmentLengths
 from ghpt.models.scorer import Scorer
 
 _METHODS = ("generate", "describe", "combine", "expand", "error")

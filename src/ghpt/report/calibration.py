@@ -14,8 +14,8 @@ from rich.table import Table
 from rich.text import Text
 from torch import Tensor
 
-from ghpt.models.baselines import Baseline
-from ghpt.models.scale import SEGMENTS
+from ghpt.models.estimators.classical import Baseline
+from ghpt.models.relative_pose.scale import SEGMENTS
 from ghpt.recording import Recording
 from ghpt.report.escape import escaped, plain
 from ghpt.report.rig_comparison import held_out_errors, rig_difference, segment_variation, triangulate_recording

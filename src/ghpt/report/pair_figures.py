@@ -11,9 +11,9 @@ from matplotlib.lines import Line2D
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
+from ghpt.models.relative_pose.evaluation import camera_after
 from ghpt.recording import RelativePoseEstimate
 from ghpt.report.figures import TRUTH, wrapped
-from ghpt.report.pair_evaluate import camera_after
 from ghpt.report.pair_tables import NAMES
 
 # Okabe and Ito's palette again; told apart in grey print by markers and dashes.

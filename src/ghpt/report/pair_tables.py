@@ -11,10 +11,10 @@ from rich.console import Console
 from rich.table import Table
 
 from ghpt.files import atomic_write
+from ghpt.models.relative_pose.evaluation import ALONE, ERRORS
 from ghpt.models.selection import SELECTIONS
+from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
 from ghpt.report.escape import code, escaped, plain
-from ghpt.report.pair_evaluate import ALONE, ERRORS
-from ghpt.report.paper import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
 from ghpt.report.tables import NONE, Rows, markdown, title, trained_on
 
 NAMES = {

@@ -8,13 +8,13 @@ from typing import Any
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
+from ghpt.models.relative_pose.evaluation import ERRORS, pair_errors
+from ghpt.models.relative_pose.predictions import PairPredictions
+from ghpt.models.rows import WEIGHTS
 from ghpt.recording import RelativePoseEstimate
 from ghpt.report.figures import image
-from ghpt.report.pair_evaluate import ERRORS, pair_errors
 from ghpt.report.pair_figures import rig_figure
-from ghpt.report.pair_predictions import PairPredictions
 from ghpt.report.pair_tables import MANY
-from ghpt.report.rows import WEIGHTS
 from ghpt.report.tables import title
 from ghpt.report.tensorboard import write_hyperparameters, write_parts, write_weights
 

@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, TypedDict
 
 from ghpt.config import build
+from ghpt.models.collect import CollectPairs
 from ghpt.models.module import StochasticEstimator
+from ghpt.models.relative_pose.evaluation import evaluate_pairs
+from ghpt.models.relative_pose.predictions import open_pairs
 from ghpt.recording import PairBatch, RelativePoseEstimate
-from ghpt.report.collect import CollectPairs
-from ghpt.report.pair_evaluate import evaluate_pairs
-from ghpt.report.pair_predictions import open_pairs
 from ghpt.report.pair_tables import print_pair_tables, write_pair_report
 from ghpt.report.pair_tensorboard import write_pair_events
 from ghpt.report.report import Report

@@ -4,11 +4,11 @@ from collections.abc import Callable, Mapping
 from typing import Any, NotRequired, TypedDict
 
 from ghpt.config import build
+from ghpt.models.collect import CollectPoses
 from ghpt.models.module import StochasticEstimator
+from ghpt.models.pose.evaluation import evaluate
+from ghpt.models.pose.predictions import open_predictions
 from ghpt.recording import KeyPointBatch, PoseEstimate
-from ghpt.report.collect import CollectPoses
-from ghpt.report.evaluate import evaluate
-from ghpt.report.predictions import open_predictions
 from ghpt.report.report import Report
 from ghpt.report.tables import print_table, write_report
 from ghpt.report.tensorboard import write_events

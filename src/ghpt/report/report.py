@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ghpt.report.collect import Collect
+from ghpt.models.collect import Collect
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from torch import Tensor
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.rotations import nearest_rotation
 from ghpt.metrics.relative_pose import rotation_deg
-from ghpt.models.baselines import Baseline
+from ghpt.models.estimators.classical import Baseline
 from ghpt.recording import KeyPointBatch, Recording
 from ghpt.skeleton import BONES, JOINT, PELVIS, THORAX
 

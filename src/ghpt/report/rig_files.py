@@ -15,9 +15,9 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from torch import Tensor
 
 from ghpt.calibration.rig import RigEstimate
-from ghpt.data.camera_files import CameraFile
-from ghpt.data.camera_writers import write_aniposelib, write_opencv, write_pose2sim
-from ghpt.data.rigs import Rig
+from ghpt.data.formats.camera_files import CameraFile
+from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
+from ghpt.data.synthetic.rigs import Rig
 from ghpt.files import atomic_write, finite, remove, write_json
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording

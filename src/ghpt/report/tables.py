@@ -12,8 +12,8 @@ from rich.table import Table
 from ghpt.files import atomic_write
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.selection import SELECTIONS
+from ghpt.paper.published import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 from ghpt.report.escape import code, escaped, plain
-from ghpt.report.paper import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 
 NAMES = {
     "h36m": "Human3.6M", "panoptic": "Panoptic",

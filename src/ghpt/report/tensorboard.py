@@ -13,10 +13,10 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from ghpt.metrics.pose_error import joint_errors
+from ghpt.models.pose.predictions import PredictionChunk, Predictions
+from ghpt.models.rows import WEIGHTS
 from ghpt.recording import PoseEstimate
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
-from ghpt.report.predictions import PredictionChunk, Predictions
-from ghpt.report.rows import WEIGHTS
 from ghpt.report.tables import title, trained_on
 
 SHOWN = ("weight", "most", "least", "random")

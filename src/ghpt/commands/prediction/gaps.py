@@ -1,0 +1,174 @@
+"""Filling and smoothing, on request alone, and marked: nothing is invented outside of what was observed."""
+
+from __future__ import annotations
+
+import math
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int
+from scipy.interpolate import PchipInterpolator
+from scipy.signal import butter, sosfiltfilt
+
+from ghpt.commands.prediction.shards import Shards
+from ghpt.errors import GhptConfigError, check
+from ghpt.files import allocate
+from ghpt.reconstruction import Reconstruction, State
+
+_ORDER = 2
+"""Of the filter in one direction; forwards and backwards it is twice that."""
+Chunks = Callable[[], Iterator[Reconstruction]]
+
+
+@dataclass(frozen=True)
+class Gaps:
+    """What is done to a joint's path over the frames.
+
+    ``longest``: gaps of at most so many frames are interpolated between the observed frames on both sides (None: none);
+    ``interpolation``: ``pchip`` or ``linear``; ``cut_off_hz``: of a zero-phase Butterworth low-pass filter of fourth
+    order over every run of frames with a position (None: no filter), which takes ``rate_hz``.
+    """
+
+    longest: int | None
+    interpolation: str
+    cut_off_hz: float | None
+    rate_hz: float | None
+
+    def __post_init__(self) -> None:
+        known = ("pchip", "linear")
+        check(self.interpolation in known, "interpolation", f"is {self.interpolation!r}", f"Existing: {known}.")
+        if self.cut_off_hz is None:
+            return
+        rate = _known("smooth", self.rate_hz, "Give rate_hz=60, say.")
+        mend = f"Give more than 0 and less than half the frame rate of {rate:g} Hz."
+        check(0 < self.cut_off_hz < rate / 2, "smooth", f"is {self.cut_off_hz:g} Hz", mend)
+
+    @property
+    def nothing(self) -> bool:
+        return self.longest is None and self.cut_off_hz is None
+
+    def __call__(
+        self, frame: Int[np.ndarray, " T"], points: Float[np.ndarray, "T 3"], state: Int[np.ndarray, " T"]
+    ) -> tuple[Float[np.ndarray, "T 3"], Int[np.ndarray, " T"]]:
+        """One joint's path, filled and smoothed, with its states; frames without a position keep their reason."""
+        step = frame_step(frame)
+        if self.longest is not None:
+            points, state = self._fill(frame, points, state, step)
+        if self.cut_off_hz is not None:
+            points = self._smooth(frame, points, state <= State.FILLED, step)
+        return points, state
+
+    def _fill(
+        self, frame: np.ndarray, points: np.ndarray, state: np.ndarray, step: int
+    ) -> tuple[np.ndarray, np.ndarray]:
+        known = np.flatnonzero(state == State.OBSERVED)
+        after = np.searchsorted(known, np.arange(len(frame)))
+        inside = (state != State.OBSERVED) & (after > 0) & (after < len(known))
+        rows = np.flatnonzero(inside)
+        left, right = known[after[rows] - 1], known[after[rows]]
+        rows = rows[frame[right] - frame[left] <= (self.longest + 1) * step]
+        x, y = frame[known].astype(np.float64), points[known].astype(np.float64)
+        points, state = points.copy(), state.copy()
+        if len(rows):
+            points[rows] = _interpolated(x, y, frame[rows].astype(np.float64), self.interpolation)
+            state[rows] = State.FILLED
+        return points, state
+
+    def _smooth(self, frame: np.ndarray, points: np.ndarray, placed: Bool[np.ndarray, " T"], step: int) -> np.ndarray:
+        sections = butter(_ORDER, self.cut_off_hz, fs=self.rate_hz, output="sos")
+        points = points.copy()
+        for run in runs(frame, placed, step):
+            if len(run) > 1:
+                padding = min(3 * (_ORDER + 1), len(run) - 1)
+                points[run] = sosfiltfilt(sections, points[run].astype(np.float64), axis=0, padlen=padding)
+        return points
+
+
+def gap_frames(fill: int | str | None, rate_hz: float | None) -> int | None:
+    """The longest gap in frames, of ``6`` or of seconds as ``0.1s``. Raises GhptConfigError."""
+    mend = "Give frames (fill=6) or seconds (fill=0.1s)."
+    if fill is None:
+        return None
+    if isinstance(fill, int) and not isinstance(fill, bool):
+        check(fill >= 1, "fill", f"is {fill}", mend)
+        return fill
+    seconds = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?s", str(fill))
+    if seconds is None:
+        raise GhptConfigError("fill", f"is {fill!r}", mend)
+    rate = _known("fill", rate_hz, "Give rate_hz=60, say, or frames: fill=6.")
+    frames = int(float(seconds[1]) * rate + 1e-9)
+    check(frames >= 1, "fill", f"is less than a frame at {rate:g} Hz", mend)
+    return frames
+
+
+def _known(key: str, rate_hz: float | None, mend: str) -> float:
+    """The frame rate. Raises GhptConfigError for ``key`` unless it is one."""
+    rate = rate_hz or math.nan
+    check(0 < rate < math.inf, key, "needs the frame rate, which the files do not tell", mend)
+    return rate
+
+
+def frame_step(frame: Int[np.ndarray, " T"]) -> int:
+    """How far the numbers of successive frames are apart: the median."""
+    return int(np.median(np.diff(frame))) if len(frame) > 1 else 1
+
+
+def runs(frame: Int[np.ndarray, " T"], placed: Bool[np.ndarray, " T"], step: int) -> list[Int[np.ndarray, " N"]]:
+    """The rows of each unbroken run of placed frames; a frame number that is left out breaks it."""
+    rows = np.flatnonzero(placed)
+    broken = (np.diff(rows) > 1) | (np.diff(frame[rows]) > step)
+    return [run for run in np.split(rows, np.flatnonzero(broken) + 1) if len(run)]
+
+
+def _interpolated(x: np.ndarray, y: np.ndarray, at: np.ndarray, kind: str) -> np.ndarray:
+    if kind == "pchip":
+        return PchipInterpolator(x, y, axis=0)(at)
+    return np.stack([np.interp(at, x, y[:, i]) for i in range(3)], axis=-1)
+
+
+@contextmanager
+def _scratch(folder: Path, dtype: str, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
+    """An array of zeros in a nameless file of ``folder``. Raises OSError if the disk lacks the space."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    with tempfile.TemporaryFile(dir=folder) as handle:
+        allocate(handle, size, folder)
+        yield np.memmap(handle, dtype, "r+", shape=shape)
+
+
+@contextmanager
+def after(gaps: Gaps, shards: Shards, joints: int, folder: Path) -> Iterator[Chunks]:
+    """The shards as they are to be written: as they are, or filled and smoothed.
+
+    Joint by joint, each over all frames, so that no border between chunks shows: memory holds one joint's path, the
+    others are in a nameless temporary file in ``folder``. Raises OSError if the disk lacks the space for it.
+    """
+    if gaps.nothing:
+        yield shards.chunks
+        return
+    frames = shards.frames
+    paths, states = (joints, frames, 3), (joints, frames)
+    with _scratch(folder, "<f8", paths) as points, _scratch(folder, "|i1", states) as state:
+        frame = np.zeros(frames, np.int64)
+        for shard, part in enumerate(shards.chunks()):
+            rows = slice(shards.rows(shard).start, shards.rows(shard).stop)
+            frame[rows] = part.frame.numpy()
+            points[:, rows], state[:, rows] = part.points.numpy().transpose(1, 0, 2), part.state.numpy().T
+        for joint in range(joints):
+            points[joint], state[joint] = gaps(frame, np.array(points[joint]), np.array(state[joint]))
+
+        def chunks() -> Iterator[Reconstruction]:
+            for shard, part in enumerate(shards.chunks()):
+                rows = slice(shards.rows(shard).start, shards.rows(shard).stop)
+                changed = (
+                    np.ascontiguousarray(points[:, rows].transpose(1, 0, 2)),
+                    np.ascontiguousarray(state[:, rows].T),
+                )
+                yield replace(part, points=torch.from_numpy(changed[0]), state=torch.from_numpy(changed[1]))
+
+        yield chunks

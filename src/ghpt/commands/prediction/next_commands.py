@@ -1,0 +1,67 @@
+"""What can be typed next on the same input, complete and as a shell takes it."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ghpt.commands.inputs import InputSettings
+from ghpt.commands.prediction.verdict import Commands
+from ghpt.commands.train import shown, typed
+
+_HEIGHT = 1750
+"""mm: stands for the person's own."""
+
+
+def commands_on(config: Mapping[str, Any], output: Path) -> Commands:
+    """The commands for what predict.py was given; each writes beside ``output``."""
+    inputs = {key: config[key] for key in InputSettings.__annotations__ if key != "data"}
+    given = {key: value for key, value in inputs.items() if value is not None}
+    if not config["keypoints"]:
+        given |= {"data": config["data"]["name"]}
+    own = {key: config[key] for key in ("person", "ckpt") if config[key]}
+
+    def command(script: str, suffix: str, values: Mapping[str, Any]) -> str:
+        words = [setting(key, value) for key, value in values.items()]
+        return " ".join(["python", script, *words, typed("output", shown(output) + suffix)])
+
+    def predict(**more: Any) -> str:
+        return command("predict.py", "_again", given | own | more)
+
+    return Commands(
+        cameras=command("cameras.py", "_checked", given),
+        calibrate=command("calibrate.py", "_calibrated", given | {"scale.height": _HEIGHT}),
+        predict=predict,
+    )
+
+
+def setting(key: str, value: object) -> str:
+    """``key=value`` as a shell and Hydra's grammar take it, lists and mappings among the values."""
+    if isinstance(value, Mapping):
+        pairs = (f"{_key(str(name))}: {_element(of)}" for name, of in value.items())
+        return shlex.quote(f"{key}={{{', '.join(pairs)}}}")
+    if isinstance(value, list | tuple):
+        return shlex.quote(f"{key}={_list(value)}")
+    if isinstance(value, float):
+        return f"{key}={value:g}"
+    return typed(key, value)
+
+
+def _list(values: Iterable[object]) -> str:
+    return f"[{','.join(map(_element, values))}]"
+
+
+def _key(name: str) -> str:
+    """A mapping's key, which Hydra's grammar has no quotes for."""
+    return re.sub(r"([^\w.-])", r"\\\1", name)
+
+
+def _element(value: object) -> str:
+    """A word of Hydra's grammar; what could be a number, or holds more than letters, is quoted."""
+    text = str(value)
+    if re.fullmatch(r"[A-Za-z_][\w.-]*", text):
+        return text
+    return '"' + text.replace("\\", "\\\\").replace('"', '\\"') + '"'

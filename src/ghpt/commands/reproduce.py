@@ -1,0 +1,214 @@
+"""Every table and figure of the paper again: the cells that are missing, then the report from all of them."""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, TypedDict
+
+import yaml
+
+from ghpt.commands.app import Command
+from ghpt.commands.jobs import Job
+from ghpt.commands.outputs import Files
+from ghpt.commands.train import shown
+from ghpt.config import check_type, suggest
+from ghpt.errors import GhptConfigError, check
+from ghpt.paper.ablations import tables as ablations
+from ghpt.paper.camera import tables as camera_tables
+from ghpt.paper.engine.cells import Cell
+from ghpt.paper.engine.item import Item, Results
+from ghpt.paper.engine.page import Entry, Page, write_page
+from ghpt.paper.engine.pool import perform_all
+from ghpt.paper.engine.setup import Setup
+from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
+from ghpt.paper.pose import figures as pose_figures
+from ghpt.paper.robustness import curves as robustness
+from ghpt.provenance import provenance
+from ghpt.report.escape import code
+from ghpt.report.tables import words
+
+_PARTS = (
+    generalization, other_systems, base_dataset, pose_figures, camera_tables, view_weights, ablations, robustness,
+)  # fmt: skip
+ITEMS: dict[str, Item] = {item.label: item for part in _PARTS for item in part.ITEMS}
+"""Every item by its label, in the report's order."""
+MOST_JOBS = 8
+_log = logging.getLogger(__name__)
+
+
+class Data(TypedDict):
+    """Where the real data sets are; see conf/reproduce.yaml."""
+
+    root: str | None
+    human36m: str | None
+    panoptic: str | None
+
+
+class Overrides(TypedDict):
+    """Of every training and of every test, in the words of their command lines."""
+
+    train: list[str]
+    test: list[str]
+
+
+class Settings(TypedDict):
+    """What `reproduce` needs of the configuration."""
+
+    only: list[str] | str | None
+    seed: int
+    seeds: int
+    jobs: int | None
+    overrides: Overrides
+    data: Data
+    sizes: dict[str, Any]
+    cells: str
+    progress_bar: bool
+
+
+def files(config: dict[str, Any]) -> Files:
+    """What `reproduce` reads and writes. Raises GhptConfigError for settings that cannot work."""
+    check_type(config, Settings, "")
+    roots = [Path(root).expanduser() for root in config["data"].values() if root]
+    return Files(tuple(roots), ("report.md", "report.html", "report.json"))
+
+
+def reproduce(config: dict[str, Any], output: Path, conf: Path) -> dict[str, Any]:
+    """Compute what is missing of the items that are asked for, and write their report into ``output``.
+
+    ``conf`` is the folder of train.yaml and test.yaml. Returns what the report says of itself. Raises GhptConfigError
+    for a label that there is not, and whatever a cell raises, with its name; what was finished by then is kept.
+    """
+    check_type(config, Settings, "")
+    check(config["seeds"] >= 1, "seeds", f"is {config['seeds']}", "It must be >= 1.")
+    check(config["jobs"] is None or config["jobs"] >= 1, "jobs", f"is {config['jobs']}", "It must be >= 1, or null.")
+    return _reproduce(config, seeds_of(config), output, conf)
+
+
+def gather(jobs: Sequence[Job], conf: Path) -> None:
+    """After a sweep over seeds or items: one report of them all in the sweep's folder, from the cells that they kept.
+
+    Where the jobs differ in anything else there is nothing to gather, and each has its own report.
+    """
+    configs = [job.config for job in jobs if not job.failed]
+    if not configs or any(_but_shares(config) != _but_shares(configs[0]) for config in configs):
+        return
+    seeds = sorted({seed for config in configs for seed in seeds_of(config)})
+    everything = any(config["only"] is None for config in configs)
+    only = None if everything else [item.label for config in configs for item in chosen(config["only"])]
+    with_all = {"only": only, "seed": seeds[0], "seeds": len(seeds)}
+    _reproduce(configs[0] | with_all, seeds, Path(configs[0]["output"]), conf)
+
+
+def spread(command: Sequence[str]) -> list[str]:
+    """The words of a command line: in a sweep ``seeds=5`` becomes ``seed=0,1,2,3,4``, a job for each."""
+    words = dict(word.split("=", 1) for word in command if "=" in word)
+    number, first = words.get("seeds", ""), words.get("seed", "0")
+    if not {"-m", "--multirun"} & set(command) or not (number.isdecimal() and first.isdecimal() and int(number) > 1):
+        return list(command)
+    others = [word for word in command if not word.startswith(("seeds=", "seed="))]
+    return [*others, "seed=" + ",".join(str(int(first) + i) for i in range(int(number)))]
+
+
+def seeds_of(config: dict[str, Any]) -> list[int]:
+    return list(range(config["seed"], config["seed"] + config["seeds"]))
+
+
+def _but_shares(config: dict[str, Any]) -> dict[str, Any]:
+    """What the jobs of a sweep that belong together have in common."""
+    return {key: value for key, value in config.items() if key not in ("only", "seed", "seeds")}
+
+
+def _reproduce(config: dict[str, Any], seeds: Sequence[int], output: Path, conf: Path) -> dict[str, Any]:
+    start = time.perf_counter()
+    items = chosen(config["only"])
+    setups = [Setup(conf, _roots(config["data"]), config["overrides"], config["sizes"], seed) for seed in seeds]
+    cells = {item.label: [item.cells(setup) for setup in setups] for item in items}
+    wanted = [cell for of_item in cells.values() for of_seed in of_item for cell in of_seed.values()]
+    folder = Path(config["cells"])
+    jobs = config["jobs"] or min(processors(), MOST_JOBS)
+    try:
+        done = perform_all(wanted, folder, jobs, config["progress_bar"])
+    except (KeyboardInterrupt, SystemExit):
+        _log.warning("Stopped. What was finished is in %s; the same command goes on.", shown(folder))
+        raise
+    entries = [
+        Entry(item, item.section(Results(setups, cells[item.label], folder)), _commands(cells[item.label][0]))
+        for item in items
+    ]
+    page = Page(entries, _about(config, setups, done, start), yaml.safe_dump(config, sort_keys=False))
+    write_page(page, output)
+    held = sum(claim.holds for claim in page.claims)
+    misses = sum(len(entry.misses) for entry in entries)
+    numbers = sum(len(entry.section.compared) for entry in entries)
+    _log.info("%d of %d claims hold, %d of %d numbers miss the paper's.", held, len(page.claims), misses, numbers)
+    _log.info("Report: %s, and report.html", shown(output / "report.md"))
+    return {"claims": len(page.claims), "held": held, "numbers": numbers, "misses": misses}
+
+
+def summary(told: dict[str, Any]) -> str:
+    """What `reproduce` returned, in words."""
+    return f"{told['held']} of {told['claims']} claims hold, {told['misses']} of {told['numbers']} numbers miss"
+
+
+def chosen(only: Sequence[str] | str | None) -> list[Item]:
+    """The items of these labels, with or without ``tab:`` or ``fig:``, or kinds, in the report's order; None: all."""
+    if only is None:
+        return list(ITEMS.values())
+    wanted = [word.removeprefix("tab:").removeprefix("fig:") for word in ([only] if isinstance(only, str) else only)]
+    existing = {*ITEMS, *(item.kind for item in ITEMS.values())}
+    for word in wanted:
+        if word not in existing:
+            raise GhptConfigError("only", f"there is no {word!r}", suggest(word, existing))
+    return [item for item in ITEMS.values() if {item.label, item.kind} & set(wanted)]
+
+
+def processors() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _roots(data: Data) -> dict[str, str | None]:
+    """Each data set's folder. Raises GhptConfigError where ``data.root`` does not hold it."""
+    roots = {}
+    for name in ("human36m", "panoptic"):
+        below = None if data["root"] is None else str(Path(data["root"]).expanduser() / name)
+        roots[name] = data[name] or below
+        if data[name] is None and below is not None and not Path(below).is_dir():
+            mend = f"Put the data set there, or name its folder alone: data.{name}=/path (the other stays embedded)."
+            raise GhptConfigError("data.root", f"{data['root']} has no folder {name}", mend)
+    return roots
+
+
+def _commands(cells: dict[str, Cell]) -> list[str]:
+    """What makes these cells by hand: trainings, then tests."""
+    found: dict[str, None] = {}
+    for cell in cells.values():
+        for before in (*cell.needs.values(), cell):
+            if before.command:
+                found[before.command] = None
+    return sorted(found, key=lambda command: "train.py" not in command)
+
+
+def _about(config: dict[str, Any], setups: Sequence[Setup], done: int, start: float) -> dict[str, Any]:
+    origin = provenance(config["seed"])
+    minutes = (time.perf_counter() - start) / 60
+    seeds = [setup.seed for setup in setups]
+    return {
+        "data": ", ".join(words(data, setups[0].source(data)) for data in ("h36m", "panoptic")),
+        "seeds": f"{len(seeds)} ({', '.join(map(str, seeds))}), of training and hypotheses; the data are the same",
+        "made by": f"ghpt {origin['ghpt']}, commit {origin['commit'] or 'unknown'}, torch {origin['torch']}, "
+        f"numpy {origin['numpy']}, Python {origin['python']}",
+        "command": code(origin["command"]),
+        "run time": f"{minutes:.1f} minutes on {processors()} processors, for {done} cells that were not there before",
+    }  # fmt: skip
+
+
+def command(conf: Path) -> Command:
+    """The command, of the configurations in the folder ``conf``."""
+    task, after = partial(reproduce, conf=conf), partial(gather, conf=conf)
+    return Command("reproduce", task, summary, files, after)

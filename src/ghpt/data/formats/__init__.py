@@ -1,0 +1,1 @@
+"""Foreign key points and cameras, read and written."""

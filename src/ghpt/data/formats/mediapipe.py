@@ -1,0 +1,110 @@
+"""caliscope's CSV of MediaPipe's landmarks: a row for each point, camera and synchronised frame."""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import io
+import re
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.formats.validate import open_input
+from ghpt.errors import GhptDataError
+
+COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
+_LARGEST = 2 << 30
+_LONGEST_LINE = 1 << 12
+_MOST_PORTS = 1000
+_WRITE = "It must be an xy_*.csv that caliscope wrote."
+_JOINTS = len(SKELETONS["mediapipe_33"])
+
+
+def opening(start: bytes) -> str:
+    """The text that a file begins with, whatever its encoding's mark says (UTF-8 without one)."""
+    marks = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
+    for mark, encoding in marks:
+        if start.startswith(mark):
+            return start[len(mark) :].decode(encoding, "replace").lstrip()
+    return start.decode("utf-8", "replace").lstrip()
+
+
+def is_caliscope(text: str) -> bool:
+    """Whether a file that starts so is one of caliscope's 2D tables, its columns parted by commas or not."""
+    header = text.splitlines()[0] if text else ""
+    return set(COLUMNS) <= {name.strip().strip('"') for name in re.split("[,;\t]", header)}
+
+
+def read_caliscope(
+    path: Path,
+) -> tuple[tuple[str, ...], Int[np.ndarray, " T"], Float[np.ndarray, "T V K 2"], Bool[np.ndarray, "T V K"]]:
+    """Camera names (``cam_<port>``), frames (``sync_index``), the body's 33 landmarks (pixels) and which are there.
+
+    Points beyond the body's (hands, face) are left out. There is no confidence in these files. Raises GhptDataError
+    for a table that is damaged, or that has a point twice.
+    """
+    table = _table(path)
+    body = (table[:, 2] >= 0) & (table[:, 2] < _JOINTS)
+    table = table[body & np.isfinite(table).all(1)]
+    if not len(table):
+        raise GhptDataError(path, "point_id", f"has no body landmark (0 to {_JOINTS - 1})", _WRITE)
+    index = table[:, :3].astype(np.int64)
+    frames, row = np.unique(index[:, 0], return_inverse=True)
+    ports, view = np.unique(index[:, 1], return_inverse=True)
+    if len(ports) > _MOST_PORTS:
+        raise GhptDataError(path, "port", f"names {len(ports)} cameras", _WRITE)
+    place = (row * len(ports) + view) * _JOINTS + index[:, 2]
+    if len(np.unique(place)) != len(place):
+        raise GhptDataError(path, "point_id", "a point is there twice in a frame of a camera", _WRITE)
+    shape = (len(frames), len(ports), _JOINTS)
+    points, seen = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
+    points.reshape(-1, 2)[place], seen.reshape(-1)[place] = table[:, 3:5], True
+    return tuple(f"cam_{port}" for port in ports), frames, points, seen
+
+
+def _table(path: Path) -> Float[np.ndarray, "N 5"]:
+    if path.stat().st_size > _LARGEST:
+        raise GhptDataError(path, "", f"has more than {_LARGEST >> 30} GiB", "Split the recording.")
+    with open_input(path) as raw:
+        utf16 = raw.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+        encoding = "utf-16" if utf16 else "utf-8-sig"
+        raw.seek(-min(2, path.stat().st_size), 2)
+        if not raw.read().strip(b"\0").endswith((b"\n", b"\r")):
+            raise GhptDataError(path, "", "ends in the middle of a line: it is truncated", "Copy it again.")
+        raw.seek(0)
+        with io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline="") as handle:
+            table = _rows(path, handle)
+    whole = table[:, :3][np.isfinite(table[:, :3])]
+    if not (np.abs(np.nan_to_num(table)) < 1e12).all() or (whole != np.round(whole)).any():
+        raise GhptDataError(path, "", "holds an index that is not whole, or a number beyond 1e12", _WRITE)
+    return table
+
+
+def _lines(handle: io.TextIOBase) -> Iterator[str]:
+    while line := handle.readline(_LONGEST_LINE):
+        if len(line) == _LONGEST_LINE:
+            raise ValueError("a line of it does not end")
+        yield line
+
+
+def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
+    line = handle.readline(_LONGEST_LINE)
+    if ";" in line or "\t" in line:
+        mend = "Save it with commas between the columns and points in the numbers (a spreadsheet may have changed it)."
+        raise GhptDataError(path, "", "has columns that commas do not part", mend)
+    try:
+        header = [name.strip() for name in next(csv.reader([line]))]
+        columns = [header.index(name) for name in COLUMNS]
+        # an empty cell is a point that was not found
+        empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # of a table without rows
+            table = np.loadtxt(_lines(handle), delimiter=",", usecols=columns, converters=empty, ndmin=2)
+    except (ValueError, StopIteration, csv.Error) as error:
+        raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
+    return table.reshape(-1, len(COLUMNS))

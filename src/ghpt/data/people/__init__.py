@@ -1,0 +1,1 @@
+"""From detections to persons: who is who in several views, and in time."""

@@ -1,0 +1,1 @@
+"""Recordings without a licence: a body, its motion, a detector, real rigs."""

@@ -1,0 +1,114 @@
+"""The data that needs no licence: real rigs, synthetic people who move, and a model of their detector."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from ghpt.data.synthetic.body import random_body
+from ghpt.data.synthetic.detector import Detector
+from ghpt.data.synthetic.motion import actions, move
+from ghpt.data.synthetic.random_processes import generator
+from ghpt.data.synthetic.rigs import ARRANGEMENTS, Rig, human36m_rig, panoptic_rig
+from ghpt.errors import check
+from ghpt.recording import Recording
+
+SPLITS = ("train", "validation", "test")
+HUMAN36M_SUBJECTS = {
+    "train": ("S1", "S5", "S6", "S7"),
+    "validation": ("S8",),
+    "test": ("S9", "S11"),
+}
+HUMAN36M_RATE = 50.0
+HUMAN36M_FRAMES = {"train": 512, "validation": 512, "test": 1066}
+"""Of each take; every 64th of the test split are 1,020 frames."""
+PANOPTIC_SUBJECTS = tuple(f"P{number}" for number in range(1, 9))
+PANOPTIC_RATE, PANOPTIC_FRAMES = 30.0, 12_600
+"""Hz, and frames of a person's one sequence (7 minutes), of which 40 of every 64th are tested."""
+PANOPTIC_PARTS = {"train": (0.0, 0.6), "validation": (0.6, 0.8), "test": (0.8, 1.0)}
+
+
+@dataclass(frozen=True)
+class Take:
+    """One person's motion before a rig, not yet detected."""
+
+    name: str
+    subject: str
+    action: str
+    rate_hz: float
+    rig: Rig
+    truth: Float[np.ndarray, "T J 3"]
+    """World frame, mm."""
+    familiar: bool
+    """Whether the detector was trained on this person."""
+    first: int
+    """Number of the first frame."""
+
+
+def embedded_recordings(
+    data: str, split: str, seed: int, detector: Detector, cameras: Sequence[int] | None = None
+) -> Iterator[Recording]:
+    """The synthetic recordings of ``h36m``, of ``cmu1`` to ``cmu4``, or of ``panoptic`` with any HD ``cameras``.
+
+    A pure function of its arguments; a camera's detections are the same in every arrangement that has it. Raises
+    GhptConfigError for an unknown name and GhptDataError for a bad list of cameras, at once.
+    """
+    return (_detect(take, seed, detector) for take in takes(data, split, seed, cameras))
+
+
+def takes(data: str, split: str, seed: int, cameras: Sequence[int] | None = None) -> Iterator[Take]:
+    """The motions behind `embedded_recordings`."""
+    check(split in SPLITS, "split", f"is {split!r}", f"Choose from {', '.join(SPLITS)}.")
+    known = (*ARRANGEMENTS, "panoptic")
+    check(data in known, "data", f"is {data!r}", f"Choose from {', '.join(known)}.")
+    if data == "h36m":
+        return _human36m(split, seed)
+    if data == "panoptic" and cameras is None:
+        cameras = range(31)
+    return _panoptic(panoptic_rig(ARRANGEMENTS[data] if cameras is None else cameras), split, seed)
+
+
+def motion(seed: int, subject: str, take: str, action: str, frames: int, rate_hz: float) -> Float[np.ndarray, "T J 3"]:
+    """One take of one person, mm, z up: the same person in all of the subject's takes."""
+    person = generator(seed, "body", subject)
+    body, left_handed = random_body(person), bool(person.uniform() < 0.1)
+    return move(body, action, frames, rate_hz, generator(seed, "motion", take), left_handed)
+
+
+def _human36m(split: str, seed: int) -> Iterator[Take]:
+    for subject in HUMAN36M_SUBJECTS[split]:
+        rig = human36m_rig(subject)
+        for action in (name for name in actions() if name != "RangeOfMotion"):
+            for number in (1, 2):
+                name = f"{subject}/{action}-{number}"
+                truth = motion(seed, subject, name, action, HUMAN36M_FRAMES[split], HUMAN36M_RATE)
+                yield Take(name, subject, action, HUMAN36M_RATE, rig, truth, split != "test", 0)
+
+
+def _panoptic(rig: Rig, split: str, seed: int) -> Iterator[Take]:
+    first, last = (round(part * PANOPTIC_FRAMES) for part in PANOPTIC_PARTS[split])
+    for subject in PANOPTIC_SUBJECTS:
+        truth = motion(seed, subject, subject, "RangeOfMotion", PANOPTIC_FRAMES, PANOPTIC_RATE)[first:last]
+        truth = np.stack([truth[..., 0], -truth[..., 2], truth[..., 1]], axis=-1)
+        yield Take(f"{subject}/{split}", subject, "RangeOfMotion", PANOPTIC_RATE, rig, truth, False, first)
+
+
+def _detect(take: Take, seed: int, detector: Detector) -> Recording:
+    found = detector(take.truth, take.rig, take.rate_hz, seed, take.subject, take.name, take.familiar)
+    return Recording(
+        name=take.name,
+        subject=take.subject,
+        action=take.action,
+        rate_hz=take.rate_hz,
+        camera_names=take.rig.names,
+        cameras=take.rig.cameras,
+        key_points=found.key_points,
+        confidence=found.confidence,
+        seen=found.seen,
+        truth=take.truth.astype(np.float32),
+        truth_seen=np.ones(take.truth.shape[:2], dtype=bool),
+        frame=np.arange(take.first, take.first + len(take.truth)),
+    )

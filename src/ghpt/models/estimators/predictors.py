@@ -1,0 +1,174 @@
+"""From a batch of key points to what a recording becomes, by a classical estimator or by the learned model."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from jaxtyping import Bool, Float, Int8
+from torch import Tensor
+
+from ghpt.geometry.normal_equations import usable_views
+from ghpt.geometry.triangulation import Status, Triangulation
+from ghpt.models.estimators.classical import Baseline, poses_of
+from ghpt.models.estimators.flips import Swaps, undo_swaps
+from ghpt.models.estimators.rejection import Rejection
+from ghpt.models.estimators.uncertainty import JointQuality, Quality
+from ghpt.models.estimators.view_weights import ViewWeights
+from ghpt.reconstruction import Reconstruction, State
+from ghpt.recording import KeyPointBatch
+
+FAR = 20.0
+"""A key point so many times as far from its view's median as the median one belongs to nobody."""
+
+_STATE = {
+    Status.OK: State.OBSERVED, Status.NOT_CONVERGED: State.OBSERVED, Status.FEW_VIEWS: State.FEW_VIEWS,
+    Status.PARALLEL: State.PARALLEL, Status.BEHIND: State.BEHIND, Status.NONFINITE_INPUT: State.BAD_INPUT,
+}  # fmt: skip
+
+
+class Predictor(Protocol):
+    """What `predict` runs: each frame's result is its own, whatever batch it is in, once ``fitted``."""
+
+    def fitted(self, batch: KeyPointBatch) -> Predictor:
+        """The same with the noise level of these frames: a few hundred, spread over the recording."""
+
+    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
+        """The batch's frames, with ``frame`` = ``batch.sample``; on the CPU."""
+
+
+class Classical:
+    """A classical estimator with what it can say of its joints.
+
+    A view counts as one of those that made a joint if its residual is within the estimator's ``reach``; where fewer
+    than two views are, all that were given to it count, and the error and covariance say so. ``reject``: which joints
+    are REJECTED because no two views explain them; null: none. ``swaps``: how exchanged sides are looked for and
+    undone; null: they are not.
+    """
+
+    def __init__(self, estimator: Baseline, quality: Quality, swaps: Swaps | None, reject: Rejection | None) -> None:
+        self.estimator, self.quality, self.swaps, self.reject = estimator, quality, swaps, reject
+
+    def fitted(self, batch: KeyPointBatch) -> Classical:
+        clean, _, _, result = _prepared(batch, self.swaps, self.estimator)
+        views, _ = self.estimator.agreeing(clean, result.points, result.placed)
+        quality = self.quality.fitted(clean, result.points, views)
+        reject = self.reject and self.reject.fitted(clean, result.points, result.placed)
+        return Classical(self.estimator, quality, self.swaps, reject)
+
+    def rejecting_nothing(self) -> Classical:
+        """The same, with all its joints: what it is compared with others by."""
+        return Classical(self.estimator, self.quality, self.swaps, None)
+
+    @torch.no_grad()
+    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
+        clean, spoilt, swapped, result = _prepared(batch, self.swaps, self.estimator)
+        state = _states(result.status, spoilt)
+        state = _rejected(self.reject, clean, result.points, state)
+        views, _ = self.estimator.agreeing(clean, result.points, state == State.OBSERVED)
+        found = self.quality(clean, result.points, views)
+        score = torch.zeros(len(batch), dtype=torch.float32)
+        return _reconstruction(batch, result.points, state, views, found, score, swapped)
+
+
+class Learned:
+    """A trained model's view weights with what can be said of their joints.
+
+    The views that made a joint are those on which the consensus of ``view_weights`` agrees, and error and covariance
+    are theirs. The score is the mean logit of the hypotheses under their weights, before ``limit_spread``, which
+    centres each frame's. ``swaps`` and ``reject`` as in Classical.
+    """
+
+    def __init__(
+        self, view_weights: ViewWeights, quality: Quality, swaps: Swaps | None, reject: Rejection | None
+    ) -> None:
+        self.view_weights, self.quality, self.swaps, self.reject = view_weights, quality, swaps, reject
+
+    def fitted(self, batch: KeyPointBatch) -> Learned:
+        clean, _, _, robust = _prepared(batch, self.swaps, self.view_weights.consensus)
+        weighed = self.view_weights.weigh(clean, robust)
+        found = weighed.triangulation
+        quality = self.quality.fitted(clean, found.points, weighed.views)
+        reject = self.reject and self.reject.fitted(clean, found.points, found.placed)
+        return Learned(self.view_weights, quality, self.swaps, reject)
+
+    def rejecting_nothing(self) -> Learned:
+        """The same, with all its joints: what it is compared with others by."""
+        return Learned(self.view_weights, self.quality, self.swaps, None)
+
+    @torch.no_grad()
+    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
+        clean, spoilt, swapped, robust = _prepared(batch, self.swaps, self.view_weights.consensus)
+        weighed = self.view_weights.weigh(clean, robust)
+        points = weighed.triangulation.points
+        state = _states(weighed.triangulation.status, spoilt)
+        state = _rejected(self.reject, clean, points, state)
+        views = weighed.views & (state == State.OBSERVED)[:, None]
+        found = self.quality(clean, points, views)
+        score = (weighed.weights * weighed.logits).sum(-1)
+        return _reconstruction(batch, points, state, views, found, score, swapped)
+
+
+def _prepared(
+    batch: KeyPointBatch, swaps: Swaps | None, estimator: Baseline
+) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"], Bool[Tensor, "B V"], Triangulation]:
+    """The batch to triangulate, what was taken out of it, in which views left and right were exchanged, and what
+    ``estimator`` makes of the batch. It does so once where it is the one that looks for swaps."""
+    clean, spoilt = cleaned(batch)
+    result = estimator.triangulate(clean)
+    if swaps is None:
+        return clean, spoilt, torch.zeros_like(batch.seen[..., 0]), result
+    clean, swapped = undo_swaps(clean, swaps, poses_of(result, clean) if estimator == swaps.estimator else None)
+    rows = torch.nonzero(swapped.any(-1))[:, 0]
+    if len(rows):
+        result = result.with_rows(rows, estimator.triangulate(clean.rows(rows)))
+    return clean, spoilt, swapped, result
+
+
+def cleaned(batch: KeyPointBatch) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"]]:
+    """The batch without key points that no detection can be, and which those were: not finite, of a camera that is
+    none, or ``FAR`` from all others of its view."""
+    usable = batch.seen & usable_views(batch.cameras, batch.key_points)
+    points = torch.where(usable[..., None], batch.key_points, torch.nan)
+    offset = (points - points.nanmedian(-2, keepdim=True).values).abs().amax(-1)
+    typical = offset.nanmedian(-1, keepdim=True).values.clamp(min=1.0)
+    few = usable.sum(-1, keepdim=True) < 5
+    seen = usable & (few | ~(offset > FAR * typical))
+    return replace(batch, seen=seen, key_points=torch.where(seen[..., None], batch.key_points, 0.0)), batch.seen & ~seen
+
+
+def _states(status: Int8[Tensor, "B J"], spoilt: Bool[Tensor, "B V J"]) -> Int8[Tensor, "B J"]:
+    table = torch.tensor([int(_STATE[s]) for s in Status], dtype=torch.int8, device=status.device)
+    state = table[status.long()]
+    return torch.where((state == State.FEW_VIEWS) & spoilt.any(1), int(State.BAD_INPUT), state).to(torch.int8)
+
+
+def _rejected(
+    reject: Rejection | None,
+    batch: KeyPointBatch,
+    points: Float[Tensor, "B J 3"],
+    state: Int8[Tensor, "B J"],
+) -> Int8[Tensor, "B J"]:
+    """The states, REJECTED where a joint has a position that no two views explain."""
+    if reject is None:
+        return state
+    placed = state == State.OBSERVED
+    unexplained = placed & ~reject.explained(batch, points, placed)
+    return torch.where(unexplained, int(State.REJECTED), state).to(torch.int8)
+
+
+def _reconstruction(
+    batch: KeyPointBatch,
+    points: Float[Tensor, "B J 3"],
+    state: Int8[Tensor, "B J"],
+    views: Bool[Tensor, "B V J"],
+    found: JointQuality,
+    score: Float[Tensor, " B"],
+    swapped: Bool[Tensor, "B V"],
+) -> Reconstruction:
+    placed = state == State.OBSERVED
+    points = torch.where(placed[..., None], points, 0.0).double()
+    error, covariance = found.error.float(), found.covariance.float()
+    fields = (batch.sample, points, state, error, views, covariance, score.float(), swapped)
+    return Reconstruction(*(x.cpu() for x in fields))

@@ -1,0 +1,1 @@
+"""The pose problem (paper, section 3.1)."""

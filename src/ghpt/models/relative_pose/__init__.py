@@ -1,0 +1,1 @@
+"""The camera problem (paper, section 3.2)."""

@@ -1,0 +1,1 @@
+"""Ablations: one setting of the pose model changed at a time."""

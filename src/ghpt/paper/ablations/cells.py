@@ -1,0 +1,50 @@
+"""The cells of the ablations: a model with a setting changed, and its errors on validation and test subjects."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from ghpt.paper.engine.cells import Cell
+from ghpt.paper.engine.item import Results, Spread
+from ghpt.paper.engine.setup import Setup
+
+BASE = "h36m"
+"""The data set that all are tested on."""
+SETS = {"validation": "S8 (validation)", "test": "test"}
+"""Split -> in tables."""
+DEFAULT = "default"
+CHANCE = 0.01
+"""A smaller gain, as a share of the error, chooses nothing."""
+NOTE = "Changes of a percent or so come with another training seed too and choose nothing."
+_SELDOM = 4096
+"""Every so many frames are validated in training, for these models are tested here."""
+
+
+def trained(setup: Setup, data: str, *overrides: str, name: str, seconds: float = 16.0) -> Cell:
+    """A model with other settings than the default."""
+    return setup.trained(data, *overrides, f"data.stride={_SELDOM}", name=name, seconds=seconds)
+
+
+def evaluated(
+    setup: Setup,
+    model: Cell,
+    settings: Sequence[tuple[int | None, float | None]] = ((None, None),),
+    splits: Iterable[str] = SETS,
+    seconds: float = 5.0,
+) -> Cell:
+    """A model on splits of Human3.6M, with other (hypotheses, temperature) where not None."""
+    strides, sets = setup.sizes["ablation"]["stride"], {}
+    for split in splits:
+        own = (f"data.evaluate={split}", f"data.stride={strides[split]}")
+        whole = setup.composed("test", BASE, *setup.overrides["test"], *own)
+        sets[split] = whole["data"]
+    config = {"sets": sets, "settings": [list(pair) for pair in settings], "seed": setup.seed}
+    config |= {"files": whole["files"]} if "files" in whole else {}
+    needs = {"model": model} | {split: setup.prepared(BASE, split) for split in splits}
+    name = model.name.replace("train-pose", "ablation")
+    return Cell(name, "ghpt.paper.ablations.work.evaluate", config, needs, seconds=seconds)
+
+
+def number(results: Results, cell: str, split: str, selection: str = "weight", setting: int = 0) -> Spread:
+    """Pelvis-relative MPJPE of an `evaluated` cell, mm."""
+    return Spread(tuple(float(each[split][setting][selection]) for each in results.read(cell)))

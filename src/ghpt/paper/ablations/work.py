@@ -1,0 +1,74 @@
+"""The work of the ablations: a model's selections on several sets of frames, at several pool sizes and temperatures."""
+
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from ghpt.config import build
+from ghpt.data.datasets.frames import Frames
+from ghpt.files import write_json
+from ghpt.metrics.pose_error import MPJPE
+from ghpt.models.checkpoint import load_model
+from ghpt.models.module import StochasticEstimator
+from ghpt.models.pose.problem import PoseHypotheses
+from ghpt.models.selection import limit_spread, selection_weights
+from ghpt.paper.engine.work import CHECKPOINT
+from ghpt.recording import KeyPointBatch
+from ghpt.skeleton import JOINTS
+
+SELECTIONS = ("weight", "average", "best")
+
+
+@torch.no_grad()
+def evaluate(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+    """Test the model of ``needs["model"]`` on each data module of ``config["sets"]`` under each of
+    ``config["settings"]``, pairs of a number of hypotheses and a temperature (None: the model's own).
+
+    result.json: set -> for each setting selection -> pelvis-relative MPJPE (mm). A smaller pool is the beginning of a
+    larger one, the same that test.py draws with so many hypotheses.
+    """
+    model, _ = load_model(needs["model"] / CHECKPOINT, seed=config["seed"])
+    model.eval()
+    settings = [(h or model.hypotheses, t or model.temperature) for h, t in config["settings"]]
+    result = {}
+    for name, set_of_frames in config["sets"].items():
+        data = build(set_of_frames, "data")
+        data.setup("test")
+        result[name] = errors(model, data.frames["test"], settings, data.batch_size)
+    write_json(folder / "result.json", result)
+
+
+def errors(
+    model: StochasticEstimator, frames: Frames, settings: list[tuple[int, float]], batch_size: int
+) -> list[dict[str, float]]:
+    """Pelvis-relative MPJPE (mm) of the selections under each setting."""
+    metrics = [{name: MPJPE("relative", 1, len(JOINTS)) for name in SELECTIONS} for _ in settings]
+    for first in range(0, len(frames), batch_size):
+        batch = frames[range(first, min(first + batch_size, len(frames)))]
+        keys = model.keys("test", batch)
+        pool = model.problem.generate(batch, max(h for h, _ in settings), keys)
+        logits = model.scorer(model.problem.describe(pool))
+        for each, (count, temperature) in zip(metrics, settings, strict=True):
+            part = PoseHypotheses(pool.points[:, :count], pool.views[:, :count], pool.estimated)
+            update(each, model, part, limit_spread(logits[:, :count], model.spread), temperature, batch, keys)
+    return [{name: metric.compute().mean.item() for name, metric in each.items()} for each in metrics]
+
+
+def update(
+    metrics: dict[str, MPJPE],
+    model: StochasticEstimator,
+    pool: PoseHypotheses,
+    logits: Float[Tensor, "B H"],
+    temperature: float,
+    batch: KeyPointBatch,
+    keys: Int[Tensor, " B"],
+) -> None:
+    """Add a batch to the metric of each selection."""
+    error, _ = model.problem.error(model.problem.expand(pool), batch)
+    for name, metric in metrics.items():
+        weights = selection_weights(name, logits, error.to(logits.dtype), temperature, keys)
+        estimate = model.problem.combine(pool, weights)
+        metric.update(estimate, batch.truth, batch.truth_seen, torch.zeros_like(batch.sample))
