@@ -1,4 +1,6 @@
-"""Calibrate: ``python calibrate.py keypoints=pose/ cameras=intrinsics.toml output=rig/``; ``--help`` says more."""
+"""Calibrate: ``python calibrate.py keypoints=pose/ cameras=intrinsics.toml output=rig/``;
+``--help`` says more.
+"""
 
 from pathlib import Path
 

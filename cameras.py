@@ -1,4 +1,6 @@
-"""The camera doctor: ``python cameras.py cameras=Calib.toml keypoints=pose/``; ``--help`` says more."""
+"""The camera doctor: ``python cameras.py cameras=Calib.toml keypoints=pose/``; ``--help`` says
+more.
+"""
 
 from pathlib import Path
 

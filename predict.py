@@ -1,4 +1,6 @@
-"""Predict: ``python predict.py keypoints=pose/ cameras=Calib.toml output=out/``; ``--help`` says more."""
+"""Predict: ``python predict.py keypoints=pose/ cameras=Calib.toml output=out/``; ``--help`` says
+more.
+"""
 
 from pathlib import Path
 

@@ -1,4 +1,6 @@
-"""Reproduce: ``python reproduce.py`` makes every table and figure of the paper; ``--help`` says more."""
+"""Reproduce: ``python reproduce.py`` makes every table and figure of the paper; ``--help`` says
+more.
+"""
 
 import sys
 from pathlib import Path

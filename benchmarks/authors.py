@@ -1,12 +1,14 @@
-"""The paper's training job beside the authors' own code: ``python benchmarks/authors.py authors=/path/to/checkout``.
+"""The paper's training job beside the authors' own code: ``python benchmarks/authors.py
+authors=/path/to/checkout``.
 
-Their code (github.com/kristijanbartol/general-3d-humans) is run from the given checkout and is no part of this
-project. It needs, beside what is here, OpenCV and a kornia below 0.7: ``pip install --no-deps --target DIR
-"kornia==0.6.12"`` and ``PYTHONPATH=DIR``.
+Their code (github.com/kristijanbartol/general-3d-humans) is run from the given checkout and is no
+part of this project. It needs, beside what is here, OpenCV and a kornia below 0.7: ``pip install
+--no-deps --target DIR "kornia==0.6.12"`` and ``PYTHONPATH=DIR``.
 
-Both get the same frames, 4 views, 200 hypotheses and the same features. Theirs goes hypothesis by hypothesis, so a
-batch of 16 frames is timed (forward frame by frame, one backward and Adam step) and multiplied up to the job; ours is
-timed whole, with the data, the feature statistics, validation and checkpoints.
+Both get the same frames, 4 views, 200 hypotheses and the same features. Theirs goes hypothesis by
+hypothesis, so a batch of 16 frames is timed (forward frame by frame, one backward and Adam step)
+and multiplied up to the job; ours is timed whole, with the data, the feature statistics, validation
+and checkpoints.
 
 Settings: ``authors=PATH`` ``frames=16`` ``samples=512``.
 """
@@ -31,7 +33,9 @@ HYPOTHESES = 200
 def theirs(authors: str, frames: int) -> tuple[float, float]:
     """Seconds a frame of their forward pass, and of their backward pass with the optimiser's step."""
     sys.path.insert(0, authors)
-    torch.Tensor.cuda = lambda self, *_, **__: self  # they move the scorer's input there whatever the device is
+    torch.Tensor.cuda = lambda self, *_, **__: (
+        self
+    )  # they move the scorer's input there whatever the device is
     warnings.filterwarnings("ignore")
     from src.dsac import PoseDSAC
     from src.loss import MPJPELoss
@@ -40,15 +44,28 @@ def theirs(authors: str, frames: int) -> tuple[float, float]:
 
     scorer = create_pose_nn(input_size=17 * 3 + 16, hidden_layer_sizes=[1000, 900, 900, 900, 700])
     model = PoseDSAC(
-        hyps=HYPOTHESES, num_joints=17, entropy_beta=0.01, entropy_to_scores=False, temp=1.5, gumbel=True, hard=False,
-        body_lengths_mode=1, weighted_selection=True, exp_beta=1.0, est_beta=0.02, score_nn=scorer,
+        hyps=HYPOTHESES,
+        num_joints=17,
+        entropy_beta=0.01,
+        entropy_to_scores=False,
+        temp=1.5,
+        gumbel=True,
+        hard=False,
+        body_lengths_mode=1,
+        weighted_selection=True,
+        exp_beta=1.0,
+        est_beta=0.02,
+        score_nn=scorer,
         loss_function=MPJPELoss(),
-    )  # fmt: skip
+    )
     optimizer = torch.optim.Adam(scorer.parameters(), lr=5e-4)
     recording = scene.take("theirs", frames, scene.ring(4), np.random.default_rng(0))
     key_points, truth = torch.from_numpy(recording.key_points), torch.from_numpy(recording.truth)
     Ks, Rs, ts = (getattr(recording.cameras, name).float() for name in ("K", "R", "t"))
-    mean, deviation = truth.mean(dim=0), torch.full((17, 3), 1000.0)  # as of people who walk about a room
+    mean, deviation = (
+        truth.mean(dim=0),
+        torch.full((17, 3), 1000.0),
+    )  # as of people who walk about a room
     metrics = GlobalMetrics("human36m")
 
     start = time.perf_counter()
@@ -71,7 +88,12 @@ def ours(samples: int, bfloat16: bool) -> float:
         config = configuration("train", "progress_bar=false", f"model.hypotheses={HYPOTHESES}")
         config["model"]["scorer"]["bfloat16"] = bfloat16
         lengths = {"train": 8 * samples, "validation": 64, "test": 16}
-        config["data"] = scene.DATA | {"cache": folder, "views": 4, "frames": lengths, "train_samples": samples}
+        config["data"] = scene.DATA | {
+            "cache": folder,
+            "views": 4,
+            "frames": lengths,
+            "train_samples": samples,
+        }
         config["trainer"] |= {"accelerator": "cpu", "devices": 1}
         _prepare(config["data"])
         start = time.perf_counter()
@@ -95,7 +117,10 @@ def main() -> None:
     rows = [
         ["theirs, a frame", f"{forward:.2f} s forward, {backward:.2f} s backward and step"],
         [f"theirs, {samples} frames, by multiplication", f"{theirs_job:.0f} s"],
-        *([f"ours, {samples} frames, {kind}", f"{s:.1f} s, ratio {theirs_job / s:.0f}"] for kind, s in jobs.items()),
+        *(
+            [f"ours, {samples} frames, {kind}", f"{s:.1f} s, ratio {theirs_job / s:.0f}"]
+            for kind, s in jobs.items()
+        ),
     ]
     show(title, ["training, 4 views, 200 hypotheses", "time"], rows)
 

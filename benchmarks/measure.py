@@ -1,4 +1,6 @@
-"""What the benchmarks share: settings from the command line, timing in pairs, and the machine's description."""
+"""What the benchmarks share: settings from the command line, timing in pairs, and the machine's
+description.
+"""
 
 import os
 import platform

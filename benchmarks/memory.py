@@ -1,11 +1,14 @@
-"""Peak memory of training and of testing, each a process of its own: ``python benchmarks/memory.py`` (Linux).
+"""Peak memory of training and of testing, each a process of its own: ``python
+benchmarks/memory.py`` (Linux).
 
-Training is ``train.py data=cmu2 model=pose`` as typed: once with the preparation of the embedded data, once from the
-cache. Testing runs that checkpoint with all baselines on synthetic recordings of growing length; the slope says what
-a frame more costs. ``private`` is what the process itself holds; the whole also counts the pages of the memory-mapped
-recordings that were touched, which the system takes back when it needs them.
+Training is ``train.py data=cmu2 model=pose`` as typed: once with the preparation of the embedded
+data, once from the cache. Testing runs that checkpoint with all baselines on synthetic recordings
+of growing length; the slope says what a frame more costs. ``private`` is what the process itself
+holds; the whole also counts the pages of the memory-mapped recordings that were touched, which the
+system takes back when it needs them.
 
-Settings: ``frames=1000,8000`` ``hypotheses=20`` (few, since the pools' memory is that of one batch).
+Settings: ``frames=1000,8000`` ``hypotheses=20`` (few, since the pools' memory is that of one
+batch).
 """
 
 import os
@@ -23,7 +26,11 @@ def peak(command: list[str], **environment: str) -> tuple[float, float, float]:
     start, whole, private = time.perf_counter(), 0, 0
     with open(os.devnull, "w", encoding="utf-8") as nowhere:
         process = subprocess.Popen(
-            [sys.executable, *command], cwd=ROOT, env=os.environ | environment, stdout=nowhere, stderr=subprocess.PIPE
+            [sys.executable, *command],
+            cwd=ROOT,
+            env=os.environ | environment,
+            stdout=nowhere,
+            stderr=subprocess.PIPE,
         )
     while process.poll() is None:
         fields = _status(process.pid)
@@ -39,7 +46,11 @@ def _status(pid: int) -> dict[str, int]:
         lines = Path(f"/proc/{pid}/status").read_text(encoding="utf-8").splitlines()
     except OSError:  # it has just ended
         return {}
-    return {name: int(value.split()[0]) for name, value in (line.split(":", 1) for line in lines) if "kB" in value}
+    return {
+        name: int(value.split()[0])
+        for name, value in (line.split(":", 1) for line in lines)
+        if "kB" in value
+    }
 
 
 def test_scene(checkpoint: str, folder: str, frames: int, hypotheses: int) -> None:
@@ -49,7 +60,9 @@ def test_scene(checkpoint: str, folder: str, frames: int, hypotheses: int) -> No
 
     from ghpt.commands.test import test
 
-    config = configuration("test", "progress_bar=false", f"ckpt={checkpoint}", f"hypotheses={hypotheses}")
+    config = configuration(
+        "test", "progress_bar=false", f"ckpt={checkpoint}", f"hypotheses={hypotheses}"
+    )
     lengths = {"train": 16, "validation": 16, "test": frames}
     config["data"] = scene.DATA | {"cache": folder, "views": 4, "frames": lengths}
     config["trainer"] |= {"accelerator": "cpu", "devices": 1}
@@ -62,16 +75,32 @@ def main() -> None:
     wanted = settings(frames="1000,8000", hypotheses=20)
     title, lengths, rows = machine(), [int(n) for n in wanted["frames"].split(",")], []
     with tempfile.TemporaryDirectory() as folder:
-        train = ["train.py", "data=cmu2", "model=pose", "progress_bar=false", f"output={folder}/train"]
+        train = [
+            "train.py",
+            "data=cmu2",
+            "model=pose",
+            "progress_bar=false",
+            f"output={folder}/train",
+        ]
         measured = {}
         for name in ("train.py, data prepared", "train.py, data cached"):
             measured[name] = peak(train, GHPT_CACHE=f"{folder}/cache", CUDA_VISIBLE_DEVICES="")
         for count in lengths:
-            again = [__file__, "test", f"{folder}/train/last.ckpt", folder, str(count), str(wanted["hypotheses"])]
+            again = [
+                __file__,
+                "test",
+                f"{folder}/train/last.ckpt",
+                folder,
+                str(count),
+                str(wanted["hypotheses"]),
+            ]
             measured[f"test, {count:,} frames"] = peak(again)
         rows = [[name, f"{a:.0f}", f"{b:.0f}", f"{t:.0f}"] for name, (a, b, t) in measured.items()]
         first, last = (measured[f"test, {count:,} frames"] for count in (lengths[0], lengths[-1]))
-        slopes = [100_000 * (b - a) / (lengths[-1] - lengths[0]) for a, b in zip(first[:2], last[:2], strict=True)]
+        slopes = [
+            100_000 * (b - a) / (lengths[-1] - lengths[0])
+            for a, b in zip(first[:2], last[:2], strict=True)
+        ]
         rows.append(["growth in MiB per 100,000 frames", *(f"{slope:.0f}" for slope in slopes), ""])
     show(title, ["peak memory, MiB", "whole", "private", "seconds"], rows)
 

@@ -1,14 +1,16 @@
 """Relative poses of camera pairs, and whole rigs: ``python benchmarks/relative_pose.py``.
 
-The first table: 100 hypotheses of a pair (generate and describe, in batches as in testing) beside USAC_ACCURATE of
-OpenCV and PoseLib together, on the same correspondences, with the settings of conf/camera_baselines. Only their own
-calls are timed, not how their input is prepared; ours holds that too. They take turns in one run, so that a busy
-machine slows both; the ratio is the median over the rounds. The second: calibration of rigs of 4 and of 31 cameras.
+The first table: 100 hypotheses of a pair (generate and describe, in batches as in testing) beside
+USAC_ACCURATE of OpenCV and PoseLib together, on the same correspondences, with the settings of
+conf/camera_baselines. Only their own calls are timed, not how their input is prepared; ours holds
+that too. They take turns in one run, so that a busy machine slows both; the ratio is the median
+over the rounds. The second: calibration of rigs of 4 and of 31 cameras.
 
-The correspondences are of the embedded (synthetic) Human3.6M and Panoptic (test splits; the first run prepares them).
+The correspondences are of the embedded (synthetic) Human3.6M and Panoptic (test splits; the first
+run prepares them).
 
-Settings: ``frames=80`` ``batch=12`` (pairs; two draws of a rig of four cameras) ``rounds=15`` ``threads=2`` ``rigs=3``
-(draws of each rig; 0: leave the rigs out).
+Settings: ``frames=80`` ``batch=12`` (pairs; two draws of a rig of four cameras) ``rounds=15``
+``threads=2`` ``rigs=3`` (draws of each rig; 0: leave the rigs out).
 """
 
 import statistics
@@ -70,7 +72,10 @@ def race(frames: int, size: int, rounds: int) -> list[list[str]]:
     rows += [[name, _ms(theirs[name], size)] for name in THEIRS]
     rows += [["both of them", _ms(both, size)]]
     quartiles = f"{ratios[len(ratios) // 4]:.2f} to {ratios[3 * len(ratios) // 4]:.2f}"
-    return [*rows, ["ratio, ours / both (quartiles)", f"{statistics.median(ratios):.2f} ({quartiles})"]]
+    return [
+        *rows,
+        ["ratio, ours / both (quartiles)", f"{statistics.median(ratios):.2f} ({quartiles})"],
+    ]
 
 
 def _ms(taken: list[float], size: int) -> str:
@@ -80,7 +85,9 @@ def _ms(taken: list[float], size: int) -> str:
 def rigs(data: str, frames: int, count: int) -> list[str]:
     """Cameras, and median and longest seconds of a calibration from ``frames`` frames."""
     pairs = draws(data, frames, count)
-    calibration = build(configuration("test")["camera_baselines"]["rig"]["calibration"], "calibration")
+    calibration = build(
+        configuration("test")["camera_baselines"]["rig"]["calibration"], "calibration"
+    )
     taken, succeeded = [], 0
     for draw in range(count):
         batch = pairs[[draw * len(pairs.pairs)]]

@@ -1,4 +1,6 @@
-"""Synthetic recordings of any length before any number of cameras, made in moments: the benchmarks' data."""
+"""Synthetic recordings of any length before any number of cameras, made in moments: the benchmarks'
+data.
+"""
 
 from collections.abc import Iterable
 from typing import Any
@@ -12,9 +14,17 @@ from ghpt.geometry.cameras import Cameras, project
 from ghpt.recording import Recording
 
 DATA = {
-    "_target_": "scene.SceneData", "name": "scene", "root": None, "seed": 0, "train_samples": 512,
-    "least_joints": 12, "stride": 1, "evaluate": "test", "batch_size": 16, "workers": 0,
-}  # fmt: skip
+    "_target_": "scene.SceneData",
+    "name": "scene",
+    "root": None,
+    "seed": 0,
+    "train_samples": 512,
+    "least_joints": 12,
+    "stride": 1,
+    "evaluate": "test",
+    "batch_size": 16,
+    "workers": 0,
+}
 """The settings that all benchmarks share; ``cache``, ``views`` and ``frames`` are to be added."""
 
 NOISE = 5.0
@@ -26,10 +36,16 @@ def ring(views: int) -> Cameras:
     """Cameras all around at two heights, 5 m from the origin, focal length 1,100 pixels."""
     angles = np.linspace(0, 2 * np.pi, views, endpoint=False)
     tilts = np.where(np.arange(views) % 2, 0.1, 0.4)
-    R = np.stack([Rotation.from_euler("yx", [a, b]).as_matrix() for a, b in zip(angles, tilts, strict=True)])
+    R = np.stack(
+        [Rotation.from_euler("yx", [a, b]).as_matrix() for a, b in zip(angles, tilts, strict=True)]
+    )
     K = np.array([[1100.0, 0, 500], [0, 1100, 500], [0, 0, 1]])
     t = np.array([0.0, 0, 5000])
-    return Cameras(torch.from_numpy(K).expand(views, 3, 3), torch.from_numpy(R), torch.from_numpy(t).expand(views, 3))
+    return Cameras(
+        torch.from_numpy(K).expand(views, 3, 3),
+        torch.from_numpy(R),
+        torch.from_numpy(t).expand(views, 3),
+    )
 
 
 def take(name: str, frames: int, cameras: Cameras, rng: np.random.Generator) -> Recording:
@@ -38,13 +54,19 @@ def take(name: str, frames: int, cameras: Cameras, rng: np.random.Generator) -> 
     pixels, _ = project(cameras, torch.from_numpy(truth))
     views = pixels.shape[1]
     return Recording(
-        name=name, subject="S1", action="Walking", rate_hz=50.0,
-        camera_names=tuple(f"c{i}" for i in range(views)), cameras=cameras,
+        name=name,
+        subject="S1",
+        action="Walking",
+        rate_hz=50.0,
+        camera_names=tuple(f"c{i}" for i in range(views)),
+        cameras=cameras,
         key_points=(pixels.numpy() + rng.normal(0, NOISE, pixels.shape)).astype(np.float32),
         confidence=rng.random((frames, views, 17), dtype=np.float32),
         seen=rng.random((frames, views, 17)) >= 0.02,
-        truth=truth.astype(np.float32), truth_seen=np.ones((frames, 17), bool), frame=np.arange(frames),
-    )  # fmt: skip
+        truth=truth.astype(np.float32),
+        truth_seen=np.ones((frames, 17), bool),
+        frame=np.arange(frames),
+    )
 
 
 class SceneData(KeyPointDataModule):

@@ -1,11 +1,14 @@
-"""One whole training step beside the bare step of the same scorer: ``python benchmarks/training_step.py``.
+"""One whole training step beside the bare step of the same scorer: ``python
+benchmarks/training_step.py``.
 
-The whole step is Lightning's: frames from the memory-mapped store, random subsets, triangulation, features, Gumbel
-weights, loss, backward, Adam, logging, and whatever the loop itself costs. The bare step is forward, backward and
-Adam of an equal scorer on random features of the same size. They take turns in one run, so that a busy machine slows
-both; the ratio is the median over pairs. The mean of the whole step holds the checkpoints too.
+The whole step is Lightning's: frames from the memory-mapped store, random subsets, triangulation,
+features, Gumbel weights, loss, backward, Adam, logging, and whatever the loop itself costs. The
+bare step is forward, backward and Adam of an equal scorer on random features of the same size. They
+take turns in one run, so that a busy machine slows both; the ratio is the median over pairs. The
+mean of the whole step holds the checkpoints too.
 
-Settings: ``views=4,7`` ``epochs=1`` ``progress_bar=1`` ``save_every=16`` (steps between checkpoints).
+Settings: ``views=4,7`` ``epochs=1`` ``progress_bar=1`` ``save_every=16`` (steps between
+checkpoints).
 """
 
 import copy
@@ -32,7 +35,10 @@ class TimedEstimator(StochasticEstimator):
     def on_fit_start(self) -> None:
         super().on_fit_start()
         twin = copy.deepcopy(self.scorer)
-        self._twin = (twin, self.optimizer(twin.parameters()))  # in a tuple it is no part of this module
+        self._twin = (
+            twin,
+            self.optimizer(twin.parameters()),
+        )  # in a tuple it is no part of this module
         batch_size = self.trainer.datamodule.batch_size
         with torch.random.fork_rng(devices=[]):
             self._features = torch.randn(batch_size, self.hypotheses, self.problem.feature_size)
@@ -70,14 +76,26 @@ def main() -> None:
     title, rows = machine(), []
     for views in map(int, wanted["views"].split(",")):
         pairs = run(views, wanted["epochs"], bool(wanted["progress_bar"]), wanted["save_every"])
-        whole, bare = ([1000 * seconds for seconds in column] for column in zip(*pairs, strict=True))
+        whole, bare = (
+            [1000 * seconds for seconds in column] for column in zip(*pairs, strict=True)
+        )
         ratios = sorted(a / b for a, b in pairs)
-        rows.append([
-            str(views), str(len(pairs)), f"{statistics.median(whole):.0f}", f"{statistics.median(bare):.0f}",
-            f"{statistics.median(ratios):.3f}", f"{ratios[len(ratios) // 4]:.3f} to {ratios[3 * len(ratios) // 4]:.3f}",
-            f"{sum(whole) / sum(bare):.3f}",
-        ])  # fmt: skip
-    show(title, ["views", "steps", "whole, ms", "bare, ms", "ratio", "quartiles", "of the means"], rows)
+        rows.append(
+            [
+                str(views),
+                str(len(pairs)),
+                f"{statistics.median(whole):.0f}",
+                f"{statistics.median(bare):.0f}",
+                f"{statistics.median(ratios):.3f}",
+                f"{ratios[len(ratios) // 4]:.3f} to {ratios[3 * len(ratios) // 4]:.3f}",
+                f"{sum(whole) / sum(bare):.3f}",
+            ]
+        )
+    show(
+        title,
+        ["views", "steps", "whole, ms", "bare, ms", "ratio", "quartiles", "of the means"],
+        rows,
+    )
 
 
 if __name__ == "__main__":

@@ -1,13 +1,15 @@
 """Speed and accuracy of triangulation beside its peers: ``python benchmarks/triangulation.py``.
 
-The errors are of the same key points for all: 5 pixels of noise, one in fifty unseen, and in the second error one
-detection in ten 100 pixels off. A point is one joint of one frame; for subsets, of one hypothesis. pycolmap and the
-loop work point by point, so their speed is taken on fewer frames. ``pycolmap alone`` is its LO-RANSAC on cameras and
-arrays that are made beforehand: the fastest that it can be called from Python. ``predict`` is its classical default
-with states, covariances and swaps. The second table divides the time of twice the frames, or
-views, by twice the time of one: 1 is linear.
+The errors are of the same key points for all: 5 pixels of noise, one in fifty unseen, and in the
+second error one detection in ten 100 pixels off. A point is one joint of one frame; for subsets, of
+one hypothesis. pycolmap and the loop work point by point, so their speed is taken on fewer frames.
+``pycolmap alone`` is its LO-RANSAC on cameras and arrays that are made beforehand: the fastest that
+it can be called from Python. ``predict`` is its classical default with states, covariances and
+swaps. The second table divides the time of twice the frames, or views, by twice the time of one: 1
+is linear.
 
-Settings: ``views=4,7,10,31`` ``frames=512`` ``loop_frames=64`` ``least=1`` (seconds for each figure).
+Settings: ``views=4,7,10,31`` ``frames=512`` ``loop_frames=64`` ``least=1`` (seconds for each
+figure).
 """
 
 from collections.abc import Callable
@@ -49,7 +51,9 @@ def with_outliers(data: KeyPointBatch) -> KeyPointBatch:
 
 
 def svd_loop(data: KeyPointBatch) -> Tensor:
-    """The textbook: for each point the two rows of each view in homogeneous coordinates, and a 4x4 SVD in NumPy."""
+    """The textbook: for each point the two rows of each view in homogeneous coordinates, and a 4x4
+    SVD in NumPy.
+    """
     P = (data.cameras.K @ torch.cat((data.cameras.R, data.cameras.t[..., None]), dim=-1)).numpy()
     key_points, seen = data.key_points.double().numpy(), data.seen.numpy()
     points = np.zeros(data.truth.shape)
@@ -74,7 +78,9 @@ def pycolmap_alone(data: KeyPointBatch, threshold: float) -> Callable[[], None]:
         for joint in range(data.seen.shape[-1]):
             views = np.flatnonzero(data.seen[frame, :, joint])
             pixels = data.key_points[frame, views, joint].double().numpy()
-            tasks.append((pixels, [found[1][v] for v in views], [found[0][v] for v in views], options))
+            tasks.append(
+                (pixels, [found[1][v] for v in views], [found[0][v] for v in views], options)
+            )
 
     def run() -> None:
         for task in tasks:
@@ -83,7 +89,9 @@ def pycolmap_alone(data: KeyPointBatch, threshold: float) -> Callable[[], None]:
     return run
 
 
-def linearity(views: int, frames: int, least: float, methods: dict[str, Callable[[KeyPointBatch], Any]]) -> list[Any]:
+def linearity(
+    views: int, frames: int, least: float, methods: dict[str, Callable[[KeyPointBatch], Any]]
+) -> list[Any]:
     rows = []
     for name, estimate in methods.items():
         one, long, wide = (
@@ -102,9 +110,13 @@ def error(estimate: Callable[[KeyPointBatch], Tensor], data: KeyPointBatch) -> f
 def main() -> None:
     wanted = settings(views="4,7,10,31", frames=512, loop_frames=64, least=1.0)
     title, baselines = machine(), build(configuration("test")["baselines"], "baselines")
-    classical = build(configuration("estimator/default")["estimator"]["classical"], "estimator.classical")
+    classical = build(
+        configuration("estimator/default")["estimator"]["classical"], "estimator.classical"
+    )
     predictor = classical(estimator=baselines[configuration("predict")["triangulation"]])
-    methods = {name: (lambda d, b=b: b(d).points) for name, b in baselines.items()} | {"SVD loop": svd_loop}
+    methods = {name: (lambda d, b=b: b(d).points) for name, b in baselines.items()} | {
+        "SVD loop": svd_loop
+    }
     methods["predict"] = lambda d: predictor(d).points
     rows, lines = [], []
     for views in map(int, wanted["views"].split(",")):
@@ -112,19 +124,36 @@ def main() -> None:
         one = batch(views, 16)
         subsets = random_subsets(one.seen, HYPOTHESES, randomness.key(0, "benchmark", one.sample))
         taken = seconds(
-            lambda one=one, s=subsets: triangulate_subsets(one.cameras, one.key_points, one.seen, s), wanted["least"]
+            lambda one=one, s=subsets: triangulate_subsets(
+                one.cameras, one.key_points, one.seen, s
+            ),
+            wanted["least"],
         )
-        rows.append([str(views), "subsets, 200 hypotheses", f"{subsets[..., 0].numel() / taken:,.0f}", "", ""])
+        rows.append(
+            [
+                str(views),
+                "subsets, 200 hypotheses",
+                f"{subsets[..., 0].numel() / taken:,.0f}",
+                "",
+                "",
+            ]
+        )
         size = person_size(few.key_points, few.seen).mean().item()
-        taken = seconds(pycolmap_alone(few, baselines["lo_ransac"].threshold * size), wanted["least"])
-        rows.append([str(views), "pycolmap alone", f"{few.truth[..., 0].numel() / taken:,.0f}", "", ""])
+        taken = seconds(
+            pycolmap_alone(few, baselines["lo_ransac"].threshold * size), wanted["least"]
+        )
+        rows.append(
+            [str(views), "pycolmap alone", f"{few.truth[..., 0].numel() / taken:,.0f}", "", ""]
+        )
         for name, estimate in methods.items():
             data = few if name in ("lo_ransac", "SVD loop") else many
             taken = seconds(lambda d=data, e=estimate: e(d), wanted["least"])
             errors = [f"{error(estimate, d):.2f}" for d in (few, with_outliers(few))]
             label = "lo_ransac (pycolmap)" if name == "lo_ransac" else name
             rows.append([str(views), label, f"{data.truth[..., 0].numel() / taken:,.0f}", *errors])
-        fast = {name: methods[name] for name in ("linear", "m_estimator", "adaptive_ransac", "predict")}
+        fast = {
+            name: methods[name] for name in ("linear", "m_estimator", "adaptive_ransac", "predict")
+        }
         if views <= 10:
             lines += linearity(views, wanted["frames"], wanted["least"], fast)
     show(title, ["views", "method", "points/s", "error, mm", "with outliers, mm"], rows)

@@ -1,4 +1,6 @@
-"""What mkdocs does for this site: pages that lie outside of docs/, where GitHub wants them, and API pages."""
+"""What mkdocs does for this site: pages that lie outside of docs/, where GitHub wants them, and API
+pages.
+"""
 
 import re
 from collections.abc import Iterator
@@ -15,15 +17,24 @@ OUTSIDE = {"benchmarks.md": "benchmarks/README.md", "changelog.md": "CHANGELOG.m
 def on_files(files: Files, config: Any) -> Files:
     """Add the pages from outside."""
     for page, file in OUTSIDE.items():
-        files.append(File.generated(config, page, content=(ROOT / file).read_text(encoding="utf-8")))
+        files.append(
+            File.generated(config, page, content=(ROOT / file).read_text(encoding="utf-8"))
+        )
     return files
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
-    """Links that are right on GitHub lead to the same pages here; ``::: ghpt.models.*`` is every module of it."""
+    """Links that are right on GitHub lead to the same pages here; ``::: ghpt.models.*`` is every
+    module of it.
+    """
     for page, file in OUTSIDE.items():
         markdown = markdown.replace(f"](../{file}", f"]({page}")
-    return re.sub(r"^::: ([\w.]+)\.\*$", lambda match: "\n\n".join(_entries(match[1])), markdown, flags=re.MULTILINE)
+    return re.sub(
+        r"^::: ([\w.]+)\.\*$",
+        lambda match: "\n\n".join(_entries(match[1])),
+        markdown,
+        flags=re.MULTILINE,
+    )
 
 
 def on_page_content(html: str, **_: Any) -> str:

@@ -1,4 +1,5 @@
-"""Set the embedded motion and detector beside real ones, as the Markdown tables of docs/embedded.md.
+"""Set the embedded motion and detector beside real ones, as the Markdown tables of
+docs/embedded.md.
 
     python scripts/compare_embedded.py [--shared ../shared/data]
 
@@ -32,9 +33,20 @@ from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 
 ROOT = Path(__file__).resolve().parents[1]
 COMMON = (
-    "nose", "left_shoulder", "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hip",
-    "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle",
-)  # fmt: skip
+    "nose",
+    "left_shoulder",
+    "right_shoulder",
+    "left_elbow",
+    "right_elbow",
+    "left_wrist",
+    "right_wrist",
+    "left_hip",
+    "right_hip",
+    "left_knee",
+    "right_knee",
+    "left_ankle",
+    "right_ankle",
+)
 """The joints that every detector has."""
 COCO = (0, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16)
 MEDIAPIPE = (0, 11, 12, 13, 14, 15, 16, 23, 24, 25, 26, 27, 28)
@@ -63,7 +75,11 @@ class Detected:
 
 def cmu_mocap(shared: Path) -> Motion:
     with np.load(shared / "cmu_mocap/cmu_mocap_17_joints_60hz.npz") as data:
-        joints, starts, rate = data["joints_mm"].astype(float), data["clip_start"], float(data["rate_hz"])
+        joints, starts, rate = (
+            data["joints_mm"].astype(float),
+            data["clip_start"],
+            float(data["rate_hz"]),
+        )
     clips = [joints[a:b] for a, b in pairwise(starts)]
     return Motion(rate, clips, np.array([0.0, 0.0, 1.0]))
 
@@ -84,11 +100,24 @@ def range_of_motion(shared: Path) -> Motion:
         "left_knee",
         "left_ankle",
     ]
-    order += ["right_shoulder", "right_elbow", "right_wrist", "right_hip", "right_knee", "right_ankle"]
+    order += [
+        "right_shoulder",
+        "right_elbow",
+        "right_wrist",
+        "right_hip",
+        "right_knee",
+        "right_ankle",
+    ]
     made = {"spine": (poses[:, 0] + poses[:, 2]) / 2, "head_top": poses[:, 15:].mean(axis=1)}
-    joints = np.stack([made[name] if name in made else poses[:, order.index(name)] for name in JOINTS], axis=1)
+    joints = np.stack(
+        [made[name] if name in made else poses[:, order.index(name)] for name in JOINTS], axis=1
+    )
     cuts = np.flatnonzero(np.diff(whole.astype(int))) + 1
-    clips = [clip for clip, ok in zip(np.split(joints, cuts), np.split(whole, cuts), strict=True) if ok[0]]
+    clips = [
+        clip
+        for clip, ok in zip(np.split(joints, cuts), np.split(whole, cuts), strict=True)
+        if ok[0]
+    ]
     return Motion(30.0, [clip for clip in clips if len(clip) > 30], np.array([0.0, -1.0, 0.0]))
 
 
@@ -108,8 +137,13 @@ def pose2sim(shared: Path) -> Detected:
     for view in range(len(entries)):
         frames = []
         for file in sorted((folder / f"pose/cam{view + 1}_json").glob("*.json")):
-            people = [np.reshape(p["pose_keypoints_2d"], (-1, 3)) for p in json.loads(file.read_text())["people"]]
-            frames.append(max(people, key=lambda person: np.ptp(person[person[:, 2] > 0, 1]))[list(COCO)])
+            people = [
+                np.reshape(p["pose_keypoints_2d"], (-1, 3))
+                for p in json.loads(file.read_text())["people"]
+            ]
+            frames.append(
+                max(people, key=lambda person: np.ptp(person[person[:, 2] > 0, 1]))[list(COCO)]
+            )
         views.append(frames)
     raw = np.array(views).swapaxes(0, 1)
     return _undistorted(entries, rotations, raw[..., :2], raw[..., 2], raw[..., 2] > 0, 60.0, True)
@@ -121,15 +155,24 @@ def caliscope(shared: Path) -> Detected:
     entries = [table[name] for name in sorted(table, key=int)]
     with open(shared / "caliscope/xy_HOLISTIC.csv", encoding="utf-8", newline="") as handle:
         lines = [line for line in csv.DictReader(handle) if int(line["point_id"]) in MEDIAPIPE]
-    frames = {number: index for index, number in enumerate(sorted({int(line["sync_index"]) for line in lines}))}
+    frames = {
+        number: index
+        for index, number in enumerate(sorted({int(line["sync_index"]) for line in lines}))
+    }
     raw = np.full((len(frames), len(entries), len(COMMON), 2), np.nan)
     for line in lines:
-        at = frames[int(line["sync_index"])], int(line["port"]), MEDIAPIPE.index(int(line["point_id"]))
+        at = (
+            frames[int(line["sync_index"])],
+            int(line["port"]),
+            MEDIAPIPE.index(int(line["point_id"])),
+        )
         raw[at] = float(line["img_loc_x"]), float(line["img_loc_y"])
     sizes = np.array([entry["size"] for entry in entries])[:, None]
     seen = ((raw >= 0) & (raw <= sizes - 1)).all(axis=-1)
     rotations = np.array([entry["rotation"] for entry in entries])
-    return _undistorted(entries, rotations, np.nan_to_num(raw), np.ones(seen.shape), seen, 30.0, False)
+    return _undistorted(
+        entries, rotations, np.nan_to_num(raw), np.ones(seen.shape), seen, 30.0, False
+    )
 
 
 def _undistorted(
@@ -142,11 +185,14 @@ def _undistorted(
     confident: bool,
 ) -> Detected:
     K, t, distortion = (
-        torch.tensor([entry[f] for entry in entries]).double() for f in ("matrix", "translation", "distortions")
+        torch.tensor([entry[f] for entry in entries]).double()
+        for f in ("matrix", "translation", "distortions")
     )
     pixels = torch.from_numpy(raw).transpose(0, 1)
     undone, exists = lens.undistort(pixels.flatten(1, 2), K, distortion)
-    undone, exists = (x.unflatten(1, pixels.shape[1:3]).transpose(0, 1).numpy() for x in (undone, exists))
+    undone, exists = (
+        x.unflatten(1, pixels.shape[1:3]).transpose(0, 1).numpy() for x in (undone, exists)
+    )
     cameras = Cameras(K, torch.from_numpy(rotations), 1000.0 * t)
     return Detected(rate_hz, cameras, [(undone, confidence, seen & exists)], confident)
 
@@ -155,9 +201,18 @@ def embedded_detections(data: str) -> Detected:
     config = "human36m" if data == "h36m" else "panoptic"
     detector = Detector(**yaml.safe_load((ROOT / f"conf/detector/{config}.yaml").read_text()))
     columns = [JOINT[name] for name in COMMON]
-    some = [r for i, r in enumerate(embedded_recordings(data, "test", 0, detector)) if data != "h36m" or i % 4 == 0]
-    some = [recording for recording in some if recording.subject == some[0].subject or data != "h36m"]
-    clips = [(r.key_points[:, :, columns], r.confidence[:, :, columns], r.seen[:, :, columns]) for r in some]
+    some = [
+        r
+        for i, r in enumerate(embedded_recordings(data, "test", 0, detector))
+        if data != "h36m" or i % 4 == 0
+    ]
+    some = [
+        recording for recording in some if recording.subject == some[0].subject or data != "h36m"
+    ]
+    clips = [
+        (r.key_points[:, :, columns], r.confidence[:, :, columns], r.seen[:, :, columns])
+        for r in some
+    ]
     return Detected(some[0].rate_hz, some[0].cameras, clips, True)
 
 
@@ -175,7 +230,10 @@ def _angle(u: np.ndarray, v: np.ndarray) -> np.ndarray:
 def motion_rows(motion: Motion) -> dict[str, str]:
     """Lengths in legs, angles (1, 50, 99 %), speeds (50, 90, 99 %)."""
     joints = np.concatenate(motion.clips)
-    length = {(JOINTS[a], JOINTS[b]): np.linalg.norm(joints[:, a] - joints[:, b], axis=-1).mean() for a, b in BONES}
+    length = {
+        (JOINTS[a], JOINTS[b]): np.linalg.norm(joints[:, a] - joints[:, b], axis=-1).mean()
+        for a, b in BONES
+    }
     leg = length["right_ankle", "right_knee"] + length["right_knee", "right_hip"]
     rows = {"leg (thigh + shank), mm": f"{leg:.0f}"}
     for (a, b), value in length.items():
@@ -190,7 +248,10 @@ def motion_rows(motion: Motion) -> dict[str, str]:
     }
     for name, values in angles.items():
         rows[f"{name}, deg"] = _percentiles(values, (1, 50, 99), 0)
-    speed = [np.linalg.norm(np.diff(clip, axis=0), axis=-1) * motion.rate_hz / 1000 for clip in motion.clips]
+    speed = [
+        np.linalg.norm(np.diff(clip, axis=0), axis=-1) * motion.rate_hz / 1000
+        for clip in motion.clips
+    ]
     for name in ("pelvis", "head_top", "left_elbow", "left_wrist", "left_knee", "left_ankle"):
         rows[f"speed of {name.replace('left_', '')}, m/s"] = _percentiles(
             np.concatenate(speed)[:, JOINT[name]], (50, 90, 99), 2
@@ -199,7 +260,9 @@ def motion_rows(motion: Motion) -> dict[str, str]:
 
 
 def detector_rows(detected: Detected) -> dict[str, str]:
-    """Residuals of a robust triangulation from the other views' consensus, relative to the stature in the image."""
+    """Residuals of a robust triangulation from the other views' consensus, relative to the stature
+    in the image.
+    """
     errors, ranks, seen_share = [], [], []
     pairs: dict[float, list[np.ndarray]] = {0.1: [], 0.5: [], 1.0: []}
     for key_points, confidence, seen in detected.clips:
@@ -216,16 +279,28 @@ def detector_rows(detected: Detected) -> dict[str, str]:
             for joint in range(len(COMMON)):
                 there = np.isfinite(length[:, :, joint])
                 if there.sum() > 50:
-                    ranks.append(spearmanr(length[:, :, joint][there], -confidence[:, :, joint][there]).statistic)
-    rows = {"residual, % of the stature (50, 90, 99 %)": _percentiles(100 * np.concatenate(errors), (50, 90, 99), 2)}
+                    ranks.append(
+                        spearmanr(
+                            length[:, :, joint][there], -confidence[:, :, joint][there]
+                        ).statistic
+                    )
+    rows = {
+        "residual, % of the stature (50, 90, 99 %)": _percentiles(
+            100 * np.concatenate(errors), (50, 90, 99), 2
+        )
+    }
     for seconds, found in pairs.items():
-        rows[f"its autocorrelation after {seconds} s"] = f"{np.corrcoef(np.concatenate(found, axis=1))[0, 1]:.2f}"
+        rows[f"its autocorrelation after {seconds} s"] = (
+            f"{np.corrcoef(np.concatenate(found, axis=1))[0, 1]:.2f}"
+        )
     rows["rank correlation with -confidence"] = f"{np.mean(ranks):.2f}" if ranks else "-"
     rows["key points not seen"] = f"{100 * (1 - np.mean(np.concatenate(seen_share))):.1f} %"
     return rows
 
 
-def _residual(cameras: Cameras, key_points: np.ndarray, confidence: np.ndarray, seen: np.ndarray) -> np.ndarray:
+def _residual(
+    cameras: Cameras, key_points: np.ndarray, confidence: np.ndarray, seen: np.ndarray
+) -> np.ndarray:
     """T V J 2 in statures; NaN where not seen or seen in fewer than 3 views."""
     frames, joints = len(key_points), key_points.shape[2]
     batch = KeyPointBatch(
@@ -238,14 +313,20 @@ def _residual(cameras: Cameras, key_points: np.ndarray, confidence: np.ndarray, 
         truth=torch.zeros(frames, joints, 3),
         truth_seen=torch.zeros(frames, joints, dtype=torch.bool),
     )
-    points = MEstimator(loss="geman_mcclure", scale=0.01, iterations=50, tolerance=0.1)(batch).points.double()
+    points = MEstimator(loss="geman_mcclure", scale=0.01, iterations=50, tolerance=0.1)(
+        batch
+    ).points.double()
     pixels, depth = project(cameras, points)
     arm = [
-        (points[:, COMMON.index(f"{s}_elbow")] - points[:, COMMON.index(f"{s}_shoulder")]).norm(dim=-1)
+        (points[:, COMMON.index(f"{s}_elbow")] - points[:, COMMON.index(f"{s}_shoulder")]).norm(
+            dim=-1
+        )
         for s in ("left", "right")
     ]
     stature = float(torch.cat(arm).median()) / UPPER_ARM
-    shoulders = depth[:, :, [COMMON.index("left_shoulder"), COMMON.index("right_shoulder")]].mean(dim=-1)
+    shoulders = depth[:, :, [COMMON.index("left_shoulder"), COMMON.index("right_shoulder")]].mean(
+        dim=-1
+    )
     focal = (cameras.K[:, 0, 0] * cameras.K[:, 1, 1]).sqrt()
     size = (focal * stature / shoulders).numpy()[..., None, None]
     residual = (key_points - pixels.numpy()) / size
@@ -259,13 +340,20 @@ def _percentiles(values: np.ndarray, at: tuple[int, ...], digits: int) -> str:
 def markdown(columns: Mapping[str, Mapping[str, str]]) -> str:
     names = list(columns)
     lines = ["| | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
-    lines += [f"| {row} | " + " | ".join(columns[n][row] for n in names) + " |" for row in columns[names[0]]]
+    lines += [
+        f"| {row} | " + " | ".join(columns[n][row] for n in names) + " |"
+        for row in columns[names[0]]
+    ]
     return "\n".join(lines)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shared", type=Path, default=ROOT.parent / "shared" / "data", help="the real recordings")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--shared", type=Path, default=ROOT.parent / "shared" / "data", help="the real recordings"
+    )
     shared = parser.parse_args().shared
     if not shared.is_dir():
         print(f"{shared} is not there: nothing to compare with.")

@@ -1,7 +1,8 @@
-"""The camera doctor's confusion table: good rigs, each spoilt in each way; what was broken against what was said.
+"""The camera doctor's confusion table: good rigs, each spoilt in each way; what was broken against
+what was said.
 
-``python scripts/doctor_table.py`` takes the embedded recordings; ``--real FOLDER`` adds Pose2Sim's example and
-caliscope's recording from a folder with ``pose2sim_single`` and ``caliscope``.
+``python scripts/doctor_table.py`` takes the embedded recordings; ``--real FOLDER`` adds Pose2Sim's
+example and caliscope's recording from a folder with ``pose2sim_single`` and ``caliscope``.
 """
 
 from __future__ import annotations
@@ -35,13 +36,19 @@ def compose(overrides: list[str]) -> dict:
         return plain(hydra.compose("cameras", [*overrides, "output=unused"]))
 
 
-def embedded(doctor: Doctor, names: list[str], frames: int, take: int) -> Iterator[tuple[str, Case]]:
-    """The middle ``frames`` frames of ``take`` recordings of each arrangement, over all of its subjects."""
+def embedded(
+    doctor: Doctor, names: list[str], frames: int, take: int
+) -> Iterator[tuple[str, Case]]:
+    """The middle ``frames`` frames of ``take`` recordings of each arrangement, over all of its
+    subjects.
+    """
     for name in names:
         for split in ("train", "validation", "test"):
             data = build(compose([f"data={name}", f"data.evaluate={split}"])["data"], "data")
             made = {"source": data.source, "split": split}
-            stored = prepared(data.cache, data.key(split), lambda data=data, split=split: data.make(split), made)
+            stored = prepared(
+                data.cache, data.key(split), lambda data=data, split=split: data.make(split), made
+            )
             subjects = defaultdict(list)
             for recording in stored:
                 subjects[recording.subject].append(recording)
@@ -56,13 +63,21 @@ def real(doctor: Doctor, folder: Path) -> Iterator[tuple[str, Case]]:
         ("pose2sim", "pose2sim_single/pose", "pose2sim_single/Calib_qualisys.toml"),
         ("caliscope", "caliscope/xy_HOLISTIC.csv", "caliscope/camera_array.toml"),
     ):
-        found = gather(read_key_points(folder / points), read_cameras(folder / cameras), {}, None, doctor.frames,
-                       doctor.shift)  # fmt: skip
+        found = gather(
+            read_key_points(folder / points),
+            read_cameras(folder / cameras),
+            {},
+            None,
+            doctor.frames,
+            doctor.shift,
+        )
         yield name, (found[0], as_filed(found[1]))
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--data", nargs="*", default=["h36m", "cmu1", "cmu2", "cmu3", "cmu4"])
     parser.add_argument("--frames", type=int, default=200, help="of each recording")
     parser.add_argument("--take", type=int, default=1, help="recordings of each subject")
@@ -89,17 +104,27 @@ def main() -> None:
             words = said(checkup.findings)
             table[kind][words] += 1
             if words != expected:
-                before, after = (" ".join(f"{x:.1f}" for x in e.tolist()) for e in (checkup.given_px, checkup.error_px))
+                before, after = (
+                    " ".join(f"{x:.1f}" for x in e.tolist())
+                    for e in (checkup.given_px, checkup.error_px)
+                )
                 print(f"{name}, {kind}: {words} [{before} -> {after} px]", flush=True)
     print_table(table)
-    print(f"\n{len(cases)} recordings; seconds: median {torch.tensor(seconds).median():.1f}, most {max(seconds):.1f}")
+    print(
+        f"\n{len(cases)} recordings; seconds: median {torch.tensor(seconds).median():.1f}, most {max(seconds):.1f}"
+    )
 
 
 def first_views(case: Case, count: int) -> Case:
     evidence, setup = case
     tensors = {name: getattr(setup, name)[:count] for name in vars(setup)}
     return (
-        replace(evidence, names=evidence.names[:count], pixels=evidence.pixels[:count], seen=evidence.seen[:count]),
+        replace(
+            evidence,
+            names=evidence.names[:count],
+            pixels=evidence.pixels[:count],
+            seen=evidence.seen[:count],
+        ),
         replace(setup, **tensors),
     )
 
@@ -110,9 +135,14 @@ def said(findings: tuple) -> str:
 
 def print_table(table: dict[str, Counter]) -> None:
     """A row for each way to spoil, with all that was said and how often."""
-    rows = [[kind, "nothing" if kind == "nothing" else BREAKAGES[kind].said,
-             ", ".join(f"{words} {count}" for words, count in row.most_common())]
-            for kind, row in table.items()]  # fmt: skip
+    rows = [
+        [
+            kind,
+            "nothing" if kind == "nothing" else BREAKAGES[kind].said,
+            ", ".join(f"{words} {count}" for words, count in row.most_common()),
+        ]
+        for kind, row in table.items()
+    ]
     print(markdown(["broken", "to be said", "said, times"], rows))
 
 

@@ -1,12 +1,13 @@
-"""Fit the embedded detector's free numbers to the learning-free rows of the paper's tab:quantitative-hypotheses.
+"""Fit the embedded detector's free numbers to the learning-free rows of the paper's
+tab:quantitative-hypotheses.
 
     python scripts/fit_detector.py            fit, print, write conf/detector/*.yaml
     python scripts/fit_detector.py --check    print only, with the numbers that are there
 
-The rows are random, average, best and worst of 200 hypotheses on both data sets, and RANSAC on Human3.6M; never the
-learned ones. Human3.6M: test split, four views. Panoptic: mean over CMU1 to CMU4, since the paper does not say which
-arrangement its column is. Pelvis-relative MPJPE (mm) over 17 joints, every 64th frame, mean over three seeds with the
-same random numbers at every step.
+The rows are random, average, best and worst of 200 hypotheses on both data sets, and RANSAC on
+Human3.6M; never the learned ones. Human3.6M: test split, four views. Panoptic: mean over CMU1 to
+CMU4, since the paper does not say which arrangement its column is. Pelvis-relative MPJPE (mm) over
+17 joints, every 64th frame, mean over three seeds with the same random numbers at every step.
 """
 
 from __future__ import annotations
@@ -48,8 +49,10 @@ FREE = {
     "human36m": ("noise", "bias", "outlier_rate"),
     "panoptic": ("bias", "outlier_rate", "outlier_size"),
 }
-"""The outliers' size on Human3.6M and the noise on Panoptic are held: with them free too, rarer and larger outliers, or
-less noise and more outliers, fit as well, and those are unlike real detectors (docs/embedded.md)."""
+"""The outliers' size on Human3.6M and the noise on Panoptic are held: with them free too, rarer and
+larger outliers, or less noise and more outliers, fit as well, and those are unlike real detectors
+(docs/embedded.md).
+"""
 TIED = {"drift": ("bias", 0.3), "outlier_rate_occluded": ("outlier_rate", 4.0)}
 """Numbers that are kept in proportion to a free one."""
 SETS = {"human36m": ("h36m",), "panoptic": ("cmu1", "cmu2", "cmu3", "cmu4")}
@@ -69,9 +72,12 @@ class Draw:
         take, count, views = self.take, len(self.points), range(len(self.processes))
         shown = detector.shown(self.points, self.body_error, take.familiar)
         found = [
-            detector.view(self.points, shown, take.rig, view, self.processes[view], take.familiar) for view in views
+            detector.view(self.points, shown, take.rig, view, self.processes[view], take.familiar)
+            for view in views
         ]
-        key_points, confidence, seen = (torch.from_numpy(np.stack(x, axis=1)) for x in zip(*found, strict=True))
+        key_points, confidence, seen = (
+            torch.from_numpy(np.stack(x, axis=1)) for x in zip(*found, strict=True)
+        )
         rig = take.rig.cameras
         return KeyPointBatch(
             sample=torch.arange(count),
@@ -86,35 +92,50 @@ class Draw:
 
 
 def draws(detector: Detector, data: str, split: str, seed: int) -> list[Draw]:
-    """One for each person. The random numbers do not depend on the free numbers, so they serve the whole fit."""
+    """One for each person. The random numbers do not depend on the free numbers, so they serve the
+    whole fit.
+    """
     cameras = sorted({number for name in SETS["panoptic"] for number in ARRANGEMENTS[name]})
     drawn = []
     for _, group in groupby(
-        takes("h36m" if data == "human36m" else "panoptic", split, seed, cameras), lambda t: t.subject
+        takes("h36m" if data == "human36m" else "panoptic", split, seed, cameras),
+        lambda t: t.subject,
     ):
         parts = []
         for take in group:
             frames = len(take.truth)
             bias, drift = detector.body_error(frames, take.rate_hz, seed, take.subject, take.name)
             generators = [generator(seed, "camera", take.name, name) for name in take.rig.names]
-            processes = [detector.processes(frames, take.rate_hz, rng).every(STRIDE) for rng in generators]
+            processes = [
+                detector.processes(frames, take.rate_hz, rng).every(STRIDE) for rng in generators
+            ]
             parts.append((take.truth[::STRIDE], drift[::STRIDE], processes))
         points, drift, processes = zip(*parts, strict=True)
         drift = np.concatenate(drift)
         drawn.append(
-            Draw(take, np.concatenate(points), (bias, drift), [_join(view) for view in zip(*processes, strict=True)])
+            Draw(
+                take,
+                np.concatenate(points),
+                (bias, drift),
+                [_join(view) for view in zip(*processes, strict=True)],
+            )
         )
     return drawn
 
 
 def _join(parts: tuple[Processes, ...]) -> Processes:
-    return Processes(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])})
+    return Processes(
+        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
+    )
 
 
 def views_of(data: str, rig_names: tuple[str, ...]) -> dict[str, list[int]]:
     if data == "human36m":
         return {"h36m": [0, 1, 2, 3]}
-    return {name: [rig_names.index(f"00_{number:02d}") for number in ARRANGEMENTS[name]] for name in SETS[data]}
+    return {
+        name: [rig_names.index(f"00_{number:02d}") for number in ARRANGEMENTS[name]]
+        for name in SETS[data]
+    }
 
 
 def some_views(batch: KeyPointBatch, views: list[int]) -> KeyPointBatch:
@@ -147,12 +168,16 @@ def rows(batch: KeyPointBatch, threshold: float, seed: int) -> dict[str, torch.T
     }
 
 
-def table(detector: Detector, data: str, drawn: list[Draw], threshold: float, seed: int) -> dict[str, dict[str, float]]:
+def table(
+    detector: Detector, data: str, drawn: list[Draw], threshold: float, seed: int
+) -> dict[str, dict[str, float]]:
     """The rows' means for each arrangement of a data set."""
     result, batches = {}, [draw.batch(detector) for draw in drawn]
     for arrangement, views in views_of(data, drawn[0].take.rig.names).items():
         parts = [rows(some_views(batch, views), threshold, seed) for batch in batches]
-        result[arrangement] = {name: float(torch.cat([part[name] for part in parts]).mean()) for name in parts[0]}
+        result[arrangement] = {
+            name: float(torch.cat([part[name] for part in parts]).mean()) for name in parts[0]
+        }
     return result
 
 
@@ -164,7 +189,11 @@ def mean(tables: list[dict[str, dict[str, float]]]) -> dict[str, float]:
 
 def with_numbers(detector: Detector, numbers: Mapping[str, float]) -> Detector:
     """Replace free numbers, and those that are tied to them."""
-    tied = {name: float(f"{numbers[of] * ratio:.3g}") for name, (of, ratio) in TIED.items() if of in numbers}
+    tied = {
+        name: float(f"{numbers[of] * ratio:.3g}")
+        for name, (of, ratio) in TIED.items()
+        if of in numbers
+    }
     return replace(detector, **numbers, **tied)
 
 
@@ -178,7 +207,9 @@ def fit(detector: Detector, data: str, drawn: dict[int, list[Draw]], threshold: 
         found = mean([table(tried, data, drawn[seed], threshold, seed) for seed in drawn])
         return np.array([np.log(found[name] / target) for name, target in targets.items()])
 
-    solution = least_squares(residuals, start, diff_step=0.02, x_scale=0.3, xtol=1e-3, ftol=1e-3, max_nfev=5)
+    solution = least_squares(
+        residuals, start, diff_step=0.02, x_scale=0.3, xtol=1e-3, ftol=1e-3, max_nfev=5
+    )
     rounded = [float(f"{value:.3g}") for value in np.exp(solution.x)]
     return with_numbers(detector, dict(zip(free, rounded, strict=True)))
 
@@ -190,24 +221,37 @@ def best_threshold(detector: Detector, data: str, seed: int) -> float:
     batches = [some_views(draw.batch(detector), views) for draw in drawn]
 
     def error(threshold: float) -> float:
-        estimates = [(Ransac(threshold=threshold, pairs=64, seed=seed)(batch), batch) for batch in batches]
-        parts = [relative_error(e.points.double(), e.estimated, batch.truth.double()) for e, batch in estimates]
+        estimates = [
+            (Ransac(threshold=threshold, pairs=64, seed=seed)(batch), batch) for batch in batches
+        ]
+        parts = [
+            relative_error(e.points.double(), e.estimated, batch.truth.double())
+            for e, batch in estimates
+        ]
         return float(torch.cat(parts).mean())
 
     return min((0.003, 0.005, 0.007, 0.01, 0.014, 0.02, 0.03), key=error)
 
 
-def report(console: Console, detector: Detector, data: str, drawn: dict[int, list[Draw]], threshold: float) -> None:
+def report(
+    console: Console, detector: Detector, data: str, drawn: dict[int, list[Draw]], threshold: float
+) -> None:
     """Target beside fitted, for the mean, and for each seed and arrangement."""
     tables = {seed: table(detector, data, drawn[seed], threshold, seed) for seed in drawn}
-    sheet = Table(title=f"{data}: pelvis-relative MPJPE, mm (RANSAC threshold {threshold} of the person's size)")
+    sheet = Table(
+        title=f"{data}: pelvis-relative MPJPE, mm (RANSAC threshold {threshold} of the person's size)"
+    )
     columns = ["target", "fitted", "difference", *(f"seed {seed}" for seed in tables)]
     arrangements = SETS[data] if len(SETS[data]) > 1 else ()
     for column in ("row", *columns, *arrangements):
         sheet.add_column(column, justify="right")
     for name in ("random", "average", "best", "worst", "ransac"):
         target, fitted = TARGETS[data].get(name), mean(list(tables.values()))[name]
-        cells = [f"{target or '-'}", f"{fitted:.1f}", f"{100 * (fitted / target - 1):+.1f} %" if target else "-"]
+        cells = [
+            f"{target or '-'}",
+            f"{fitted:.1f}",
+            f"{100 * (fitted / target - 1):+.1f} %" if target else "-",
+        ]
         cells += [f"{mean([one])[name]:.1f}" for one in tables.values()]
         cells += [f"{np.mean([one[a][name] for one in tables.values()]):.1f}" for a in arrangements]
         sheet.add_row(name, *cells)
@@ -219,14 +263,20 @@ def write(path: Path, detector: Detector, data: str) -> None:
     numbers: dict[str, Any] = dict(vars(detector))
     free = ", ".join((*FREE[data], *(name for name, (of, _) in TIED.items() if of in FREE[data])))
     with atomic_write(path, "w") as handle:
-        handle.write(f"# The embedded detector on {data}. Written by scripts/fit_detector.py, which fitted\n")
-        handle.write(f"# {free}\n# to the learning-free rows of the paper's tab:quantitative-hypotheses.\n")
+        handle.write(
+            f"# The embedded detector on {data}. Written by scripts/fit_detector.py, which fitted\n"
+        )
+        handle.write(
+            f"# {free}\n# to the learning-free rows of the paper's tab:quantitative-hypotheses.\n"
+        )
         handle.write("# Lengths in statures, rates as shares of the time, durations in seconds.\n")
         yaml.safe_dump(numbers, handle, sort_keys=False, default_flow_style=None, width=100)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--check", action="store_true", help="do not fit, do not write")
     parser.add_argument("--data", choices=sorted(TARGETS), action="append", help="only this one")
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)

@@ -4,9 +4,9 @@
     python scripts/mutants.py --files src/ghpt/geometry/*.py --count 50 --seed 1
     python scripts/mutants.py --planted                           # the bugs of planted_bugs.json instead
 
-One mutant at a time is written into a temporary copy of ``src``, never into the working tree. The tests of its file
-run in a fork of this process, which has imported the large libraries already; so this needs Linux or macOS. Which
-mutants are drawn depends on the sources and the seed only.
+One mutant at a time is written into a temporary copy of ``src``, never into the working tree. The
+tests of its file run in a fork of this process, which has imported the large libraries already; so
+this needs Linux or macOS. Which mutants are drawn depends on the sources and the seed only.
 """
 
 from __future__ import annotations
@@ -62,7 +62,15 @@ TESTS = {
 }
 """What may be mutated, and for each file the tests that must notice it."""
 
-LIBRARIES = ("torch", "lightning.pytorch", "torchmetrics", "hydra", "scipy.spatial.transform", "cv2", "hypothesis")
+LIBRARIES = (
+    "torch",
+    "lightning.pytorch",
+    "torchmetrics",
+    "hydra",
+    "scipy.spatial.transform",
+    "cv2",
+    "hypothesis",
+)
 """Imported once, before the forks. Nothing of ghpt may be: it differs from mutant to mutant."""
 
 COMPARISONS = {
@@ -88,7 +96,14 @@ OPERATORS = {
     ast.BitAnd: ast.BitOr,
     ast.BitOr: ast.BitAnd,
 }
-PAIRS = [("min", "max"), ("amin", "amax"), ("any", "all"), ("sum", "mean"), ("sin", "cos"), ("argmin", "argmax")]
+PAIRS = [
+    ("min", "max"),
+    ("amin", "amax"),
+    ("any", "all"),
+    ("sum", "mean"),
+    ("sin", "cos"),
+    ("argmin", "argmax"),
+]
 NAMES = dict(PAIRS) | {second: first for first, second in PAIRS}
 DROPPED = ("clamp", "clamp_", "clamp_min", "nan_to_num", "abs", "sqrt", "square", "double")
 """Methods that a mutant leaves out of a chain of calls."""
@@ -133,7 +148,8 @@ def variants(node: ast.AST) -> Iterator[ast.AST | str]:
         case ast.BoolOp(op=operator):
             yield ast.BoolOp(ast.Or() if isinstance(operator, ast.And) else ast.And(), node.values)
         case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int())):
-            pass  # -1 for 1 is the same dimension or the one beside it, which changing the number tries
+            # -1 for 1 is the same dimension or the one beside it, which changing the number tries
+            pass
         case ast.UnaryOp(operand=operand):
             yield operand
         case ast.Constant(value=bool() as value):
@@ -182,7 +198,9 @@ def call_variants(call: ast.Call) -> Iterator[ast.AST]:
 
 
 def nodes(tree: ast.AST) -> Iterator[ast.AST]:
-    """All nodes whose change would change what the program does: no annotations, messages or docstrings."""
+    """All nodes whose change would change what the program does: no annotations, messages or
+    docstrings.
+    """
     yield tree
     for name, value in ast.iter_fields(tree):
         if name in ("annotation", "returns", "decorator_list", "exc", "bases"):
@@ -203,7 +221,9 @@ def mutants(file: str) -> list[Mutant]:
     for node in nodes(ast.parse(source)):
         for variant in variants(node):
             text = variant if isinstance(variant, str) else ast.unparse(copy.deepcopy(variant))
-            if isinstance(node, ast.expr) and not isinstance(variant, ast.Name | ast.Constant | ast.Call):
+            if isinstance(node, ast.expr) and not isinstance(
+                variant, ast.Name | ast.Constant | ast.Call
+            ):
                 text = f"({text})"
             start = starts[node.lineno - 1] + node.col_offset
             end = starts[node.end_lineno - 1] + node.end_col_offset
@@ -276,7 +296,15 @@ def _in_child(tests: list[str], work: Path, cached: bool) -> int:
     found = importlib.util.find_spec("ghpt")
     if found is None or not str(found.origin).startswith(str(work)):
         return 1
-    options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", f"--basetemp={work / 'tests'}"]
+    options = [
+        "-x",
+        "-q",
+        "-p",
+        "no:cacheprovider",
+        "-p",
+        "no:xdist",
+        f"--basetemp={work / 'tests'}",
+    ]
     options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of plugins among the libraries
     return int(pytest.main([*options, *(f"tests/{test}" for test in tests)]))
 
@@ -298,11 +326,15 @@ def duration(file: str, work: Path) -> float:
     """How long the tests of an unchanged file take, s. They must pass."""
     start = time.monotonic()
     if run_tests(TESTS[file], work, None) != "passed":
-        raise SystemExit(f"The tests of {file} fail without a mutant:\n{(work / 'log.txt').read_text()[-3000:]}")
+        raise SystemExit(
+            f"The tests of {file} fail without a mutant:\n{(work / 'log.txt').read_text()[-3000:]}"
+        )
     return time.monotonic() - start
 
 
-def share(chosen: list[Mutant], work: Path, same: dict[tuple[str, str, str], str]) -> Iterator[dict]:
+def share(
+    chosen: list[Mutant], work: Path, same: dict[tuple[str, str, str], str]
+) -> Iterator[dict]:
     """Try mutants one after another; yields a row for each."""
     shutil.copytree(ROOT / "src", work / "src", ignore=shutil.ignore_patterns("__pycache__"))
     limits: dict[str, float] = {}
@@ -325,16 +357,30 @@ def score(rows: list[dict]) -> tuple[int, int]:
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("--files", nargs="+", help="which of the files of TESTS; all")
-    parser.add_argument("--planted", action="store_true", help="the bugs of planted_bugs.json instead of random ones")
-    parser.add_argument("--count", type=int, default=100, help="how many mutants, drawn among all of these files")
+    parser.add_argument(
+        "--planted",
+        action="store_true",
+        help="the bugs of planted_bugs.json instead of random ones",
+    )
+    parser.add_argument(
+        "--count", type=int, default=100, help="how many mutants, drawn among all of these files"
+    )
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--least", type=float, default=0.0, help="exit with 1 if a smaller share is killed")
+    parser.add_argument(
+        "--least", type=float, default=0.0, help="exit with 1 if a smaller share is killed"
+    )
     parser.add_argument("--output", default="mutants.json")
     options = parser.parse_args()
     files = options.files or sorted(TESTS)
-    every = planted() if options.planted else [mutant for file in sorted(files) for mutant in mutants(file)]
+    every = (
+        planted()
+        if options.planted
+        else [mutant for file in sorted(files) for mutant in mutants(file)]
+    )
     if unknown := sorted({mutant.file for mutant in every} - set(TESTS)):
         parser.error(f"no tests are named for {', '.join(unknown)}: add them to TESTS")
     chosen = random.Random(options.seed).sample(every, min(options.count, len(every)))
@@ -345,7 +391,9 @@ def main() -> int:
     torch.set_num_threads(1)  # threads do not survive a fork
     rows = []
     with tempfile.TemporaryDirectory() as folder:
-        for row in share(sorted(chosen, key=lambda m: (m.file, m.start)), Path(folder), equivalent()):
+        for row in share(
+            sorted(chosen, key=lambda m: (m.file, m.start)), Path(folder), equivalent()
+        ):
             print(f"{row['result']:10} {row['file']}:{row['line']}", flush=True)
             print(f"    - {row['before']}\n    + {row['after']}", flush=True)
             rows.append(row)
@@ -357,7 +405,11 @@ def main() -> int:
     from ghpt.files import atomic_write  # only now: the forks must import the mutants
 
     with atomic_write(options.output, "w") as handle:
-        json.dump({"seed": options.seed, "killed": killed, "total": total, "mutants": rows}, handle, indent=1)
+        json.dump(
+            {"seed": options.seed, "killed": killed, "total": total, "mutants": rows},
+            handle,
+            indent=1,
+        )
     return int(killed < options.least * total)
 
 

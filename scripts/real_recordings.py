@@ -1,10 +1,12 @@
-"""Real recordings without a truth: errors in left-out views, constancy of lengths, agreement with the tools' own 3D.
+"""Real recordings without a truth: errors in left-out views, constancy of lengths, agreement with
+the tools' own 3D.
 
     python scripts/real_recordings.py FOLDER [ckpt=...]
 
-FOLDER holds pose2sim_single/ (Pose2Sim's demo: pose/, Calib_qualisys.toml, Balancing_for_IK.trc) and caliscope/
-(xy_HOLISTIC.csv, camera_array.toml, xyz_HOLISTIC.csv). Prints Markdown tables. The tools' own 3D is no truth: it was
-made of the same key points, by linear triangulation, and Pose2Sim's was filtered.
+FOLDER holds pose2sim_single/ (Pose2Sim's demo: pose/, Calib_qualisys.toml, Balancing_for_IK.trc)
+and caliscope/ (xy_HOLISTIC.csv, camera_array.toml, xyz_HOLISTIC.csv). Prints Markdown tables. The
+tools' own 3D is no truth: it was made of the same key points, by linear triangulation, and
+Pose2Sim's was filtered.
 """
 
 from __future__ import annotations
@@ -29,17 +31,32 @@ from ghpt.skeleton import JOINT
 
 ROOT = Path(__file__).resolve().parents[1]
 ESTIMATORS = ("linear", "weighted_linear", "ransac", "adaptive_ransac", "m_estimator", "lo_ransac")
-LIMBS = [f"{side}_{joint}" for side in ("right", "left")
-         for joint in ("ankle", "knee", "hip", "shoulder", "elbow", "wrist")]  # fmt: skip
+LIMBS = [
+    f"{side}_{joint}"
+    for side in ("right", "left")
+    for joint in ("ankle", "knee", "hip", "shoulder", "elbow", "wrist")
+]
 
 
 def main(folder: Path, words: list[str]) -> None:
     recordings = {
-        "Pose2Sim's demo": (["rate_hz=60", "keypoints={}/pose2sim_single/pose",
-                             "cameras={}/pose2sim_single/Calib_qualisys.toml"], of_pose2sim),
-        "caliscope's": (["rate_hz=30", "keypoints={}/caliscope/xy_HOLISTIC.csv",
-                         "cameras={}/caliscope/camera_array.toml"], of_caliscope),
-    }  # fmt: skip
+        "Pose2Sim's demo": (
+            [
+                "rate_hz=60",
+                "keypoints={}/pose2sim_single/pose",
+                "cameras={}/pose2sim_single/Calib_qualisys.toml",
+            ],
+            of_pose2sim,
+        ),
+        "caliscope's": (
+            [
+                "rate_hz=30",
+                "keypoints={}/caliscope/xy_HOLISTIC.csv",
+                "cameras={}/caliscope/camera_array.toml",
+            ],
+            of_caliscope,
+        ),
+    }
     for name, (given, own) in recordings.items():
         theirs = own(folder)
         given = [word.format(folder) for word in given]
@@ -48,7 +65,9 @@ def main(folder: Path, words: list[str]) -> None:
             runs = {estimator: [f"triangulation={estimator}"] for estimator in ESTIMATORS}
             runs |= {"view_weights": words} if words else {}
             for estimator, more in runs.items():
-                found[estimator] = poses([*given, *more, "formats=[npz]", "evaluated_frames=1"], Path(output))
+                found[estimator] = poses(
+                    [*given, *more, "formats=[npz]", "evaluated_frames=1"], Path(output)
+                )
             numbers = run([*given, *words, f"compare=[{','.join(ESTIMATORS)}]"], Path(output))
         header, rows = comparison_rows(numbers)
         print(f"\n{name}, {numbers['frames']} frames:\n\n{markdown(header, rows)}\n")
@@ -81,14 +100,20 @@ def distance(ours: dict[int, np.ndarray], theirs: dict[int, np.ndarray]) -> tupl
 
 
 def of_pose2sim(folder: Path) -> dict[int, np.ndarray]:
-    """Metres, counted from 1, and turned to y up: x, y, z of the cameras' world are the file's z, x, y."""
+    """Metres, counted from 1, and turned to y up: x, y, z of the cameras' world are the file's z,
+    x, y.
+    """
     with open(folder / "pose2sim_single" / "Balancing_for_IK.trc", encoding="utf-8") as handle:
         rows = list(csv.reader(handle, delimiter="\t"))
     names = [name for name in rows[3][2:] if name]
-    at = [names.index("".join((name[0].upper(), name.split("_")[1].capitalize()))) for name in LIMBS]
+    at = [
+        names.index("".join((name[0].upper(), name.split("_")[1].capitalize()))) for name in LIMBS
+    ]
     found = {}
     for row in (row for row in rows[5:] if row and row[0].strip()):
-        values = np.array([float(cell or "nan") for cell in row[2 : 2 + 3 * len(names)]]).reshape(-1, 3)
+        values = np.array([float(cell or "nan") for cell in row[2 : 2 + 3 * len(names)]]).reshape(
+            -1, 3
+        )
         found[int(row[0]) - 1] = 1000 * values[at][:, [2, 0, 1]]
     return found
 
@@ -101,7 +126,9 @@ def of_caliscope(folder: Path) -> dict[int, np.ndarray]:
         for row in csv.DictReader(handle):
             if int(row["point_id"]) in at:
                 pose = found.setdefault(int(row["sync_index"]), np.full((len(LIMBS), 3), np.nan))
-                pose[at[int(row["point_id"])]] = [1000 * float(row[f"{axis}_coord"]) for axis in "xyz"]
+                pose[at[int(row["point_id"])]] = [
+                    1000 * float(row[f"{axis}_coord"]) for axis in "xyz"
+                ]
     return found
 
 

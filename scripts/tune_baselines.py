@@ -1,7 +1,9 @@
-"""Choose the classical estimators' thresholds on validation data: ``python scripts/tune_baselines.py``.
+"""Choose the classical estimators' thresholds on validation data: ``python
+scripts/tune_baselines.py``.
 
-Prints the pelvis-relative MPJPE of each estimator for each threshold (a fraction of the person's size in the image) on
-the embedded validation splits; conf/baselines/default.yaml holds the best on Human3.6M. Test data are never looked at.
+Prints the pelvis-relative MPJPE of each estimator for each threshold (a fraction of the person's
+size in the image) on the embedded validation splits; conf/baselines/default.yaml holds the best on
+Human3.6M. Test data are never looked at.
 """
 
 import itertools
@@ -25,7 +27,9 @@ ESTIMATORS = {
     "ransac": lambda x: Ransac(threshold=x, pairs=64, seed=0),
     "lo_ransac": lambda x: LoRansac(threshold=x, seed=0),
     **{
-        f"m_estimator {loss}": lambda x, loss=loss: MEstimator(loss=loss, scale=x, iterations=10, tolerance=1.0)
+        f"m_estimator {loss}": lambda x, loss=loss: MEstimator(
+            loss=loss, scale=x, iterations=10, tolerance=1.0
+        )
         for loss in ("huber", "cauchy", "geman_mcclure")
     },
     "weighted_linear (power = 100 x)": lambda x: WeightedLinear(power=100 * x),
@@ -34,7 +38,9 @@ ESTIMATORS = {
 
 def validation_batches(name: str) -> list:
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        config = plain(hydra.compose("train", [f"data={name}", "data.evaluate=validation", "output=none"]))
+        config = plain(
+            hydra.compose("train", [f"data={name}", "data.evaluate=validation", "output=none"])
+        )
     data = build(config["data"], "data")
     data.setup("test")
     return list(data.test_dataloader())
@@ -52,14 +58,21 @@ def main() -> None:
     torch.set_num_threads(2)
     for name in ("h36m", "cmu3"):
         batches = validation_batches(name)
-        table = Table("estimator", *map(str, GRID), title=f"validation split of embedded {name}: relative MPJPE, mm")
+        table = Table(
+            "estimator",
+            *map(str, GRID),
+            title=f"validation split of embedded {name}: relative MPJPE, mm",
+        )
         cells = {
             (e, x): error(ESTIMATORS[e](x), batches)
             for e, x in track(list(itertools.product(ESTIMATORS, GRID)), description=name)
         }
         for e in ESTIMATORS:
             best = min(cells[e, x] for x in GRID)
-            table.add_row(e, *(f"[bold]{v:.2f}[/]" if (v := cells[e, x]) == best else f"{v:.2f}" for x in GRID))
+            table.add_row(
+                e,
+                *(f"[bold]{v:.2f}[/]" if (v := cells[e, x]) == best else f"{v:.2f}" for x in GRID),
+            )
         Console(width=120).print(table)
 
 

@@ -1,9 +1,11 @@
-"""Choose the numbers of the camera problem's classical baselines: ``python scripts/tune_camera_baselines.py``.
+"""Choose the numbers of the camera problem's classical baselines: ``python
+scripts/tune_camera_baselines.py``.
 
-Prints the median E_3D (mm, with the known length of t) of each estimator for each setting, for every pair of cameras,
-over random draws of 80 frames of the embedded Human3.6M's validation split (S8), and the time for a pair. The geometric
-mean over the pairs decides, so that every pair counts the same: conf/camera_baselines/default.yaml holds the best.
-Arguments, if any, are the estimators to tune. Test data are never looked at.
+Prints the median E_3D (mm, with the known length of t) of each estimator for each setting, for
+every pair of cameras, over random draws of 80 frames of the embedded Human3.6M's validation split
+(S8), and the time for a pair. The geometric mean over the pairs decides, so that every pair counts
+the same: conf/camera_baselines/default.yaml holds the best. Arguments, if any, are the estimators
+to tune. Test data are never looked at.
 """
 
 import sys
@@ -28,17 +30,24 @@ DRAWS = 20
 USAC = {"confidence": 0.9999, "iterations": 1000}
 CANDIDATES: dict[str, dict[str, PairBaseline]] = {
     "eight_point": {"": EightPoint()},
-    "ransac": {f"threshold {x}": Ransac(samples=500, threshold=x, seed=0) for x in (0.02, 0.03, 0.04, 0.06, 0.08)},
+    "ransac": {
+        f"threshold {x}": Ransac(samples=500, threshold=x, seed=0)
+        for x in (0.02, 0.03, 0.04, 0.06, 0.08)
+    },
     **{
         f"usac_{method}": {
-            f"threshold {x}, pixels {pixels}": Usac(f"USAC_{method.upper()}", threshold=x, pixels=pixels, **USAC)
+            f"threshold {x}, pixels {pixels}": Usac(
+                f"USAC_{method.upper()}", threshold=x, pixels=pixels, **USAC
+            )
             for pixels in (1.0, 100.0, 200.0, 500.0)
             for x in (0.01, 0.02, 0.04, 0.08)
         }
         for method in ("magsac", "accurate")
     },
     "poselib": {
-        f"threshold {x}, {loss} {scale}": PoseLib(threshold=x, loss=loss, scale=scale, iterations=1000, seed=0)
+        f"threshold {x}, {loss} {scale}": PoseLib(
+            threshold=x, loss=loss, scale=scale, iterations=1000, seed=0
+        )
         for x in (0.01, 0.02, 0.04)
         for loss in ("TRUNCATED", "HUBER", "CAUCHY")
         for scale in (0.003, 0.006, 0.012)
@@ -48,10 +57,14 @@ CANDIDATES: dict[str, dict[str, PairBaseline]] = {
 
 def validation_pairs() -> PairBatch:
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        config = plain(hydra.compose("train", ["data=h36m", "data.evaluate=validation", "output=none"]))
+        config = plain(
+            hydra.compose("train", ["data=h36m", "data.evaluate=validation", "output=none"])
+        )
     data = build(config["data"], "data")
     data.setup("test")
-    pairs = Pairs(data.frames["test"].recordings, PairSettings(frames=80, draws=DRAWS, points=500), seed=0)
+    pairs = Pairs(
+        data.frames["test"].recordings, PairSettings(frames=80, draws=DRAWS, points=500), seed=0
+    )
     return pairs[range(len(pairs))]
 
 
@@ -73,7 +86,14 @@ def main() -> None:
     names = ["-".join(str(v + 1) for v in pair) for pair in batch.pair.tolist()]
     pairs = list(dict.fromkeys(names))
     for name in sys.argv[1:] or CANDIDATES:
-        table = Table(name, *pairs, "all", "geometric", "ms", title=f"{name}: median E_3D, mm, {DRAWS} draws of S8")
+        table = Table(
+            name,
+            *pairs,
+            "all",
+            "geometric",
+            "ms",
+            title=f"{name}: median E_3D, mm, {DRAWS} draws of S8",
+        )
         rows = {}
         for setting, baseline in CANDIDATES[name].items():
             start = time.perf_counter()
@@ -81,7 +101,12 @@ def main() -> None:
             duration = 1e3 * (time.perf_counter() - start) / len(batch)
             error = errors(estimate, batch)
             of_pair = torch.stack([error[[n == pair for n in names]].median() for pair in pairs])
-            rows[setting] = (*of_pair.tolist(), error.median().item(), of_pair.log().mean().exp().item(), duration)
+            rows[setting] = (
+                *of_pair.tolist(),
+                error.median().item(),
+                of_pair.log().mean().exp().item(),
+                duration,
+            )
         for setting, row in sorted(rows.items(), key=lambda item: item[1][-2]):
             table.add_row(setting, *(f"{x:.2f}" for x in row))
         Console(width=140).print(table)

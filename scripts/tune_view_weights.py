@@ -2,9 +2,9 @@
 
     python scripts/tune_view_weights.py runs/cmu2/last.ckpt
 
-Prints the pelvis-relative MPJPE of adaptive RANSAC and of the view weights on the embedded validation splits, as they
-are and perturbed, and the geometric mean over all, by which conf/view_weights and conf/baselines are chosen. Test data
-are never looked at.
+Prints the pelvis-relative MPJPE of adaptive RANSAC and of the view weights on the embedded
+validation splits, as they are and perturbed, and the geometric mean over all, by which
+conf/view_weights and conf/baselines are chosen. Test data are never looked at.
 """
 
 import argparse
@@ -24,7 +24,13 @@ from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Linear
 from ghpt.models.estimators.ransac import AdaptiveRansac
 from ghpt.models.estimators.view_weights import ViewWeights
-from ghpt.paper.robustness.perturbation import MissingDetections, Noise, Outliers, RotatedCameras, ShiftedCameras
+from ghpt.paper.robustness.perturbation import (
+    MissingDetections,
+    Noise,
+    Outliers,
+    RotatedCameras,
+    ShiftedCameras,
+)
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STRIDES = {"h36m": 256, "cmu3": 512}
@@ -48,7 +54,12 @@ CONDITIONS = {
 
 
 def validation_batches(name: str) -> list:
-    words = [f"data={name}", "data.evaluate=validation", f"data.stride={STRIDES[name]}", "output=none"]
+    words = [
+        f"data={name}",
+        "data.evaluate=validation",
+        f"data.stride={STRIDES[name]}",
+        "output=none",
+    ]
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         config = plain(hydra.compose("train", words))
     data = build(config["data"], "data")
@@ -59,7 +70,9 @@ def validation_batches(name: str) -> list:
 def error(estimator, batches: list, condition) -> float:
     total = count = 0.0
     for batch in batches:
-        errors, counted = joint_errors(estimator(condition(batch, 0)), batch.truth, batch.truth_seen, "relative")
+        errors, counted = joint_errors(
+            estimator(condition(batch, 0)), batch.truth, batch.truth_seen, "relative"
+        )
         total, count = total + errors.sum().item(), count + counted.sum().item()
     return total / count
 
@@ -72,14 +85,29 @@ def main() -> None:
     batches = {name: validation_batches(name) for name in STRIDES}
     estimators = [("linear", Linear())]
     for quantile, adapt in CONSENSUS:
-        settings = {"threshold": 0.02, "pairs": 24, "seed": 0, "adapt": adapt, "quantile": quantile, "rounds": 4}
+        settings = {
+            "threshold": 0.02,
+            "pairs": 24,
+            "seed": 0,
+            "adapt": adapt,
+            "quantile": quantile,
+            "rounds": 4,
+        }
         robust = AdaptiveRansac(**settings)
         estimators.append((f"RANSAC, quantile {quantile:g}, adapt {adapt:g}", robust))
-        estimators += [(f"  power {power:g}", ViewWeights(model, robust, power)) for power in POWERS]
-    columns = [Column("estimator", no_wrap=True), "mean", *(f"{name} {c}" for name in STRIDES for c in CONDITIONS)]
+        estimators += [
+            (f"  power {power:g}", ViewWeights(model, robust, power)) for power in POWERS
+        ]
+    columns = [
+        Column("estimator", no_wrap=True),
+        "mean",
+        *(f"{name} {c}" for name in STRIDES for c in CONDITIONS),
+    ]
     table = Table(*columns)
     for name, estimator in track(estimators):
-        errors = [error(estimator, batches[data], c) for data in STRIDES for c in CONDITIONS.values()]
+        errors = [
+            error(estimator, batches[data], c) for data in STRIDES for c in CONDITIONS.values()
+        ]
         mean = math.exp(sum(map(math.log, errors)) / len(errors))
         table.add_row(name, f"{mean:.2f}", *(f"{e:.2f}" for e in errors))
     Console(width=260).print(table)

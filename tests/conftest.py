@@ -25,16 +25,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         return
     for item in items:
         if item.get_closest_marker("posix"):
-            item.add_marker(pytest.mark.skip(reason="needs forks, signals or programs that Windows lacks"))
+            item.add_marker(
+                pytest.mark.skip(reason="needs forks, signals or programs that Windows lacks")
+            )
 
 
-if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # so a script's background job starts, and all that it starts
+if (
+    signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+):  # so a script's background job starts, and all that it starts
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """The folder of real calibrations, motion and detections that developers have beside the project."""
+    """The folder of real calibrations, motion and detections that developers have beside the
+    project.
+    """
     folder = Path(__file__).resolve().parents[2] / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"the developers' real data is not at {folder}")
@@ -43,13 +49,17 @@ def shared_data() -> Path:
 
 @pytest.fixture(autouse=True)
 def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Prepared recordings go to a folder of the test session, shared by its tests, never to the user's cache."""
+    """Prepared recordings go to a folder of the test session, shared by its tests, never to the
+    user's cache.
+    """
     base = tmp_path_factory.getbasetemp()
     monkeypatch.setenv("GHPT_CACHE", str((base.parent if WORKER else base) / "cache"))
 
 
 @pytest.fixture
-def typed(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+def typed(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> Callable[..., tuple[int, str, str]]:
     """``typed(conf, command, words)`` runs train.py in this process: (exit status, stdout, stderr)."""
     handlers, level = list(logging.root.handlers), logging.root.level
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")

@@ -7,11 +7,27 @@ from typing import Any
 
 from ghpt.errors import GhptDataError
 
-_WORDS = (b"nan", b"inf", b"-1", b"1e400", b"[]", b"{}", b"null", b'"x"', b"9" * 30, b"\xff", b"[[[", b":", b",")
+_WORDS = (
+    b"nan",
+    b"inf",
+    b"-1",
+    b"1e400",
+    b"[]",
+    b"{}",
+    b"null",
+    b'"x"',
+    b"9" * 30,
+    b"\xff",
+    b"[[[",
+    b":",
+    b",",
+)
 
 
 def damage(path: Path, read: Callable[[Path], Any], times: int) -> set[str]:
-    """Spoil the file so many times, each time anew: what came of reading it, "read" or "named" (GhptDataError)."""
+    """Spoil the file so many times, each time anew: what came of reading it, "read" or "named"
+    (GhptDataError).
+    """
     whole = path.read_bytes()
     chance = random.Random(0)
     outcomes = set()

@@ -1,4 +1,6 @@
-"""The commands and the code of README.md and the pages of the site: where they stand, and what they need to run."""
+"""The commands and the code of README.md and the pages of the site: where they stand, and what they
+need to run.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,11 @@ from predicting import walk, write_people
 from real_layout import write_human36m_layout
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "benchmarks" / "README.md"]
+PAGES = [
+    ROOT / "README.md",
+    *sorted((ROOT / "docs").glob("*.md")),
+    ROOT / "benchmarks" / "README.md",
+]
 FRAMES = 80
 
 
@@ -58,8 +64,12 @@ def blocks(page: Path) -> list[Block]:
     """The page's fenced blocks in their order."""
     found, text = [], page.read_text(encoding="utf-8")
     for match in re.finditer(r"^```(.*)\n((?:(?!```).*\n)*)```$", text, flags=re.MULTILINE):
-        found.append(Block(page, text[: match.start(2)].count("\n") + 1, match[1].strip(), match[2]))
-    assert 2 * len(found) == len(re.findall(r"^```", text, flags=re.MULTILINE)), f"{page}: a fence is not closed"
+        found.append(
+            Block(page, text[: match.start(2)].count("\n") + 1, match[1].strip(), match[2])
+        )
+    assert 2 * len(found) == len(re.findall(r"^```", text, flags=re.MULTILINE)), (
+        f"{page}: a fence is not closed"
+    )
     return found
 
 
@@ -73,7 +83,9 @@ def commands_of(block: Block) -> Iterator[Command]:
 def inline_commands(page: Path) -> Iterator[Command]:
     """Commands between backticks in the text, which may go over a line's end."""
     text = page.read_text(encoding="utf-8")
-    prose = re.sub(r"^```.*?^```$", lambda m: "\n" * m[0].count("\n"), text, flags=re.MULTILINE | re.DOTALL)
+    prose = re.sub(
+        r"^```.*?^```$", lambda m: "\n" * m[0].count("\n"), text, flags=re.MULTILINE | re.DOTALL
+    )
     for match in re.finditer(r"`((?:python|pip|tensorboard|mkdocs|pytest)\s[^`]+)`", prose):
         yield from _split(page, prose[: match.start()].count("\n") + 1, match[1])
 
@@ -90,7 +102,9 @@ def _split(page: Path, line: int, text: str) -> Iterator[Command]:
 
 
 def workplace(folder: Path) -> Path:
-    """A folder with every file that the pages name: a person who walks before four cameras, in each format."""
+    """A folder with every file that the pages name: a person who walks before four cameras, in each
+    format.
+    """
     rig = human36m_rig("S9")
     rig = Rig(("cam01", "cam02", "cam03", "cam04"), rig.cameras, 0 * rig.distortion, rig.size)
     points = walk()[:FRAMES]
@@ -99,7 +113,17 @@ def workplace(folder: Path) -> Path:
     for name in ("pose", "walk", "run"):
         write_openpose(folder / name, rig, pixels)
     seen = np.ones(pixels.shape[:-1], bool)
-    given = KeyPoints("", rig.names, JOINTS, np.arange(FRAMES), pixels, seen.astype(float), seen, 50.0, (0,) * len(rig))
+    given = KeyPoints(
+        "",
+        rig.names,
+        JOINTS,
+        np.arange(FRAMES),
+        pixels,
+        seen.astype(float),
+        seen,
+        50.0,
+        (0,) * len(rig),
+    )
     write_key_points(folder / "points.npz", given)
     same = Cameras(rig.cameras.K, rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3))
     write_pose2sim(folder / "intrinsics.toml", replace(rig, cameras=same), {})
@@ -117,7 +141,9 @@ def detected(view: str, frame: int) -> tuple[np.ndarray, np.ndarray]:
     names = ["nose", *(f"{side}_{limb}" for limb in limbs for side in ("left", "right"))]
     rig = human36m_rig("S9")
     pixels = project(rig.cameras, walk()[frame : frame + 1])[0][0]
-    return pixels[int(view.removeprefix("cam")) - 1, [JOINT[name] for name in names]].numpy(), np.ones(len(names))
+    return pixels[
+        int(view.removeprefix("cam")) - 1, [JOINT[name] for name in names]
+    ].numpy(), np.ones(len(names))
 
 
 def takes() -> list[tuple[str, str, np.ndarray]]:
@@ -137,8 +163,14 @@ def write_openpose(folder: Path, rig: Rig, pixels: np.ndarray) -> None:
 
 def write_caliscope(folder: Path, rig: Rig, pixels: np.ndarray) -> None:
     """caliscope's table of MediaPipe's landmarks, and its cameras."""
-    rows = ["sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"]
-    there = [(number, JOINT[name]) for number, name in enumerate(SKELETONS["mediapipe_33"]) if name in JOINT]
+    rows = [
+        "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"
+    ]
+    there = [
+        (number, JOINT[name])
+        for number, name in enumerate(SKELETONS["mediapipe_33"])
+        if name in JOINT
+    ]
     for frame, view in np.ndindex(pixels.shape[:2]):
         for number, joint in there:
             x, y = pixels[frame, view, joint].tolist()
@@ -147,10 +179,20 @@ def write_caliscope(folder: Path, rig: Rig, pixels: np.ndarray) -> None:
     tables = []
     for view in range(len(rig)):
         camera = {
-            "size": rig.size[view], "matrix": rig.cameras.K[view], "distortions": rig.distortion[view],
-            "translation": rig.cameras.t[view] / 1000, "rotation": rig.cameras.R[view],
-        }  # fmt: skip
-        tables.append("\n".join([f"[cameras.{view}]", *(f"{key} = {value.tolist()}" for key, value in camera.items())]))
+            "size": rig.size[view],
+            "matrix": rig.cameras.K[view],
+            "distortions": rig.distortion[view],
+            "translation": rig.cameras.t[view] / 1000,
+            "rotation": rig.cameras.R[view],
+        }
+        tables.append(
+            "\n".join(
+                [
+                    f"[cameras.{view}]",
+                    *(f"{key} = {value.tolist()}" for key, value in camera.items()),
+                ]
+            )
+        )
     (folder / "camera_array.toml").write_text("\n\n".join(tables) + "\n")
 
 

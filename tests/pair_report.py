@@ -16,9 +16,18 @@ from ghpt.recording import RelativePoseEstimate
 from scenes import look_at
 
 META = {
-    "data": "h36m", "source": "embedded", "split": "test", "seed": 7, "hypotheses": 5, "frames": 80,
-    "provenance": {"commit": "abc", "checkpoint": "last.ckpt", "training": {"data": "h36m", "source": "embedded"}},
-}  # fmt: skip
+    "data": "h36m",
+    "source": "embedded",
+    "split": "test",
+    "seed": 7,
+    "hypotheses": 5,
+    "frames": 80,
+    "provenance": {
+        "commit": "abc",
+        "checkpoint": "last.ckpt",
+        "training": {"data": "h36m", "source": "embedded"},
+    },
+}
 NAMES = ("weight", "average", "worst", "eight_point", "poselib", "rig")
 
 
@@ -34,7 +43,9 @@ def rig(seed: int, views: int = 4) -> RigOfSplit:
     return RigOfSplit(f"S{seed}", tuple(f"c{i}" for i in range(views)), cameras, (0,), points)
 
 
-def true_poses(rigs: list[RigOfSplit], index: torch.Tensor, pair: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def true_poses(
+    rigs: list[RigOfSplit], index: torch.Tensor, pair: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
     """The relative poses of pairs of views."""
     poses = []
     for which, (a, b) in zip(index.tolist(), pair.tolist(), strict=True):
@@ -45,13 +56,22 @@ def true_poses(rigs: list[RigOfSplit], index: torch.Tensor, pair: torch.Tensor) 
 
 
 def moved(
-    poses: tuple[torch.Tensor, torch.Tensor], degrees: float, mm: float, seed: int, missing: float = 0.0
+    poses: tuple[torch.Tensor, torch.Tensor],
+    degrees: float,
+    mm: float,
+    seed: int,
+    missing: float = 0.0,
 ) -> RelativePoseEstimate:
     """Poses turned by about ``degrees`` and shifted by about ``mm``; a share of them missing."""
     rng = np.random.default_rng(seed)
     count = len(poses[0])
-    turn = Rotation.from_rotvec(np.deg2rad(degrees) * rng.normal(0, 3**-0.5, (count, 3))).as_matrix()
-    R, t = torch.from_numpy(turn) @ poses[0], poses[1] + torch.from_numpy(rng.normal(0, mm / 3**0.5, (count, 3)))
+    turn = Rotation.from_rotvec(
+        np.deg2rad(degrees) * rng.normal(0, 3**-0.5, (count, 3))
+    ).as_matrix()
+    R, t = (
+        torch.from_numpy(turn) @ poses[0],
+        poses[1] + torch.from_numpy(rng.normal(0, mm / 3**0.5, (count, 3))),
+    )
     estimated = torch.from_numpy(rng.random(count) >= missing)
     R = torch.where(estimated[:, None, None], R, torch.eye(3, dtype=torch.float64))
     return RelativePoseEstimate(R, torch.where(estimated[:, None], t, 0.0), estimated)
@@ -60,19 +80,32 @@ def moved(
 def content(rigs: list[RigOfSplit], draws: int = 10) -> dict:
     """What a ``PairWriter`` takes: all pairs of ``draws`` draws of each rig."""
     pairs = list(combinations(range(len(rigs[0].names)), 2))
-    each = [(g, g * draws + d, pair) for g in range(len(rigs)) for d in range(draws) for pair in pairs]
+    each = [
+        (g, g * draws + d, pair) for g in range(len(rigs)) for d in range(draws) for pair in pairs
+    ]
     index, draw = (torch.tensor([row[i] for row in each]) for i in (0, 1))
     pair = torch.tensor([row[2] for row in each])
     truth = true_poses(rigs, index, pair)
     estimates = {
-        name: moved(truth, 0.1 * (i + 1), 5.0 * (i + 1), seed=i, missing=0.2 if name == "poselib" else 0.0)
+        name: moved(
+            truth, 0.1 * (i + 1), 5.0 * (i + 1), seed=i, missing=0.2 if name == "poselib" else 0.0
+        )
         for i, name in enumerate(NAMES)
     }
     weights = {summary: torch.linspace(0, 1, len(each)) for summary in WEIGHTS}
-    return {"estimates": estimates, "truth": truth, "rig": index, "draw": draw, "pair": pair, "weights": weights}
+    return {
+        "estimates": estimates,
+        "truth": truth,
+        "rig": index,
+        "draw": draw,
+        "pair": pair,
+        "weights": weights,
+    }
 
 
-def written(folder: Path, rigs: list[RigOfSplit], values: Mapping, meta: Mapping = META) -> PairPredictions:
+def written(
+    folder: Path, rigs: list[RigOfSplit], values: Mapping, meta: Mapping = META
+) -> PairPredictions:
     """The content through a predictions file."""
     count = len(values["draw"])
     writer = PairWriter(folder / "rows", count, tuple(values["estimates"]))

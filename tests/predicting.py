@@ -44,11 +44,17 @@ def frames_of(count: int, noise: float = 1.0, gaps: float = 0.1) -> Frames:
     def read(rows: np.ndarray) -> Seen:
         shape = (len(rows), len(rig), len(JOINTS))
         # a stream of its own for each frame, so that a frame is the same however it is read
-        phase = (rows[:, None, None] * 7919 + np.arange(shape[1] * shape[2]).reshape(shape[1:]) * 104729) % 65521
+        phase = (
+            rows[:, None, None] * 7919 + np.arange(shape[1] * shape[2]).reshape(shape[1:]) * 104729
+        ) % 65521
         random = phase / 65521
         values = pixels[rows % len(pixels)] + noise * np.sin(40 * random)[..., None]
         seen = random >= gaps
-        return np.where(seen[..., None], values, 0).astype(np.float32), seen.astype(np.float32), seen
+        return (
+            np.where(seen[..., None], values, 0).astype(np.float32),
+            seen.astype(np.float32),
+            seen,
+        )
 
     return Frames("walk", "embedded", rig.names, rig.cameras, np.arange(count), 50.0, read)
 
@@ -57,7 +63,9 @@ def cameras_file(folder: Path) -> Path:
     """Human3.6M's cameras of S9 with perfect lenses, named cam_00 to cam_03."""
     rig = human36m_rig("S9")
     names = tuple(f"cam_{i:02d}" for i in range(len(rig)))
-    write_pose2sim(folder / "cameras.toml", Rig(names, rig.cameras, 0 * rig.distortion, rig.size), {})
+    write_pose2sim(
+        folder / "cameras.toml", Rig(names, rig.cameras, 0 * rig.distortion, rig.size), {}
+    )
     return folder / "cameras.toml"
 
 
@@ -67,7 +75,9 @@ def openpose_folders(folder: Path, frames: list[int], cameras: Cameras | None = 
     for view in range(pixels.shape[1]):
         (folder / f"cam{view}_json").mkdir(parents=True)
         for frame in frames:
-            write_people(folder / f"cam{view}_json" / f"cam{view}_{frame:06d}.json", [pixels[frame, view]])
+            write_people(
+                folder / f"cam{view}_json" / f"cam{view}_{frame:06d}.json", [pixels[frame, view]]
+            )
     return folder
 
 

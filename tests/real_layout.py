@@ -1,4 +1,6 @@
-"""Folders in the layouts of the real data sets, made from poses: test support, and what scripts/real_motion.py uses."""
+"""Folders in the layouts of the real data sets, made from poses: test support, and what
+scripts/real_motion.py uses.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,9 @@ Detect = Callable[[Rig, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 SUBJECTS = ["S1", "S5", "S6", "S7", "S8", "S9", "S11"]
 
 
-def person(rng: np.random.Generator, frames: int, centre: Sequence[float], joints: int = 17) -> np.ndarray:
+def person(
+    rng: np.random.Generator, frames: int, centre: Sequence[float], joints: int = 17
+) -> np.ndarray:
     """Points [T J 3] within a metre of ``centre`` (mm)."""
     return rng.uniform(-900, 900, (frames, joints, 3)) + np.asarray(centre, float)
 
@@ -37,7 +41,11 @@ def through_lens(rig: Rig, pixels: np.ndarray) -> np.ndarray:
     shown = np.empty_like(pixels)
     for view in range(len(rig)):
         flat = torch.from_numpy(pixels[:, view]).reshape(-1, 2)
-        shown[:, view] = distort(flat, rig.cameras.K[view], rig.distortion[view]).reshape(pixels[:, view].shape).numpy()
+        shown[:, view] = (
+            distort(flat, rig.cameras.K[view], rig.distortion[view])
+            .reshape(pixels[:, view].shape)
+            .numpy()
+        )
     return shown
 
 
@@ -51,31 +59,51 @@ def human36m_labels(takes: Sequence[tuple[str, str, np.ndarray]]) -> dict:
     """karfly's labels of takes (subject, action with number, poses [T 17 3] mm)."""
     actions = sorted({action for _, action, _ in takes})
     rigs = [human36m_rig(subject) for subject in SUBJECTS]
-    cameras = np.zeros((7, 4), [("R", "f4", (3, 3)), ("t", "f4", (3, 1)), ("K", "f4", (3, 3)), ("dist", "f4", 5)])
+    cameras = np.zeros(
+        (7, 4), [("R", "f4", (3, 3)), ("t", "f4", (3, 1)), ("K", "f4", (3, 3)), ("dist", "f4", 5)]
+    )
     for row, rig in zip(cameras, rigs, strict=True):
         row["R"], row["K"], row["dist"] = rig.cameras.R, rig.cameras.K, rig.distortion
         row["t"] = rig.cameras.t[..., None]
-    columns = [("subject_idx", "i1"), ("action_idx", "i1"), ("frame_idx", "i2"), ("keypoints", "f4", (17, 3)),
-               ("bbox_by_camera_tlbr", "i2", (4, 4))]  # fmt: skip
+    columns = [
+        ("subject_idx", "i1"),
+        ("action_idx", "i1"),
+        ("frame_idx", "i2"),
+        ("keypoints", "f4", (17, 3)),
+        ("bbox_by_camera_tlbr", "i2", (4, 4)),
+    ]
     table = np.zeros(sum(len(poses) for *_, poses in takes), columns)
-    table["subject_idx"] = np.repeat([SUBJECTS.index(s) for s, *_ in takes], [len(p) for *_, p in takes])
-    table["action_idx"] = np.repeat([actions.index(a) for _, a, _ in takes], [len(p) for *_, p in takes])
+    table["subject_idx"] = np.repeat(
+        [SUBJECTS.index(s) for s, *_ in takes], [len(p) for *_, p in takes]
+    )
+    table["action_idx"] = np.repeat(
+        [actions.index(a) for _, a, _ in takes], [len(p) for *_, p in takes]
+    )
     table["frame_idx"] = np.concatenate([5 * np.arange(len(p)) for *_, p in takes])
     table["keypoints"] = np.concatenate([p for *_, p in takes])
-    return {"subject_names": list(SUBJECTS), "camera_names": list(rigs[0].names), "action_names": actions,
-            "cameras": cameras, "table": table}  # fmt: skip
+    return {
+        "subject_names": list(SUBJECTS),
+        "camera_names": list(rigs[0].names),
+        "action_names": actions,
+        "cameras": cameras,
+        "table": table,
+    }
 
 
 def write_pickle(path: Path, content: object, protocol: int = 4) -> None:
     """``numpy.save`` of a Python object, by a chosen pickle protocol."""
     with open(path, "wb") as handle:
-        np.lib.format.write_array_header_1_0(handle, {"descr": "|O", "fortran_order": False, "shape": ()})
+        np.lib.format.write_array_header_1_0(
+            handle, {"descr": "|O", "fortran_order": False, "shape": ()}
+        )
         box = np.empty((), object)
         box[()] = content
         pickle.dump(box, handle, protocol=protocol)
 
 
-def write_human36m_layout(root: Path, takes: Sequence[tuple[str, str, np.ndarray]], chunk: int) -> None:
+def write_human36m_layout(
+    root: Path, takes: Sequence[tuple[str, str, np.ndarray]], chunk: int
+) -> None:
     """Labels, and perfect detections in pixels of a 384-high crop, in chunks of ``chunk`` frames."""
     root.mkdir(parents=True, exist_ok=True)
     write_pickle(root / LABELS_FILE, human36m_labels(takes))
@@ -95,9 +123,17 @@ def write_human36m_layout(root: Path, takes: Sequence[tuple[str, str, np.ndarray
 
 
 def write_panoptic_layout(
-    root: Path, name: str, calibration: dict, rig: Rig, frames: Sequence[int], poses: np.ndarray, detect: Detect
+    root: Path,
+    name: str,
+    calibration: dict,
+    rig: Rig,
+    frames: Sequence[int],
+    poses: np.ndarray,
+    detect: Detect,
 ) -> None:
-    """A sequence: poses [T 19 3] (cm, COCO19; NaN = missing) and detections as keypoints/<camera>.npz."""
+    """A sequence: poses [T 19 3] (cm, COCO19; NaN = missing) and detections as
+    keypoints/<camera>.npz.
+    """
     folder = root / name
     (folder / "hdPose3d_stage1_coco19").mkdir(parents=True)
     (folder / "keypoints").mkdir()
@@ -114,29 +150,58 @@ def write_panoptic_layout(
     shown = through_lens(rig, pixels.astype(np.float64))
     for view, camera in enumerate(rig.names):
         np.savez(
-            folder / "keypoints" / f"{camera}.npz", frame=np.asarray(frames),
-            key_points=shown[:, view].astype(np.float32), confidence=confidence[:, view].astype(np.float32),
+            folder / "keypoints" / f"{camera}.npz",
+            frame=np.asarray(frames),
+            key_points=shown[:, view].astype(np.float32),
+            confidence=confidence[:, view].astype(np.float32),
             seen=seen[:, view],
-        )  # fmt: skip
+        )
 
 
 def panoptic_calibration(rig: Rig) -> dict:
     """The calibration file's content for a rig, in its order."""
     cameras = [
-        {"name": name, "type": "hd", "resolution": rig.size[v].tolist(), "panel": 0, "node": v,
-         "K": rig.cameras.K[v].tolist(), "distCoef": rig.distortion[v].tolist(),
-         "R": rig.cameras.R[v].tolist(), "t": (rig.cameras.t[v, :, None] / 10).tolist()}
+        {
+            "name": name,
+            "type": "hd",
+            "resolution": rig.size[v].tolist(),
+            "panel": 0,
+            "node": v,
+            "K": rig.cameras.K[v].tolist(),
+            "distCoef": rig.distortion[v].tolist(),
+            "R": rig.cameras.R[v].tolist(),
+            "t": (rig.cameras.t[v, :, None] / 10).tolist(),
+        }
         for v, name in enumerate(rig.names)
-    ]  # fmt: skip
+    ]
     return {"calibDataSource": "test", "cameras": cameras}
 
 
 def upright19() -> np.ndarray:
-    """One standing person [19 3] in Panoptic's world (cm, y down): left joints at x = 20, right ones at -20."""
-    heights = {"neck": -140, "nose": -155, "mid_hip": -95, "shoulder": -138, "elbow": -115, "wrist": -95,
-               "hip": -95, "knee": -50, "ankle": -10, "eye": -160, "ear": -158}  # fmt: skip
+    """One standing person [19 3] in Panoptic's world (cm, y down): left joints at x = 20, right
+    ones at -20.
+    """
+    heights = {
+        "neck": -140,
+        "nose": -155,
+        "mid_hip": -95,
+        "shoulder": -138,
+        "elbow": -115,
+        "wrist": -95,
+        "hip": -95,
+        "knee": -50,
+        "ankle": -10,
+        "eye": -160,
+        "ear": -158,
+    }
     sides = {"left": 20.0, "right": -20.0}
-    return np.array([
-        [sides.get(name.split("_")[0], 0.0), heights[name.removeprefix("left_").removeprefix("right_")], 0.0]
-        for name in COCO19
-    ])  # fmt: skip
+    return np.array(
+        [
+            [
+                sides.get(name.split("_")[0], 0.0),
+                heights[name.removeprefix("left_").removeprefix("right_")],
+                0.0,
+            ]
+            for name in COCO19
+        ]
+    )

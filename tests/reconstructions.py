@@ -10,9 +10,15 @@ from toys import recording
 
 def about(joints=JOINTS, cameras=("cam_1", "cam_2", "cam_3"), rate_hz=29.97):
     return About(
-        name="S1/Walking-1", source="embedded", estimator="huber", joints=tuple(joints), camera_names=tuple(cameras),
-        rate_hz=rate_hz, smoothed=False, provenance={"seed": 3, "commit": "abc"},
-    )  # fmt: skip
+        name="S1/Walking-1",
+        source="embedded",
+        estimator="huber",
+        joints=tuple(joints),
+        camera_names=tuple(cameras),
+        rate_hz=rate_hz,
+        smoothed=False,
+        provenance={"seed": 3, "commit": "abc"},
+    )
 
 
 def random_reconstruction(frames, joints=17, views=3, seed=0, missing=0.3, first=0):

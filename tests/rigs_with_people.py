@@ -23,7 +23,10 @@ CONF = Path(__file__).resolve().parents[1] / "conf"
 
 def calibration(**changed: object) -> RigCalibration:
     """conf/calibration/default.yaml, with top-level values changed."""
-    return build(OmegaConf.to_container(OmegaConf.load(CONF / "calibration" / "default.yaml")) | changed, "calibration")
+    return build(
+        OmegaConf.to_container(OmegaConf.load(CONF / "calibration" / "default.yaml")) | changed,
+        "calibration",
+    )
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,9 @@ class People:
 @cache
 def _walk(frames: int, seed: int) -> np.ndarray:
     takes = ("Walking", "Greeting", "Phoning", "WalkingDog")
-    return np.concatenate([motion(seed, "S8", f"S8/{a}-1", a, 8 * frames, 50.0)[::32] for a in takes])[:frames]
+    return np.concatenate(
+        [motion(seed, "S8", f"S8/{a}-1", a, 8 * frames, 50.0)[::32] for a in takes]
+    )[:frames]
 
 
 def people(rig: str = "h36m", frames: int = 80, noise: float = 0.01, seed: int = 0) -> People:
@@ -70,7 +75,9 @@ def people(rig: str = "h36m", frames: int = 80, noise: float = 0.01, seed: int =
         points = torch.stack((points[..., 0], -points[..., 2], points[..., 1]), dim=-1)
     exact, depth = project(found.cameras.index(None), points)
     size = person_size(exact, depth > 0)
-    random = torch.randn(exact.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    random = torch.randn(
+        exact.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+    )
     key_points = exact + noise * size[..., None, None] * random
     seen = (depth > 0) & (key_points >= 0).all(-1) & (key_points <= found.size[:, None] - 1).all(-1)
     return People(found.names, found.cameras.K, key_points, seen, found.size, found.cameras, points)

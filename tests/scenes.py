@@ -1,4 +1,6 @@
-"""A scene factory: a person-sized pose in random rigs of V cameras, with exact projections, in float64."""
+"""A scene factory: a person-sized pose in random rigs of V cameras, with exact projections, in
+float64.
+"""
 
 from __future__ import annotations
 
@@ -12,19 +14,31 @@ from ghpt.geometry.cameras import Cameras, project
 from ghpt.recording import KeyPointBatch
 
 _STANDING = {
-    "right_ankle": (-120, 0, 80), "right_knee": (-130, 40, 500), "right_hip": (-130, 0, 950),
-    "left_hip": (130, 0, 950), "left_knee": (130, 30, 500), "left_ankle": (120, 0, 80),
-    "pelvis": (0, 0, 950), "spine": (0, 20, 1200), "thorax": (0, 0, 1450), "head_top": (0, 0, 1750),
-    "right_wrist": (-400, 150, 950), "right_elbow": (-330, 30, 1150), "right_shoulder": (-180, 0, 1420),
-    "left_shoulder": (180, 0, 1420), "left_elbow": (330, 30, 1150), "left_wrist": (400, 150, 950),
+    "right_ankle": (-120, 0, 80),
+    "right_knee": (-130, 40, 500),
+    "right_hip": (-130, 0, 950),
+    "left_hip": (130, 0, 950),
+    "left_knee": (130, 30, 500),
+    "left_ankle": (120, 0, 80),
+    "pelvis": (0, 0, 950),
+    "spine": (0, 20, 1200),
+    "thorax": (0, 0, 1450),
+    "head_top": (0, 0, 1750),
+    "right_wrist": (-400, 150, 950),
+    "right_elbow": (-330, 30, 1150),
+    "right_shoulder": (-180, 0, 1420),
+    "left_shoulder": (180, 0, 1420),
+    "left_elbow": (330, 30, 1150),
+    "left_wrist": (400, 150, 950),
     "nose": (0, 100, 1600),
-}  # fmt: skip
+}
 
 
 @dataclass(frozen=True)
 class Scene:
-    """B frames: cameras with leading dimensions B V, points [B, J, 3] in mm, their exact pixels [B, V, J,
-    2]."""
+    """B frames: cameras with leading dimensions B V, points [B, J, 3] in mm, their exact pixels [B,
+    V, J, 2].
+    """
 
     cameras: Cameras
     points: Tensor
@@ -35,11 +49,17 @@ class Scene:
         shape = self.key_points.shape[:-1]
         seen = torch.ones(shape, dtype=torch.bool) if seen is None else seen
         return KeyPointBatch(
-            sample=torch.arange(shape[0]), recording=torch.zeros(shape[0], dtype=torch.int64),
-            cameras=self.cameras, key_points=self.key_points, seen=seen,
-            confidence=torch.ones(shape, dtype=self.points.dtype) if confidence is None else confidence,
-            truth=self.points, truth_seen=torch.ones(self.points.shape[:-1], dtype=torch.bool),
-        )  # fmt: skip
+            sample=torch.arange(shape[0]),
+            recording=torch.zeros(shape[0], dtype=torch.int64),
+            cameras=self.cameras,
+            key_points=self.key_points,
+            seen=seen,
+            confidence=torch.ones(shape, dtype=self.points.dtype)
+            if confidence is None
+            else confidence,
+            truth=self.points,
+            truth_seen=torch.ones(self.points.shape[:-1], dtype=torch.bool),
+        )
 
     def noisy(self, sigma: float, seed: int) -> Scene:
         """The same with Gaussian noise of ``sigma`` pixels on the key points."""
@@ -47,14 +67,19 @@ class Scene:
         return replace(self, key_points=self.key_points + torch.from_numpy(noise))
 
 
-def random_scene(seed: int, frames: int = 2, views: int = 4, scale: float = 1.0, place: float = 0.0) -> Scene:
-    """Random poses, and for each frame its own rig of cameras 3 to 6 m around the person, all looking at it.
+def random_scene(
+    seed: int, frames: int = 2, views: int = 4, scale: float = 1.0, place: float = 0.0
+) -> Scene:
+    """Random poses, and for each frame its own rig of cameras 3 to 6 m around the person, all
+    looking at it.
 
-    ``scale`` scales the whole scene (1e-3: metres); ``place`` puts it so far (mm) from the world's origin. No
-    two cameras see a joint along one line.
+    ``scale`` scales the whole scene (1e-3: metres); ``place`` puts it so far (mm) from the world's
+    origin. No two cameras see a joint along one line.
     """
     rng = np.random.default_rng(seed)
-    points = np.array(list(_STANDING.values()), dtype=np.float64) + rng.normal(0, 60, (frames, 17, 3))
+    points = np.array(list(_STANDING.values()), dtype=np.float64) + rng.normal(
+        0, 60, (frames, 17, 3)
+    )
     points = points - [0, 0, 950]
     centre = np.empty((frames, views, 3))
     for frame in range(frames):
@@ -75,7 +100,9 @@ def random_scene(seed: int, frames: int = 2, views: int = 4, scale: float = 1.0,
 
 
 def look_at(centre: np.ndarray, target: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """World to camera rotations [..., 3, 3] of cameras at ``centre`` whose z axis points at ``target``."""
+    """World to camera rotations [..., 3, 3] of cameras at ``centre`` whose z axis points at
+    ``target``.
+    """
     z = target - centre
     z = z / np.linalg.norm(z, axis=-1, keepdims=True)
     x = np.cross(up, z)
@@ -89,6 +116,8 @@ def _directions(rng: np.random.Generator, count: int) -> np.ndarray:
     while len(found) < count:
         direction = rng.normal(size=3)
         direction /= np.linalg.norm(direction)
-        if all(np.linalg.norm(np.cross(direction, other)) > 0.2 / np.sqrt(count) for other in found):
+        if all(
+            np.linalg.norm(np.cross(direction, other)) > 0.2 / np.sqrt(count) for other in found
+        ):
             found.append(direction)
     return np.stack(found)

@@ -1,4 +1,6 @@
-"""Checkpoints that end in the digest of what is in them, whatever that is: what an attacker can make."""
+"""Checkpoints that end in the digest of what is in them, whatever that is: what an attacker can
+make.
+"""
 
 import hashlib
 import io

@@ -1,4 +1,6 @@
-"""The ablations: pools and temperatures on a toy, the cells of each item, and what is said of made-up numbers."""
+"""The ablations: pools and temperatures on a toy, the cells of each item, and what is said of
+made-up numbers.
+"""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,9 +24,14 @@ from toys import DATA, TRAIN
 CONF = Path(__file__).resolve().parents[1] / "conf"
 BY_LABEL = {item.label: item for item in ITEMS}
 SIZES = {
-    "stride": {"validation": 512, "test": 512}, "also_trained_on": ["cmu3"], "temperature": [0.5, 5.0],
-    "hypotheses": [10, 1000], "hypotheses_trained": [20], "samples": [50, 5000], "samples_hypotheses": 20,
-}  # fmt: skip
+    "stride": {"validation": 512, "test": 512},
+    "also_trained_on": ["cmu3"],
+    "temperature": [0.5, 5.0],
+    "hypotheses": [10, 1000],
+    "hypotheses_trained": [20],
+    "samples": [50, 5000],
+    "samples_hypotheses": 20,
+}
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +43,9 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]]
     return folder, data
 
 
-def evaluated(toy: tuple[Path, dict[str, Any]], settings: Sequence[Sequence[Any]], out: Path) -> list[dict[str, float]]:
+def evaluated(
+    toy: tuple[Path, dict[str, Any]], settings: Sequence[Sequence[Any]], out: Path
+) -> list[dict[str, float]]:
     folder, data = toy
     evaluate({"sets": {"test": data}, "settings": settings, "seed": 0}, {"model": folder}, out)
     return read_json(out / "result.json")["test"]
@@ -51,10 +60,14 @@ def test_the_beginning_of_a_pool_is_the_pool_of_so_many_hypotheses(toy, tmp_path
     frames = module.frames["test"]
     batch = frames[range(len(frames))]
     for count, errors in zip(counts, ours, strict=True):
-        estimates, _ = load_model(folder / "last.ckpt", hypotheses=count, seed=0)[0].eval().test_step(batch, 0)
+        estimates, _ = (
+            load_model(folder / "last.ckpt", hypotheses=count, seed=0)[0].eval().test_step(batch, 0)
+        )
         for name, error in errors.items():
             metric = MPJPE("relative", 1, 17)
-            metric.update(estimates[name], batch.truth, batch.truth_seen, torch.zeros_like(batch.sample))
+            metric.update(
+                estimates[name], batch.truth, batch.truth_seen, torch.zeros_like(batch.sample)
+            )
             assert error == pytest.approx(metric.compute().mean.item(), rel=1e-5)
     assert ours[0]["best"] > ours[1]["best"] > ours[2]["best"]
 
@@ -68,11 +81,17 @@ def test_a_high_temperature_is_the_average_and_the_default_is_the_models_own(toy
 
 def setup(seed: int = 0, **sizes: Any) -> Setup:
     overrides = {"train": (), "test": ()}
-    return Setup(CONF, {"human36m": None, "panoptic": None}, overrides, {"ablation": SIZES | sizes}, seed)
+    return Setup(
+        CONF, {"human36m": None, "panoptic": None}, overrides, {"ablation": SIZES | sizes}, seed
+    )
 
 
-def section(label: str, error: Callable[[int, str, str, int], float], folder: Path, seeds: int = 1) -> Section:
-    """Of cells in which ``weight`` has ``error(seed, cell, split, setting)``, the average 40 and the best 20 mm."""
+def section(
+    label: str, error: Callable[[int, str, str, int], float], folder: Path, seeds: int = 1
+) -> Section:
+    """Of cells in which ``weight`` has ``error(seed, cell, split, setting)``, the average 40 and
+    the best 20 mm.
+    """
     setups = [setup(seed) for seed in range(seeds)]
     cells = [BY_LABEL[label].cells(one) for one in setups]
     for one, by_name in zip(setups, cells, strict=True):
@@ -82,19 +101,26 @@ def section(label: str, error: Callable[[int, str, str, int], float], folder: Pa
             write_json(own / "cell.json", {"seconds": 90.0 + 20 * one.seed})
             if "sets" in cell.config:
                 result = {
-                    split: [{"weight": error(one.seed, name, split, i), "average": 40.0, "best": 20.0}
-                            for i in range(len(cell.config["settings"]))]
+                    split: [
+                        {"weight": error(one.seed, name, split, i), "average": 40.0, "best": 20.0}
+                        for i in range(len(cell.config["settings"]))
+                    ]
                     for split in cell.config["sets"]
-                }  # fmt: skip
+                }
                 write_json(own / "result.json", result)
     return BY_LABEL[label].section(Results(setups, cells, folder))
 
 
 @pytest.mark.parametrize(("label", "settings"), [("gumbel", 2), ("features", 3), ("selection", 2)])
-def test_each_setting_is_trained_twice_and_the_default_is_the_reports_own_model(label: str, settings: int):
+def test_each_setting_is_trained_twice_and_the_default_is_the_reports_own_model(
+    label: str, settings: int
+):
     cells = BY_LABEL[f"ablation-{label}"].cells(setup())
     assert len({cell.needs["model"].key for cell in cells.values()}) == len(cells) == 2 * settings
-    defaults = {data: next(cell for name, cell in cells.items() if name.startswith(data)) for data in ("h36m", "cmu3")}
+    defaults = {
+        data: next(cell for name, cell in cells.items() if name.startswith(data))
+        for data in ("h36m", "cmu3")
+    }
     for data, cell in defaults.items():
         assert cell.needs["model"].key == setup().trained(data).key
     assert set(defaults["cmu3"].config["sets"]) == {"test"}
@@ -110,9 +136,13 @@ def test_each_setting_is_trained_twice_and_the_default_is_the_reports_own_model(
         ("samples", ("data", "train_samples"), {50, 500, 5000}),
     ],
 )
-def test_each_quantity_is_what_the_models_are_trained_with(label: str, keys: tuple[str, str], trained: set[float]):
+def test_each_quantity_is_what_the_models_are_trained_with(
+    label: str, keys: tuple[str, str], trained: set[float]
+):
     cells = BY_LABEL[f"ablation-{label}"].cells(setup())
-    models = [cell.needs["model"].config for name, cell in cells.items() if name not in ("model", "cmu3")]
+    models = [
+        cell.needs["model"].config for name, cell in cells.items() if name not in ("model", "cmu3")
+    ]
     assert {config[keys[0]][keys[1]] for config in models} == trained
     assert len(models) == len(trained)
 
@@ -128,7 +158,9 @@ def test_a_table_says_what_validation_chooses_and_what_that_is_worth(tmp_path: P
     assert "20.5 ± 0.7" in found.body
     assert "| average of the same pool " in found.body
     assert found.data == "embedded (synthetic) Human3.6M"
-    equal = section("ablation-gumbel", lambda seed, cell, split, i: 20.0 + 0.1 * ("default" in cell), tmp_path)
+    equal = section(
+        "ablation-gumbel", lambda seed, cell, split, i: 20.0 + 0.1 * ("default" in cell), tmp_path
+    )
     assert "Validation keeps the default." in equal.body
 
 
@@ -153,9 +185,15 @@ def test_five_hundred_samples_are_enough_only_where_no_other_number_is_better(tm
 
 @pytest.mark.parametrize(
     ("label", "places"),
-    [("temperature", [0.5, 1.5, 5.0]), ("hypotheses", [10, 200, 1000]), ("samples", [50, 500, 5000])],
+    [
+        ("temperature", [0.5, 1.5, 5.0]),
+        ("hypotheses", [10, 200, 1000]),
+        ("samples", [50, 500, 5000]),
+    ],
 )
-def test_a_figure_has_validation_and_test_on_logarithmic_axes(label: str, places: list[float], tmp_path: Path):
+def test_a_figure_has_validation_and_test_on_logarithmic_axes(
+    label: str, places: list[float], tmp_path: Path
+):
     found = section(f"ablation-{label}", lambda seed, cell, split, i: 30.0 + i, tmp_path)
     ((name, figure),) = found.figures.items()
     assert f"]({name}.svg)" in found.body

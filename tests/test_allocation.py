@@ -91,7 +91,10 @@ def test_a_file_without_bytes_is_none(tmp_path, monkeypatch, system):
 @pytest.mark.parametrize("system", [as_it_is, without_fallocate])
 def test_a_file_that_cannot_grow_is_named(tmp_path, monkeypatch, small_files, system):
     system(monkeypatch)
-    with pytest.raises(OSError, match="'its name'") as caught, open(tmp_path / "file", "wb") as handle:
+    with (
+        pytest.raises(OSError, match="'its name'") as caught,
+        open(tmp_path / "file", "wb") as handle,
+    ):
         allocate(handle, LIMIT + 1, "its name")
     assert caught.value.errno == errno.EFBIG
 

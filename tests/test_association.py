@@ -1,4 +1,6 @@
-"""Several people in the views of calibrated cameras: the right one is followed, whoever the lists put first."""
+"""Several people in the views of calibrated cameras: the right one is followed, whoever the lists
+put first.
+"""
 
 import json
 import logging
@@ -25,23 +27,33 @@ FRAMES = 240
 
 @pytest.fixture(scope="module")
 def detector(pytestconfig) -> Detector:
-    return Detector(**yaml.safe_load((pytestconfig.rootpath / "conf" / "detector" / "human36m.yaml").read_text()))
+    return Detector(
+        **yaml.safe_load(
+            (pytestconfig.rootpath / "conf" / "detector" / "human36m.yaml").read_text()
+        )
+    )
 
 
 def rig_of(views: int) -> Rig:
     rig = human36m_rig("S9")
     at = list(range(views))
-    return Rig(tuple(rig.names[i] for i in at), rig.cameras.index(at), rig.distortion[at], rig.size[at])
+    return Rig(
+        tuple(rig.names[i] for i in at), rig.cameras.index(at), rig.distortion[at], rig.size[at]
+    )
 
 
 def camera_file(rig: Rig, calibrated: bool = True) -> CameraFile:
     pose = (rig.cameras.R, rig.cameras.t) if calibrated else (None, None)
     lens = rig.distortion * 0  # the detector's key points are out of the lens
-    return CameraFile("Calib.toml", "Pose2Sim", rig.names, ("",) * len(rig), rig.cameras.K, lens, None, *pose)
+    return CameraFile(
+        "Calib.toml", "Pose2Sim", rig.names, ("",) * len(rig), rig.cameras.K, lens, None, *pose
+    )
 
 
 def scene(detector: Detector, rig: Rig, seed: int = 1) -> tuple[People, np.ndarray]:
-    """One who walks and one who greets, each out of each view for a while, listed in any order; whose each is."""
+    """One who walks and one who greets, each out of each view for a while, listed in any order;
+    whose each is.
+    """
     rng = np.random.default_rng(seed)
     parts, owner = [], []
     for person, action in enumerate(("Walking", "Greeting")):
@@ -53,14 +65,19 @@ def scene(detector: Detector, rig: Rig, seed: int = 1) -> tuple[People, np.ndarr
             start = rng.integers(0, FRAMES)
             there[start : start + 40, view] = False
         row, view = np.nonzero(there)
-        parts.append((row, view, *(x[row, view] for x in (found.key_points, found.confidence, found.seen))))
+        parts.append(
+            (row, view, *(x[row, view] for x in (found.key_points, found.confidence, found.seen)))
+        )
         owner.append(np.full(len(row), person))
     row, view, points, sure, seen = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.lexsort((rng.random(len(row)), row, view))
-    arrays = (x[order] for x in (row, view, np.full(len(row), -1), points.astype(float), sure.astype(float), seen))
-    return People("pose", rig.names, SKELETONS["human36m"], np.arange(FRAMES), *arrays, 50.0), np.concatenate(owner)[
-        order
-    ]
+    arrays = (
+        x[order]
+        for x in (row, view, np.full(len(row), -1), points.astype(float), sure.astype(float), seen)
+    )
+    return People(
+        "pose", rig.names, SKELETONS["human36m"], np.arange(FRAMES), *arrays, 50.0
+    ), np.concatenate(owner)[order]
 
 
 @pytest.mark.parametrize(("views", "seed"), [(4, 1), (4, 2), (3, 1)])
@@ -128,12 +145,20 @@ def test_whoever_is_alone_is_taken_as_they_are(detector):
 
 def test_identities_in_the_files_are_taken_as_they_are(tmp_path):
     rng = np.random.default_rng(0)
-    bodies = {number: np.column_stack([rng.uniform(0, 400, (25, 2)), np.full(25, 0.5)]) for number in (3, 7)}
+    bodies = {
+        number: np.column_stack([rng.uniform(0, 400, (25, 2)), np.full(25, 0.5)])
+        for number in (3, 7)
+    }
     for view in ("a", "b"):
         (tmp_path / view).mkdir()
         for frame in range(4):
-            there = [number for number in rng.permutation([3, 7]).tolist() if number == 7 or frame != 2]
-            listed = [{"person_id": [n], "pose_keypoints_2d": (bodies[n] + frame).ravel().tolist()} for n in there]
+            there = [
+                number for number in rng.permutation([3, 7]).tolist() if number == 7 or frame != 2
+            ]
+            listed = [
+                {"person_id": [n], "pose_keypoints_2d": (bodies[n] + frame).ravel().tolist()}
+                for n in there
+            ]
             (tmp_path / view / f"{frame}.json").write_text(json.dumps({"people": listed}))
     people = read_people(tmp_path, "body_25b")
     cameras = camera_file(Rig(("a", "b"), rig_of(2).cameras, rig_of(2).distortion, rig_of(2).size))
@@ -141,7 +166,9 @@ def test_identities_in_the_files_are_taken_as_they_are(tmp_path):
         points = people.pick(who(people, cameras, (0, 1), person))
         there = np.array([number == 7 or frame != 2 for frame in range(4)])
         assert (points.seen.any(-1) == there[:, None]).all()
-        expected = np.broadcast_to((bodies[number][:, 0] + np.arange(4)[:, None])[:, None], (4, 2, 25))
+        expected = np.broadcast_to(
+            (bodies[number][:, 0] + np.arange(4)[:, None])[:, None], (4, 2, 25)
+        )
         np.testing.assert_allclose(points.key_points[..., 0][there], expected[there])
     with pytest.raises(GhptDataError, match="there is no person 2: 2 can be told apart"):
         who(people, cameras, (0, 1), 2)
@@ -151,7 +178,18 @@ def test_nobody_is_no_error():
     rig = rig_of(3)
     none = np.zeros((0, 17, 2), np.float32)
     empty = np.zeros(0, np.int64)
-    assert associate(rig.cameras, 5, empty, empty, none, np.zeros((0, 17), bool), np.zeros((0, 17), np.float32)) == []
+    assert (
+        associate(
+            rig.cameras,
+            5,
+            empty,
+            empty,
+            none,
+            np.zeros((0, 17), bool),
+            np.zeros((0, 17), np.float32),
+        )
+        == []
+    )
 
 
 def test_who_was_seen_beside_another_is_not_that_one():
@@ -163,7 +201,9 @@ def test_who_was_seen_beside_another_is_not_that_one():
 
 
 def test_the_real_recording_keeps_its_person(shared_data):
-    """Two or three people in two views, of whom one is in all: every frame of every view is that one's."""
+    """Two or three people in two views, of whom one is in all: every frame of every view is that
+    one's.
+    """
     from ghpt.data.formats.camera_files import read_cameras
 
     folder = shared_data / "pose2sim_single"

@@ -52,7 +52,10 @@ def test_chunks_follow_one_another_by_number(tmp_path):
     ("change", "says"),
     [
         ({"bboxes": np.zeros((5, 3, 2, 2))}, r"all_bboxes\.npy: has shape 5 x 3 x 2 x 2"),
-        ({"2d_preds": np.zeros((6, 3, 19, 2))}, "human36m has 17 joints and the key points have 19"),
+        (
+            {"2d_preds": np.zeros((6, 3, 19, 2))},
+            "human36m has 17 joints and the key points have 19",
+        ),
         ({"2d_preds": np.zeros((6, 3, 17, 3))}, r"all_2d_preds\.npy: has shape 6 x 3 x 17 x 3"),
         ({"2d_preds": np.full((6, 3, 17, 2), 1e30)}, "a number beyond 1e6"),
         ({"2d_preds": np.full((6, 3, 17, 2), np.nan)}, "has no key point"),
@@ -66,5 +69,7 @@ def test_bad_arrays_are_named(change, says, tmp_path):
 
 def test_predictions_without_boxes_are_refused(tmp_path):
     (layout(tmp_path) / "all_bboxes.npy").unlink()
-    with pytest.raises(GhptDataError, match=r"all_bboxes\.npy: there is no such file.*pixels of a crop"):
+    with pytest.raises(
+        GhptDataError, match=r"all_bboxes\.npy: there is no such file.*pixels of a crop"
+    ):
         read_key_points(tmp_path)

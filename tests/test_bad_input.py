@@ -1,7 +1,9 @@
-"""What a user can get wrong with data and settings, through `train`: a named error, and nothing written half.
+"""What a user can get wrong with data and settings, through `train`: a named error, and nothing
+written half.
 
-Single files and arrays have their cases beside their readers: test_labels, test_human36m, test_panoptic, test_rigs,
-test_store, test_validate; checkpoints in reliability/test_checkpoint_code; the command line in test_cli.
+Single files and arrays have their cases beside their readers: test_labels, test_human36m,
+test_panoptic, test_rigs, test_store, test_validate; checkpoints in
+reliability/test_checkpoint_code; the command line in test_cli.
 """
 
 import copy
@@ -35,7 +37,9 @@ def toy(**data: Any) -> dict[str, Any]:
     return copy.deepcopy(toys.TRAIN) | {"data": toys.DATA | data}
 
 
-def check_refused(settings: dict[str, Any], folder: Path, kind: type[GhptError], message: str) -> None:
+def check_refused(
+    settings: dict[str, Any], folder: Path, kind: type[GhptError], message: str
+) -> None:
     """`train` raises this error, and leaves no file in its output and no recording in the cache."""
     settings["data"]["cache"] = str(folder / "cache")
     with pytest.raises(kind, match=message):
@@ -52,10 +56,22 @@ def check_refused(settings: dict[str, Any], folder: Path, kind: type[GhptError],
             GhptConfigError,
             r"data\.cameras: is \[0\]\. Triangulation needs at least 2",
         ),
-        (["data=cmu1", "data.cameras=[]"], GhptConfigError, r"data\.cameras: is \[\]\. Triangulation needs at least 2"),
+        (
+            ["data=cmu1", "data.cameras=[]"],
+            GhptConfigError,
+            r"data\.cameras: is \[\]\. Triangulation needs at least 2",
+        ),
         (["data=cmu1", "data.cameras=[3,7,3]"], GhptDataError, "camera 3 is listed twice"),
-        (["data=cmu1", "data.cameras=[3,31]"], GhptDataError, r"no HD camera 31\. HD cameras are 0 to 30"),
-        (["data=h36m", "data.root=/no/such"], GhptDataError, r"/no/such: data\.root: there is no such folder"),
+        (
+            ["data=cmu1", "data.cameras=[3,31]"],
+            GhptDataError,
+            r"no HD camera 31\. HD cameras are 0 to 30",
+        ),
+        (
+            ["data=h36m", "data.root=/no/such"],
+            GhptDataError,
+            r"/no/such: data\.root: there is no such folder",
+        ),
         (["data=cmu1", "data.name=cmu7"], GhptConfigError, r"is 'cmu7'\. Choose from cmu1"),
     ],
 )
@@ -63,10 +79,14 @@ def test_cameras_and_folders(tmp_path, words, kind, message):
     check_refused(config(*words), tmp_path, kind, message)
 
 
-@pytest.mark.parametrize(("data", "missing"), [("h36m", "labels"), ("cmu1", "sequence|calibration|folder")])
+@pytest.mark.parametrize(
+    ("data", "missing"), [("h36m", "labels"), ("cmu1", "sequence|calibration|folder")]
+)
 def test_a_folder_that_is_not_the_data_set(tmp_path, data, missing):
     (tmp_path / "empty").mkdir()
-    check_refused(config(f"data={data}", f"data.root={tmp_path / 'empty'}"), tmp_path, GhptDataError, missing)
+    check_refused(
+        config(f"data={data}", f"data.root={tmp_path / 'empty'}"), tmp_path, GhptDataError, missing
+    )
 
 
 def test_a_truncated_labels_file(tmp_path):
@@ -85,14 +105,19 @@ def test_a_truncated_labels_file(tmp_path):
 
 def test_an_empty_split(tmp_path, monkeypatch):
     make = toys.ToyData.make
-    monkeypatch.setattr(toys.ToyData, "make", lambda self, split: [] if split == "train" else make(self, split))
-    check_refused(toy(), tmp_path, GhptDataError, r"embedded: train: there are no frames to prepare")
+    monkeypatch.setattr(
+        toys.ToyData, "make", lambda self, split: [] if split == "train" else make(self, split)
+    )
+    check_refused(
+        toy(), tmp_path, GhptDataError, r"embedded: train: there are no frames to prepare"
+    )
 
 
 def test_no_frame_with_enough_joints(tmp_path):
     settings = toy(missing=0.95, cache=str(tmp_path / "cache"))
     with pytest.raises(
-        GhptDataError, match=r"toy train: no frame has a true pelvis and 5 joints seen in two views\. Lower"
+        GhptDataError,
+        match=r"toy train: no frame has a true pelvis and 5 joints seen in two views\. Lower",
     ):
         train(settings, tmp_path / "run")
     assert not [path for path in (tmp_path / "run").rglob("*") if "tfevents" not in path.name]
@@ -132,7 +157,9 @@ def changed(settings: dict[str, Any], path: tuple[str, ...], value: Any) -> dict
 
 
 PARTS = {part: toys.TRAIN[part] for part in ("model", "data", "save_every", "seed")}
-NUMBERS = [path for path in numbers(PARTS) if path not in (("data", "views"), ("data", "missing"))]  # the toy's own
+NUMBERS = [
+    path for path in numbers(PARTS) if path not in (("data", "views"), ("data", "missing"))
+]  # the toy's own
 
 
 def test_there_are_numbers():
@@ -143,7 +170,11 @@ def test_there_are_numbers():
 @pytest.mark.parametrize("path", NUMBERS, ids=".".join)
 def test_every_number_has_a_type_and_a_range_and_is_named(tmp_path, path):
     """-1 is right for a seed alone; text and NaN are wrong everywhere."""
-    wrong = ["many", math.nan] if path[-1] == "seed" else ["many", math.nan, -1 if _whole(path) else -1.0]
+    wrong = (
+        ["many", math.nan]
+        if path[-1] == "seed"
+        else ["many", math.nan, -1 if _whole(path) else -1.0]
+    )
     for value in wrong:
         name = "model.optimizer" if "optimizer" in path and value == -1 else ".".join(path)
         check_refused(changed(toy(), path, value), tmp_path, GhptConfigError, f"^{name}: ")

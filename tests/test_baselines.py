@@ -15,7 +15,9 @@ from scenes import random_scene
 ROBUST = {
     "ransac": Ransac(threshold=0.02, pairs=100, seed=0),
     "ransac_random": Ransac(threshold=0.02, pairs=9, seed=0),
-    "adaptive_ransac": AdaptiveRansac(threshold=0.02, pairs=100, seed=0, adapt=5.0, quantile=0.55, rounds=4),
+    "adaptive_ransac": AdaptiveRansac(
+        threshold=0.02, pairs=100, seed=0, adapt=5.0, quantile=0.55, rounds=4
+    ),
     "huber": MEstimator(loss="huber", scale=0.002, iterations=40, tolerance=1e-3),
     "cauchy": MEstimator(loss="cauchy", scale=0.002, iterations=40, tolerance=1e-3),
     "geman_mcclure": MEstimator(loss="geman_mcclure", scale=0.01, iterations=40, tolerance=1e-3),
@@ -80,9 +82,12 @@ def test_a_frame_s_estimate_depends_on_no_other_frame(baseline):
     batch = scene.batch()
     together = baseline(batch)
     parts = {
-        f: getattr(batch, f) for f in ("sample", "recording", "key_points", "confidence", "seen", "truth", "truth_seen")
+        f: getattr(batch, f)
+        for f in ("sample", "recording", "key_points", "confidence", "seen", "truth", "truth_seen")
     }
-    alone = replace(batch, cameras=batch.cameras.index(slice(3, 4)), **{f: x[3:4] for f, x in parts.items()})
+    alone = replace(
+        batch, cameras=batch.cameras.index(slice(3, 4)), **{f: x[3:4] for f, x in parts.items()}
+    )
     torch.testing.assert_close(baseline(alone).points[0], together.points[3], rtol=0, atol=1e-9)
 
 
@@ -90,7 +95,11 @@ def test_a_frame_s_estimate_depends_on_no_other_frame(baseline):
 def test_the_order_of_the_views_is_nothing(name):
     scene, _ = spoilt()
     order = torch.tensor([5, 0, 7, 2, 1, 6, 4, 3])
-    turned = replace(scene, cameras=scene.cameras.index((slice(None), order)), key_points=scene.key_points[:, order])
+    turned = replace(
+        scene,
+        cameras=scene.cameras.index((slice(None), order)),
+        key_points=scene.key_points[:, order],
+    )
     there, back = (ALL[name](s.batch()).points for s in (scene, turned))
     torch.testing.assert_close(there, back, rtol=0, atol=1e-6)
 
@@ -101,7 +110,9 @@ def test_the_resolution_and_the_unit_are_nothing(baseline):
     zoom = torch.tensor([4.0, 4.0, 1.0], dtype=torch.float64).diag()
     cameras = Cameras(zoom @ scene.cameras.K, scene.cameras.R, scene.cameras.t)
     large = replace(scene, cameras=cameras, key_points=scene.key_points * 4)
-    torch.testing.assert_close(baseline(large.batch()).points, baseline(scene.batch()).points, rtol=0, atol=1e-2)
+    torch.testing.assert_close(
+        baseline(large.batch()).points, baseline(scene.batch()).points, rtol=0, atol=1e-2
+    )
 
 
 def test_ransac_takes_the_inliers_of_the_best_pair():
@@ -137,9 +148,14 @@ def test_the_m_estimator_minimises_pixels_and_says_when_it_has_not_finished():
         return reprojection_error(batch.cameras, batch.key_points, points).square().sum(1)
 
     assert (cost(square.points) < cost(Linear()(batch).points)).float().mean() > 0.95
-    step = torch.randn(200, *square.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    step = torch.randn(
+        200, *square.points.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     for direction in step:  # nothing 3 mm away is better
-        assert (cost(square.points + 3 * direction / direction.norm(dim=-1, keepdim=True)) > cost(square.points)).all()
+        assert (
+            cost(square.points + 3 * direction / direction.norm(dim=-1, keepdim=True))
+            > cost(square.points)
+        ).all()
     short = MEstimator(loss="huber", scale=1e-4, iterations=1, tolerance=1e-6)
     result = short.triangulate(batch)
     assert (result.status == Status.NOT_CONVERGED).all()
@@ -157,7 +173,9 @@ def test_the_size_of_a_person_is_the_diagonal_of_what_is_seen():
 @each
 def test_a_batch_of_no_frames_gives_no_points(baseline):
     whole = vars(random_scene(4).batch())
-    empty = {k: v[:0] if isinstance(v, torch.Tensor) else v.index(slice(0, 0)) for k, v in whole.items()}
+    empty = {
+        k: v[:0] if isinstance(v, torch.Tensor) else v.index(slice(0, 0)) for k, v in whole.items()
+    }
     estimate = baseline(KeyPointBatch(**empty))
     assert estimate.points.shape == (0, 17, 3)
 
@@ -166,7 +184,9 @@ def test_a_batch_of_no_frames_gives_no_points(baseline):
 def test_the_dtype_is_that_of_the_key_points(baseline):
     scene, _ = spoilt(frames=1, views=4)
     batch = scene.batch()
-    single = replace(batch, key_points=batch.key_points.float(), confidence=batch.confidence.float())
+    single = replace(
+        batch, key_points=batch.key_points.float(), confidence=batch.confidence.float()
+    )
     estimate = baseline(single)
     assert estimate.points.dtype == torch.float32
     torch.testing.assert_close(estimate.points.double(), baseline(batch).points, rtol=0, atol=0.1)

@@ -18,7 +18,9 @@ def random_angles(seed: int, frames: int = 50) -> np.ndarray:
 
 
 def bones(joints: np.ndarray) -> np.ndarray:
-    return np.stack([np.linalg.norm(joints[:, a] - joints[:, b], axis=-1) for a, b in BONES], axis=-1)
+    return np.stack(
+        [np.linalg.norm(joints[:, a] - joints[:, b], axis=-1) for a, b in BONES], axis=-1
+    )
 
 
 def test_joint_angles_never_change_the_length_of_a_bone(body):
@@ -36,13 +38,19 @@ def test_turning_the_pelvis_turns_the_whole_body(body):
 
 def test_exchanging_the_sides_mirrors_a_symmetric_body(body):
     offsets = body.offsets.copy()
-    offsets[[JOINT[f"left_{j}"] for j in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")]] = offsets[
+    offsets[
+        [JOINT[f"left_{j}"] for j in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")]
+    ] = offsets[
         [JOINT[f"right_{j}"] for j in ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")]
     ] * [1, -1, 1]
     symmetric = Body(body.stature, offsets)
     angles = random_angles(2)
     names = [
-        s.replace("left", "right") if "left" in s else s.replace("right", "left") if "right" in s else s
+        s.replace("left", "right")
+        if "left" in s
+        else s.replace("right", "left")
+        if "right" in s
+        else s
         for s in SEGMENTS
     ]
     mirrored = angles[:, [SEGMENT[name] for name in names]]
@@ -55,14 +63,21 @@ def test_exchanging_the_sides_mirrors_a_symmetric_body(body):
 @pytest.mark.parametrize(
     ("segment", "column", "joint", "axis", "sign"),
     [
-        ("right_upper_arm", 0, "right_elbow", 0, 1), ("left_upper_arm", 1, "left_elbow", 1, 1),
-        ("right_upper_arm", 1, "right_elbow", 1, -1), ("right_forearm", 0, "right_wrist", 0, 1),
-        ("left_shank", 0, "left_ankle", 0, -1), ("left_thigh", 0, "left_knee", 0, 1),
-        ("lumbar", 0, "thorax", 0, 1), ("lumbar", 1, "thorax", 1, 1), ("pelvis", 0, "thorax", 0, 1),
-        ("pelvis", 1, "thorax", 1, 1), ("neck", 2, "nose", 1, 1), ("right_clavicle", 1, "right_shoulder", 2, 1),
+        ("right_upper_arm", 0, "right_elbow", 0, 1),
+        ("left_upper_arm", 1, "left_elbow", 1, 1),
+        ("right_upper_arm", 1, "right_elbow", 1, -1),
+        ("right_forearm", 0, "right_wrist", 0, 1),
+        ("left_shank", 0, "left_ankle", 0, -1),
+        ("left_thigh", 0, "left_knee", 0, 1),
+        ("lumbar", 0, "thorax", 0, 1),
+        ("lumbar", 1, "thorax", 1, 1),
+        ("pelvis", 0, "thorax", 0, 1),
+        ("pelvis", 1, "thorax", 1, 1),
+        ("neck", 2, "nose", 1, 1),
+        ("right_clavicle", 1, "right_shoulder", 2, 1),
         ("left_clavicle", 2, "left_shoulder", 0, 1),
     ],
-)  # fmt: skip
+)
 def test_positive_angles_move_the_way_their_names_say(body, segment, column, joint, axis, sign):
     angles = np.zeros((2, len(SEGMENTS), 3))
     angles[1, SEGMENT[segment], column] = 0.3
@@ -78,7 +93,10 @@ def test_people_differ_and_their_sides_differ_a_little():
     standing = np.concatenate([pose(person, np.zeros((1, len(SEGMENTS), 3))) for person in people])
     for joint, parent in PARENT.items():
         right, left = (
-            np.linalg.norm(standing[:, JOINT[f"{side}_{joint}"]] - standing[:, JOINT[f"{side}_{parent}"]], axis=-1)
+            np.linalg.norm(
+                standing[:, JOINT[f"{side}_{joint}"]] - standing[:, JOINT[f"{side}_{parent}"]],
+                axis=-1,
+            )
             for side in ("right", "left")
         )
         assert 0.005 < np.std(left / right) < 0.02

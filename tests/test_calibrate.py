@@ -1,4 +1,6 @@
-"""calibrate.py as a user meets it: what it writes and says, with and without a scale, and how it fails."""
+"""calibrate.py as a user meets it: what it writes and says, with and without a scale, and how it
+fails.
+"""
 
 import json
 import re
@@ -30,9 +32,16 @@ from predicting import config
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUTS = {
-    "calibration.json", "report.md", "rig.png", "rig.svg", "rig.toml", "rig_anipose.toml", "intri.yml", "extri.yml",
+    "calibration.json",
+    "report.md",
+    "rig.png",
+    "rig.svg",
+    "rig.toml",
+    "rig_anipose.toml",
+    "intri.yml",
+    "extri.yml",
     "poses.npz",
-}  # fmt: skip
+}
 
 
 @pytest.fixture
@@ -44,7 +53,9 @@ def command(monkeypatch, typed):
 
 @pytest.fixture(scope="module")
 def scene():
-    """A walking person before Human3.6M's cameras, through their lenses, with 2 px of noise; the truth with it."""
+    """A walking person before Human3.6M's cameras, through their lenses, with 2 px of noise; the
+    truth with it.
+    """
     rig = human36m_rig("S9")
     truth = motion(0, "S9", "S9/Walking-1", "Walking", 400, 50.0)[::5]
     pixels, _ = project(rig.cameras, torch.from_numpy(truth).double())
@@ -52,8 +63,17 @@ def scene():
     values = seen_by_lens.unflatten(1, truth.shape[:2]).transpose(0, 1).numpy()
     values = values + np.random.default_rng(0).normal(0, 2, values.shape)
     shape = values.shape[:-1]
-    points = KeyPoints("", tuple(f"cam{i}_json" for i in range(4)), JOINTS, np.arange(len(truth)), values,
-                       np.ones(shape), np.ones(shape, bool), 10.0, (0,) * 4)  # fmt: skip
+    points = KeyPoints(
+        "",
+        tuple(f"cam{i}_json" for i in range(4)),
+        JOINTS,
+        np.arange(len(truth)),
+        values,
+        np.ones(shape),
+        np.ones(shape, bool),
+        10.0,
+        (0,) * 4,
+    )
     return replace(rig, names=tuple(f"cam_{i:02d}" for i in range(len(rig)))), points, truth
 
 
@@ -74,8 +94,14 @@ def write(folder, scene, extrinsics: bool = True):
 
 def test_intrinsics_and_a_height_give_the_rig_in_every_format(command, scene, tmp_path):
     rig, _, truth = scene
-    thigh = float(np.median(np.linalg.norm(truth[:, JOINT["left_hip"]] - truth[:, JOINT["left_knee"]], axis=-1)))
-    status, said, errors = command(*write(tmp_path, scene, extrinsics=False), f"scale.segments={{left_thigh: {thigh}}}")
+    thigh = float(
+        np.median(
+            np.linalg.norm(truth[:, JOINT["left_hip"]] - truth[:, JOINT["left_knee"]], axis=-1)
+        )
+    )
+    status, said, errors = command(
+        *write(tmp_path, scene, extrinsics=False), f"scale.segments={{left_thigh: {thigh}}}"
+    )
     assert status == 0, errors
     output = tmp_path / "rig"
     assert {file.name for file in output.iterdir()} >= OUTPUTS
@@ -117,7 +143,9 @@ def test_a_height_comes_back_from_every_command(command, scene, tmp_path):
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         checked = examine(plain(hydra.compose("cameras", [keypoints, again])), tmp_path)
     assert checked["stature_mm"] == pytest.approx(1750, rel=0.01)
-    predicted = predict(config(keypoints, again, "evaluated_frames=80", "formats=[npz]"), tmp_path / "out")
+    predicted = predict(
+        config(keypoints, again, "evaluated_frames=80", "formats=[npz]"), tmp_path / "out"
+    )
     assert predicted["stature_mm"] == pytest.approx(1750, rel=0.01)
 
 
@@ -134,14 +162,21 @@ def test_extrinsics_in_the_file_are_compared_with_and_not_used(command, scene, t
     assert numbers["difference"]["scale"] == pytest.approx(true / 8000, rel=0.02)
     centre = np.array([camera["centre_mm"] for camera in numbers["cameras"]])
     assert np.linalg.norm(centre[0] - centre[3]) == pytest.approx(8000, rel=1e-6)
-    ours, own = (numbers["explains"][n]["held_out"] for n in ("estimated", "the file's own calibration"))
+    ours, own = (
+        numbers["explains"][n]["held_out"] for n in ("estimated", "the file's own calibration")
+    )
     assert ours["count"] == own["count"] > 0
     assert ours["median"] < 1.1 * own["median"]
     # the same key points with no extrinsics in the file: the same rig, but for the world
     other = tmp_path / "other"
     other.mkdir()
-    assert command(*write(other, scene, extrinsics=False), "scale.baseline=[cam_00,cam_03,8000]")[0] == 0
-    apart = rig_difference(*(read_cameras(folder / "rig" / "rig.toml").cameras for folder in (tmp_path, other)))
+    assert (
+        command(*write(other, scene, extrinsics=False), "scale.baseline=[cam_00,cam_03,8000]")[0]
+        == 0
+    )
+    apart = rig_difference(
+        *(read_cameras(folder / "rig" / "rig.toml").cameras for folder in (tmp_path, other))
+    )
     assert float(apart.rotation_deg.max()) < 1e-5
     assert float(apart.centre_mm.max()) < 1e-3
     assert "Δ turn" in said
@@ -161,10 +196,16 @@ def test_an_assumed_scale_is_said_everywhere(command, scene, tmp_path):
         (["cameras=null"], "cameras: is missing"),
         (["keypoints=nowhere"], "nowhere: : |there is no such file"),
         (["cameras=nowhere.toml"], "there is no such file"),
-        (["scale.height=1750", "scale.baseline=[cam_00,cam_03,8000]"], "scale: has height and baseline"),
+        (
+            ["scale.height=1750", "scale.baseline=[cam_00,cam_03,8000]"],
+            "scale: has height and baseline",
+        ),
         (["scale.baseline=[cam_00,cam_00,3000]"], "scale.baseline: is"),
         (["scale.baseline=[cam_00,front,3000]"], "Give two of cam_00"),
-        (["scale.segments={tail: 30}"], r"scale\.segments: names 'tail', which is no part of the body"),
+        (
+            ["scale.segments={tail: 30}"],
+            r"scale\.segments: names 'tail', which is no part of the body",
+        ),
         (["scale.segments={thigh: long}"], r"scale\.segments: says thigh is 'long'"),
         (["scale.height=-3"], r"scale\.height: is -3"),
         (["triangulation=guess"], "triangulation: is 'guess'"),
@@ -173,7 +214,7 @@ def test_an_assumed_scale_is_said_everywhere(command, scene, tmp_path):
         (["skeleton=body_25"], "body_25 has 25 joints and the key points have 17"),
         (["evaluated_frames=0"], "evaluated_frames"),
     ],
-)  # fmt: skip
+)
 def test_bad_input_ends_in_one_line(words, says, command, scene, tmp_path):
     status, _, errors = command(*write(tmp_path, scene), *words)
     assert status == 1
@@ -220,13 +261,21 @@ def test_the_followed_person_is_mentioned(scene):
     assert people_note(replace(points, several=(0,) * 4)) == ()
 
 
-def test_the_real_recording_is_explained_better_than_by_its_own_calibration(command, shared_data, tmp_path):
+def test_the_real_recording_is_explained_better_than_by_its_own_calibration(
+    command, shared_data, tmp_path
+):
     folder, better = shared_data / "pose2sim_single", 0.7
-    status, _, errors = command(f"keypoints={folder / 'pose'}", f"cameras={folder / 'Calib_qualisys.toml'}",
-                                f"output={tmp_path / 'rig'}", "scale.height=1750")  # fmt: skip
+    status, _, errors = command(
+        f"keypoints={folder / 'pose'}",
+        f"cameras={folder / 'Calib_qualisys.toml'}",
+        f"output={tmp_path / 'rig'}",
+        "scale.height=1750",
+    )
     assert status == 0, errors
     numbers = json.loads((tmp_path / "rig" / "calibration.json").read_text())
-    ours, own = (numbers["explains"][n]["held_out"] for n in ("estimated", "the file's own calibration"))
+    ours, own = (
+        numbers["explains"][n]["held_out"] for n in ("estimated", "the file's own calibration")
+    )
     assert ours["median"] < better * own["median"]
     assert ours["p90"] < better * own["p90"]
     assert max(numbers["difference"]["rotation_deg"].values()) < 2
@@ -235,8 +284,12 @@ def test_the_real_recording_is_explained_better_than_by_its_own_calibration(comm
 
 def test_the_seated_person_is_said_not_to_do(command, shared_data, tmp_path):
     folder = shared_data / "caliscope"
-    status, said, _ = command(f"keypoints={folder / 'xy_HOLISTIC.csv'}", f"cameras={folder / 'camera_array.toml'}",
-                              f"output={tmp_path / 'rig'}", "evaluated_frames=20")  # fmt: skip
+    status, said, _ = command(
+        f"keypoints={folder / 'xy_HOLISTIC.csv'}",
+        f"cameras={folder / 'camera_array.toml'}",
+        f"output={tmp_path / 'rig'}",
+        "evaluated_frames=20",
+    )
     numbers = json.loads((tmp_path / "rig" / "calibration.json").read_text())
     assert "little_motion" in {found["code"] for found in numbers["diagnoses"]}
     assert re.search("(error|warning): joints move by", said)

@@ -1,4 +1,6 @@
-"""Calibration of a rig: exact on exact data, indifferent to order and resolution, honest about its uncertainty."""
+"""Calibration of a rig: exact on exact data, indifferent to order and resolution, honest about its
+uncertainty.
+"""
 
 from dataclasses import replace
 
@@ -104,7 +106,10 @@ def test_uncertainty_is_the_size_of_the_error():
     for seed in range(12):
         scene = people(frames=30, seed=seed)
         estimate = scene.calibrate(CALIBRATE)
-        z.append(free_error(estimate, scene.cameras) / estimate.covariance.diagonal(dim1=-2, dim2=-1).sqrt())
+        z.append(
+            free_error(estimate, scene.cameras)
+            / estimate.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+        )
     z = torch.stack(z)
     assert 0.7 < z.square().mean().sqrt() < 1.4
     assert (z.abs() < 2).double().mean() > 0.88
@@ -115,7 +120,13 @@ def problem(views=3, seed=0):
     seen_by = observe(scene.K, scene.key_points, scene.seen, 0.01)
     cameras = scene.cameras
     points = scene.points.flatten(0, 1)
-    rig = Rig(cameras.R, cameras.t / 1000, torch.ones(views, dtype=torch.bool), points / 1000, seen_by.seen)
+    rig = Rig(
+        cameras.R,
+        cameras.t / 1000,
+        torch.ones(views, dtype=torch.bool),
+        points / 1000,
+        seen_by.seen,
+    )
     return seen_by, rig
 
 
@@ -138,19 +149,31 @@ def test_gradient_is_that_of_the_cost():
     # with the points at their best place for the views, eliminating them leaves the plain gradient
     best = replace(rig, points=newton(seen_by, rig))
     after = linearise(seen_by, best, best.inlier, 3.0)
-    plain = torch.tensor([
-        (linearise(seen_by, moved(best, d), best.inlier, 3.0).cost
-         - linearise(seen_by, moved(best, -d), best.inlier, 3.0).cost) / (2 * h)
-        for d in h * torch.eye(count, dtype=torch.float64)
-    ], dtype=torch.float64)  # fmt: skip
-    torch.testing.assert_close(after.scores.sum(0), plain, rtol=1e-4, atol=1e-4 * float(plain.abs().max()))
+    plain = torch.tensor(
+        [
+            (
+                linearise(seen_by, moved(best, d), best.inlier, 3.0).cost
+                - linearise(seen_by, moved(best, -d), best.inlier, 3.0).cost
+            )
+            / (2 * h)
+            for d in h * torch.eye(count, dtype=torch.float64)
+        ],
+        dtype=torch.float64,
+    )
+    torch.testing.assert_close(
+        after.scores.sum(0), plain, rtol=1e-4, atol=1e-4 * float(plain.abs().max())
+    )
 
 
 def newton(seen_by, rig):
     """The points at their best place for the views as they are."""
     points = rig.points.clone().requires_grad_()
     optimiser = torch.optim.LBFGS(
-        [points], max_iter=300, tolerance_grad=1e-10, tolerance_change=1e-14, line_search_fn="strong_wolfe"
+        [points],
+        max_iter=300,
+        tolerance_grad=1e-10,
+        tolerance_change=1e-14,
+        line_search_fn="strong_wolfe",
     )
 
     def cost():
@@ -187,7 +210,9 @@ def test_noise_of_views_and_joints_is_found():
     view, joint = torch.tensor([1.0, 2.0, 0.5, 1.0]), torch.ones(17)
     joint[[0, 5]] = 1.7
     sigma = (view[:, None] * joint[seen_by.joint]).double()
-    error = (sigma[..., None] * torch.randn(*sigma.shape, 2, generator=generator, dtype=torch.float64)).norm(dim=-1)
+    error = (
+        sigma[..., None] * torch.randn(*sigma.shape, 2, generator=generator, dtype=torch.float64)
+    ).norm(dim=-1)
     # of 2 x 4 numbers a point takes 3
     found = reweighted(seen_by, error * (5 / 8) ** 0.5, seen_by.seen).noise / seen_by.noise
     assert (found / sigma - 1).abs().max() < 0.12
@@ -201,11 +226,16 @@ def batch_of_pairs():
     count = torch.arange(3)
     seen = stack(lambda s: s.seen.transpose(0, 1))
     return PairBatch(
-        sample=count, rig=torch.zeros(3, dtype=torch.int64), draw=torch.tensor([d for d, _ in pairs]),
-        pair=torch.tensor([p for _, p in pairs]), cameras=cameras,
-        key_points=stack(lambda s: s.key_points.transpose(0, 1)), confidence=torch.ones(seen.shape), seen=seen,
+        sample=count,
+        rig=torch.zeros(3, dtype=torch.int64),
+        draw=torch.tensor([d for d, _ in pairs]),
+        pair=torch.tensor([p for _, p in pairs]),
+        cameras=cameras,
+        key_points=stack(lambda s: s.key_points.transpose(0, 1)),
+        confidence=torch.ones(seen.shape),
+        seen=seen,
         points=torch.zeros(3, 1, 3, dtype=torch.float64),
-    )  # fmt: skip
+    )
 
 
 def test_baseline_calibrates_a_draw_once_and_gives_its_pairs():
@@ -254,7 +284,13 @@ def test_broken_numbers_of_one_camera_leave_the_others(value):
     estimate = replace(scene, key_points=key_points).calibrate(CALIBRATE)
     assert estimate.calibrated.all()
     assert errors(estimate, scene.cameras)[0] < 1
-    for part in (estimate.cameras.R, estimate.cameras.t, estimate.points, estimate.covariance, estimate.reprojection):
+    for part in (
+        estimate.cameras.R,
+        estimate.cameras.t,
+        estimate.points,
+        estimate.covariance,
+        estimate.reprojection,
+    ):
         assert torch.isfinite(part).all()
 
 
@@ -283,7 +319,9 @@ def test_arrays_that_do_not_belong_together_are_refused():
 def test_scaled_scales_lengths_alone():
     scene = people(frames=20)
     estimate = scene.calibrate(CALIBRATE)
-    factor = float(relative(scene.cameras, 0, 1)[1].norm() / relative(estimate.cameras, 0, 1)[1].norm())
+    factor = float(
+        relative(scene.cameras, 0, 1)[1].norm() / relative(estimate.cameras, 0, 1)[1].norm()
+    )
     scaled = estimate.scaled(factor)
     torch.testing.assert_close(scaled.cameras.R, estimate.cameras.R)
     torch.testing.assert_close(scaled.centre_std, factor * estimate.centre_std)

@@ -1,4 +1,6 @@
-"""Cameras as people have them on their disks: read whatever the format, and written so that its own reader agrees."""
+"""Cameras as people have them on their disks: read whatever the format, and written so that its own
+reader agrees.
+"""
 
 import json
 import tomllib
@@ -26,10 +28,17 @@ def many(count: int = 12, lens: bool = True) -> Rig:
     vectors = rng.normal(size=(count, 3))
     vectors[0], vectors[1] = [np.pi - 1e-9, 0, 0], 0
     K = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
-    K[:, 0, 0], K[:, 1, 1], K[:, :2, 2] = rng.uniform(500, 2000, count), rng.uniform(500, 2000, count), 400.123456789
+    K[:, 0, 0], K[:, 1, 1], K[:, :2, 2] = (
+        rng.uniform(500, 2000, count),
+        rng.uniform(500, 2000, count),
+        400.123456789,
+    )
     names = tuple(f"cam_{i}" for i in range(count))
     cameras = Cameras(
-        *map(torch.from_numpy, (K, Rotation.from_rotvec(vectors).as_matrix(), rng.normal(size=(count, 3)) * 3e3))
+        *map(
+            torch.from_numpy,
+            (K, Rotation.from_rotvec(vectors).as_matrix(), rng.normal(size=(count, 3)) * 3e3),
+        )
     )
     distortion = torch.from_numpy(rng.normal(size=(count, 5)) * 0.1 * lens)
     return Rig(names, cameras, distortion, torch.tensor([[1080 + i, 1920] for i in range(count)]))
@@ -47,7 +56,9 @@ def written(form: str, folder: Path, rig: Rig) -> Path:
 
 
 @pytest.mark.parametrize("form", WRITERS)
-@pytest.mark.parametrize("make", [many, lambda: human36m_rig("S1"), lambda: panoptic_rig(range(31))])
+@pytest.mark.parametrize(
+    "make", [many, lambda: human36m_rig("S1"), lambda: panoptic_rig(range(31))]
+)
 def test_what_is_written_is_read_back(form, make, tmp_path):
     rig = make()
     found = read_cameras(written(form, tmp_path, rig))
@@ -63,19 +74,26 @@ def test_opencv_s_own_reader_reads_the_yml(tmp_path):
     rig = many()
     write_opencv(tmp_path, rig)
     intrinsic, extrinsic = (
-        cv2.FileStorage(str(tmp_path / f), cv2.FILE_STORAGE_READ) for f in ("intri.yml", "extri.yml")
+        cv2.FileStorage(str(tmp_path / f), cv2.FILE_STORAGE_READ)
+        for f in ("intri.yml", "extri.yml")
     )
     listed = intrinsic.getNode("names")
     assert [listed.at(i).string() for i in range(listed.size())] == list(rig.names)
     for i, name in enumerate(rig.names):
         np.testing.assert_array_equal(intrinsic.getNode(f"K_{name}").mat(), rig.cameras.K[i])
-        np.testing.assert_array_equal(intrinsic.getNode(f"dist_{name}").mat(), rig.distortion[i][None])
+        np.testing.assert_array_equal(
+            intrinsic.getNode(f"dist_{name}").mat(), rig.distortion[i][None]
+        )
         assert int(intrinsic.getNode(f"H_{name}").real()) == 1920
         assert int(intrinsic.getNode(f"W_{name}").real()) == 1080 + i
         turned = cv2.Rodrigues(extrinsic.getNode(f"R_{name}").mat())[0]
         np.testing.assert_allclose(turned, rig.cameras.R[i], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(extrinsic.getNode(f"Rot_{name}").mat(), rig.cameras.R[i], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(extrinsic.getNode(f"T_{name}").mat()[:, 0] * 1000, rig.cameras.t[i], rtol=1e-12)
+        np.testing.assert_allclose(
+            extrinsic.getNode(f"Rot_{name}").mat(), rig.cameras.R[i], rtol=0, atol=1e-9
+        )
+        np.testing.assert_allclose(
+            extrinsic.getNode(f"T_{name}").mat()[:, 0] * 1000, rig.cameras.t[i], rtol=1e-12
+        )
 
 
 def test_opencv_s_own_writer_is_read(tmp_path):
@@ -115,7 +133,9 @@ def test_pose2sim_s_layout(tmp_path):
         assert len(table["size"]) == 2
         turned = Rotation.from_rotvec(table["rotation"]).as_matrix()
         np.testing.assert_allclose(turned, rig.cameras.R[i], rtol=0, atol=1e-9)
-        np.testing.assert_allclose(np.array(table["translation"]) * 1000, rig.cameras.t[i], rtol=1e-12)
+        np.testing.assert_allclose(
+            np.array(table["translation"]) * 1000, rig.cameras.t[i], rtol=1e-12
+        )
 
 
 def test_aniposelib_s_order_of_keys_is_the_rig_s(tmp_path):
@@ -159,14 +179,23 @@ def toml(folder: Path, text: str | None = None, old: str = "", new: str = "") ->
 
 
 def test_a_camera_that_caliscope_ignores_is_left_out(tmp_path):
-    text = "".join(CAMERA.format(key=f"cameras.{i}", turn=i) for i in range(3)).replace('name = "cameras.', 'n = "')
-    found = read_cameras(toml(tmp_path, text.replace("[cameras.1]", "[cameras.1]\nignore = true\nrotation_count = -1")))
+    text = "".join(CAMERA.format(key=f"cameras.{i}", turn=i) for i in range(3)).replace(
+        'name = "cameras.', 'n = "'
+    )
+    found = read_cameras(
+        toml(
+            tmp_path, text.replace("[cameras.1]", "[cameras.1]\nignore = true\nrotation_count = -1")
+        )
+    )
     assert found.format == "caliscope"
     assert found.names == ("cam_0", "cam_2")
 
 
 def test_intrinsics_alone_are_enough(tmp_path):
-    for old, new in (("rotation = [0, 0.5, 0]", ""), ("rotation = [0, 0.5, 0]", 'rotation = "null"')):
+    for old, new in (
+        ("rotation = [0, 0.5, 0]", ""),
+        ("rotation = [0, 0.5, 0]", 'rotation = "null"'),
+    ):
         found = read_cameras(toml(tmp_path, old=old, new=new))
         assert found.cameras is None
         assert found.K.shape == (2, 3, 3)
@@ -179,9 +208,17 @@ def test_intrinsics_alone_are_enough(tmp_path):
     [
         ("distortions", "fisheye = true\ndistortions", r"a\.fisheye: is true.*Undistort"),
         ("distortions", "fisheye = 1\ndistortions", r"a\.fisheye: is true.*Undistort"),
-        ("distortions", "fisheye = 2\ndistortions", r"c\.toml: a\.fisheye: is 2, not true or false"),
+        (
+            "distortions",
+            "fisheye = 2\ndistortions",
+            r"c\.toml: a\.fisheye: is 2, not true or false",
+        ),
         ("distortions", "fisheye = 1.0\ndistortions", r"a\.fisheye: is 1.0, not true or false"),
-        ("distortions", 'fisheye = "true"\ndistortions', r"a\.fisheye: is 'true', not true or false"),
+        (
+            "distortions",
+            'fisheye = "true"\ndistortions',
+            r"a\.fisheye: is 'true', not true or false",
+        ),
         ("distortions", 'ignore = "no"\ndistortions', r"a\.ignore: is 'no', not true or false"),
         ('name = "a"', "name = true", r"a\.name: is True, not a name"),
         ('name = "a"', 'name = " "', r"a\.name: is ' ', not a name"),
@@ -189,9 +226,21 @@ def test_intrinsics_alone_are_enough(tmp_path):
         ("900.0", '"900"', "camera a, matrix: is not 9 finite numbers"),
         ("900.0", "inf", "camera a, matrix: is not 9 finite numbers"),
         ("900.0", "1.1e15", "camera a, matrix: is not 9 finite numbers"),
-        ("[[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]", "[[[[900.0, 0, 640, 0, 900, 360, 0, 0, 1]]]]", "a, matrix"),
-        ("[0.1, 0, 0, 0]", "[0.1, true, 0, 0]", "camera a, distortion: is not 4 or 5 finite numbers"),
-        ("[0.1, 0, 0, 0]", "[[0.1, 0], [0, 0]]", "camera a, distortion: is not 4 or 5 finite numbers"),
+        (
+            "[[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]",
+            "[[[[900.0, 0, 640, 0, 900, 360, 0, 0, 1]]]]",
+            "a, matrix",
+        ),
+        (
+            "[0.1, 0, 0, 0]",
+            "[0.1, true, 0, 0]",
+            "camera a, distortion: is not 4 or 5 finite numbers",
+        ),
+        (
+            "[0.1, 0, 0, 0]",
+            "[[0.1, 0], [0, 0]]",
+            "camera a, distortion: is not 4 or 5 finite numbers",
+        ),
         ("[0, 0.5, 0]", "[0, true, 0]", "camera a, rotation: is not 3 or 9 finite numbers"),
         ("[0, 0.5, 0]", '"0 0.5 0"', "camera a, rotation: is not 3 or 9 finite numbers"),
         ("[0, 0, 3]", "[0, true, 3]", "camera a, translation: is not 3 finite numbers"),
@@ -200,8 +249,16 @@ def test_intrinsics_alone_are_enough(tmp_path):
         ("matrix", "matrices", r"a\.matrix: is missing"),
         ("[0.1, 0, 0, 0]", "[0.1, 0]", "camera a, distortion: is not 4 or 5 finite numbers"),
         ("[0.1, 0, 0, 0]", "[nan, 0, 0, 0]", "camera a, distortion: is not 4 or 5"),
-        ("[[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]", "[[900.0, 0, 640], [0, 900], [0, 0, 1]]", "camera a, matrix"),
-        ("[[900.0, 0, 640], [0, 900, 360]", "[[900.0, 0, 0], [640, 900, 360]", "camera a, K.*transposed"),
+        (
+            "[[900.0, 0, 640], [0, 900, 360], [0, 0, 1]]",
+            "[[900.0, 0, 640], [0, 900], [0, 0, 1]]",
+            "camera a, matrix",
+        ),
+        (
+            "[[900.0, 0, 640], [0, 900, 360]",
+            "[[900.0, 0, 0], [640, 900, 360]",
+            "camera a, K.*transposed",
+        ),
         ("[[900.0", "[[-900.0", "camera a, K.*must be positive"),
         ("[0, 0.5, 0]", "[[1, 0, 0], [0, 2, 0], [0, 0, 1]]", "camera a, R: R is not a rotation"),
         ("[0, 0, 3]", '["0", "0", "3"]', "camera a, translation: is not 3 finite numbers"),
@@ -215,7 +272,10 @@ def test_a_bad_toml_is_named(old, new, says, tmp_path):
         read_cameras(
             toml(tmp_path, old=old, new=new)
             if old != 'name = "b"'
-            else toml(tmp_path, CAMERA.format(key="a", turn=0.5) + CAMERA.format(key="b", turn=1).replace(old, new))
+            else toml(
+                tmp_path,
+                CAMERA.format(key="a", turn=0.5) + CAMERA.format(key="b", turn=1).replace(old, new),
+            )
         )
 
 
@@ -231,9 +291,12 @@ def test_a_bad_toml_is_named(old, new, says, tmp_path):
         (b"%YAML:1.0\n---\nnames: [a, b]\n", "K_a: is missing"),
         (b"%YAML:1.0\n---\nnothing: 1\n", "names: is not a list"),
         (b"%YAML:1.0\n---\nnames: [a\n", "is not valid yml"),
-        (b"%YAML:1.0\n---\nK_a: !!opencv-matrix {rows: 999999999, cols: 3, dt: d, data: [1]}\n", "K_a: is no matrix"),
+        (
+            b"%YAML:1.0\n---\nK_a: !!opencv-matrix {rows: 999999999, cols: 3, dt: d, data: [1]}\n",
+            "K_a: is no matrix",
+        ),
     ],
-)  # fmt: skip
+)
 def test_a_bad_file_is_named(content, says, tmp_path):
     (tmp_path / "cameras").write_bytes(content)
     with pytest.raises(GhptDataError, match=says):
@@ -242,7 +305,12 @@ def test_a_bad_file_is_named(content, says, tmp_path):
 
 @pytest.mark.parametrize("field", ["K", "distCoef", "R", "t", "resolution"])
 def test_true_in_json_is_no_number(field, tmp_path):
-    camera = {"type": "hd", "K": np.eye(3).tolist(), "distCoef": [0.0] * 5, "resolution": [1920, 1080]}
+    camera = {
+        "type": "hd",
+        "K": np.eye(3).tolist(),
+        "distCoef": [0.0] * 5,
+        "resolution": [1920, 1080],
+    }
     cameras = [camera | {"name": i, "R": np.eye(3).tolist(), "t": [[0], [0], [i]]} for i in (3, 4)]
     path = tmp_path / "calibration.json"
     path.write_text(json.dumps({"cameras": cameras}))
@@ -254,12 +322,23 @@ def test_true_in_json_is_no_number(field, tmp_path):
         read_cameras(path)
 
 
-@pytest.mark.parametrize(("name", "content", "says"), [
-    ("c.json", '{"intrinsics": {"a": {}, "b": {}, "a": {}}}', "'a' is there twice"),
-    ("intri.yml", "%YAML:1.0\n---\nK_a: 1\nK_b: 2\nK_a: 3\n", "K_a is there twice"),
-    ("c.json", '{"cameras": [{"name": true, "K": 1, "distCoef": 1}]}', "name: is True, not a name"),
-    ("intri.yml", "%YAML:1.0\n---\nnames: [a, b]\nK_a: true\nK_b: true\n", "camera a, matrix: is not 9"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("c.json", '{"intrinsics": {"a": {}, "b": {}, "a": {}}}', "'a' is there twice"),
+        ("intri.yml", "%YAML:1.0\n---\nK_a: 1\nK_b: 2\nK_a: 3\n", "K_a is there twice"),
+        (
+            "c.json",
+            '{"cameras": [{"name": true, "K": 1, "distCoef": 1}]}',
+            "name: is True, not a name",
+        ),
+        (
+            "intri.yml",
+            "%YAML:1.0\n---\nnames: [a, b]\nK_a: true\nK_b: true\n",
+            "camera a, matrix: is not 9",
+        ),
+    ],
+)
 def test_a_name_that_is_there_twice_or_is_none_is_named(name, content, says, tmp_path):
     (tmp_path / name).write_text(content)
     with pytest.raises(GhptDataError, match=says):
@@ -267,13 +346,19 @@ def test_a_name_that_is_there_twice_or_is_none_is_named(name, content, says, tmp
 
 
 def test_a_camera_whose_flag_is_zero_is_read(tmp_path):
-    assert read_cameras(toml(tmp_path, old="distortions", new="fisheye = 0\ndistortions")).names == ("a", "b")
-    text = toml(tmp_path).read_text().replace("[a]", "[a]\nignore = 1") + CAMERA.format(key="c", turn=2)
+    assert read_cameras(
+        toml(tmp_path, old="distortions", new="fisheye = 0\ndistortions")
+    ).names == ("a", "b")
+    text = toml(tmp_path).read_text().replace("[a]", "[a]\nignore = 1") + CAMERA.format(
+        key="c", turn=2
+    )
     assert read_cameras(toml(tmp_path, text)).names == ("b", "c")
 
 
 def test_yml_is_read_without_running_code(tmp_path):
-    (tmp_path / "intri.yml").write_text(f"%YAML:1.0\n---\nnames: !!python/object/apply:os.mkdir ['{tmp_path}/run']\n")
+    (tmp_path / "intri.yml").write_text(
+        f"%YAML:1.0\n---\nnames: !!python/object/apply:os.mkdir ['{tmp_path}/run']\n"
+    )
     with pytest.raises(GhptDataError, match="K_"):
         read_cameras(tmp_path)
     assert not (tmp_path / "run").exists()
@@ -282,20 +367,36 @@ def test_yml_is_read_without_running_code(tmp_path):
 def test_the_real_files(shared_data):
     names = ("cam01", "cam02", "cam03", "cam04")
     found = read_cameras(shared_data / "pose2sim_single" / "Calib_qualisys.toml")
-    assert (found.format, found.names, found.other_names) == ("Pose2Sim", names, ("cam_1", "cam_2", "cam_3", "cam_4"))
-    one, other = (read_cameras(shared_data / "caliscope" / f) for f in ("camera_array.toml", "config.toml"))
+    assert (found.format, found.names, found.other_names) == (
+        "Pose2Sim",
+        names,
+        ("cam_1", "cam_2", "cam_3", "cam_4"),
+    )
+    one, other = (
+        read_cameras(shared_data / "caliscope" / f) for f in ("camera_array.toml", "config.toml")
+    )
     assert one.names == other.names == ("cam_0", "cam_1", "cam_2", "cam_3")
     torch.testing.assert_close(one.R, other.R, rtol=0, atol=0)
     torch.testing.assert_close(one.t, other.t, rtol=0, atol=0)
-    panoptic = read_cameras(shared_data / "panoptic" / "160906_band1" / "calibration_160906_band1.json")
+    panoptic = read_cameras(
+        shared_data / "panoptic" / "160906_band1" / "calibration_160906_band1.json"
+    )
     ours = panoptic_rig(range(31))
     assert panoptic.names == ours.names
     torch.testing.assert_close(panoptic.cameras.centre, ours.cameras.centre, rtol=0, atol=1e-3)
 
 
 def test_json_with_a_strange_camera_is_named(tmp_path):
-    camera = {"type": "hd", "K": [[1, 0, 0], [0, 1, 0], [0, 0, 1]], "distCoef": [0] * 5, "resolution": [1920, 1080]}
-    cameras = [camera | {"name": f"00_0{i}", "R": np.eye(3).tolist(), "t": [[0], [0], [i]]} for i in range(2)]
+    camera = {
+        "type": "hd",
+        "K": [[1, 0, 0], [0, 1, 0], [0, 0, 1]],
+        "distCoef": [0] * 5,
+        "resolution": [1920, 1080],
+    }
+    cameras = [
+        camera | {"name": f"00_0{i}", "R": np.eye(3).tolist(), "t": [[0], [0], [i]]}
+        for i in range(2)
+    ]
     path = tmp_path / "calibration.json"
     path.write_text(json.dumps({"cameras": cameras}))
     assert read_cameras(path).cameras.t[1].tolist() == [0, 0, 10]
@@ -305,7 +406,9 @@ def test_json_with_a_strange_camera_is_named(tmp_path):
         read_cameras(path)
 
 
-@pytest.mark.parametrize(("form", "file"), [("pose2sim", "rig.toml"), ("opencv", "intri.yml"), ("opencv", "extri.yml")])
+@pytest.mark.parametrize(
+    ("form", "file"), [("pose2sim", "rig.toml"), ("opencv", "intri.yml"), ("opencv", "extri.yml")]
+)
 def test_a_damaged_file_is_read_or_named(form, file, tmp_path):
     path = written(form, tmp_path, many(2))
     assert damage(tmp_path / file, lambda _: read_cameras(path), 150) == {"read", "named"}

@@ -1,4 +1,6 @@
-"""The camera problem's tables and figure: cells on a small copy of the real layout, text on made-up cells."""
+"""The camera problem's tables and figure: cells on a small copy of the real layout, text on made-up
+cells.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +20,12 @@ SIZES = {
     "frames_sweep": {"frames": [12, 24], "draws": 1, "all_pairs": True},
     "unknown_extrinsics": {"frames": 30, "draws": 1, "stride": 8},
 }
-SMALL = ("model.hypotheses=6", "model.scorer.layers=[4]", "data.train_samples=16", "trainer.max_epochs=1")
+SMALL = (
+    "model.hypotheses=6",
+    "model.scorer.layers=[4]",
+    "data.train_samples=16",
+    "trainer.max_epochs=1",
+)
 OF_CAMERAS = ("model.problem.draws=1", "model.problem.points=20")
 NONE = {"train": (), "test": ()}
 BY_LABEL = {item.label: item for item in ITEMS}
@@ -38,7 +45,9 @@ def real(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, str | None
     """Human3.6M in the layout of the real one, with perfect detections; and a folder for cells."""
     folder = tmp_path_factory.mktemp("real")
     rng = np.random.default_rng(0)
-    takes = [(subject, "Walking-1", layout.person(rng, 40, (0, 0, 1000))) for subject in layout.SUBJECTS]
+    takes = [
+        (subject, "Walking-1", layout.person(rng, 40, (0, 0, 1000))) for subject in layout.SUBJECTS
+    ]
     layout.write_human36m_layout(folder / "human36m", takes, chunk=40)
     return {"human36m": str(folder / "human36m"), "panoptic": None}, folder / "cells"
 
@@ -48,7 +57,9 @@ def made(cells: dict[str, Cell], folder: Path) -> None:
         perform(cell, folder)
 
 
-def made_up(setups: list[Setup], item: Item, folder: Path, contents: Any, file: str = "result.json") -> Section:
+def made_up(
+    setups: list[Setup], item: Item, folder: Path, contents: Any, file: str = "result.json"
+) -> Section:
     """The item's section of cells that hold ``contents(seed, name)``."""
     cells = [item.cells(setup) for setup in setups]
     for setup, by_name in zip(setups, cells, strict=True):
@@ -65,11 +76,16 @@ def test_sweep_of_perfect_detections_has_no_error(real):
     made(cells, folder)
     result = read_json(cells["12"].folder(folder) / "result.json")
     assert set(result) == set(PAIRS)
-    assert all(len(values) == 2 for errors in result.values() for values in errors.values())  # a draw of each rig
+    assert all(
+        len(values) == 2 for errors in result.values() for values in errors.values()
+    )  # a draw of each rig
     assert max(result["2-3"]["eight_point"]) < 3
     section = item.section(Results([setup], [cells], folder))
     assert "Human3.6M from" in section.data
-    assert "synthetic" not in section.data + section.figures["comparison-to-8-point"].axes[0].get_title()
+    assert (
+        "synthetic"
+        not in section.data + section.figures["comparison-to-8-point"].axes[0].get_title()
+    )
     assert "of 12 cells" in section.body
     assert "](comparison-to-8-point.svg)" in section.body
 
@@ -89,7 +105,9 @@ def test_tables_of_perfect_detections(real):
     cells = BY_LABEL["fundamental-evaluation"].cells(setup)
     made(cells, folder)
     results = Results([setup], [cells], folder)
-    evaluation, dissection = (BY_LABEL[f"fundamental-{name}"].section(results) for name in ("evaluation", "dissection"))
+    evaluation, dissection = (
+        BY_LABEL[f"fundamental-{name}"].section(results) for name in ("evaluation", "dissection")
+    )
     assert (len(evaluation.compared), len(dissection.compared)) == (24, 24)
     first = evaluation.compared[0]
     assert (first.what, first.paper) == ("1-3 E_R", pytest.approx(17.0))
@@ -124,14 +142,18 @@ def test_estimated_extrinsics_of_perfect_detections_cost_nothing(real):
 
 
 def sweep_cells(seed: int, name: str) -> dict[str, Any]:
-    """8-point: 30, 40 mm; weight: 10, 12 mm, but 50, 90 for M = 24 on the pair 2-3 with the first seed."""
+    """8-point: 30, 40 mm; weight: 10, 12 mm, but 50, 90 for M = 24 on the pair 2-3 with the first
+    seed.
+    """
     return {
         pair: {
             "weight": [50.0, 90.0] if (name, pair, seed) == ("24", "2-3", 0) else [10.0, 12.0],
-            "eight_point": [30.0, 40.0], "ransac": [9.0, None], "poselib": [5.0, 5.0],
+            "eight_point": [30.0, 40.0],
+            "ransac": [9.0, None],
+            "poselib": [5.0, 5.0],
         }
         for pair in PAIRS
-    }  # fmt: skip
+    }
 
 
 def test_sweep_claims_count_the_numbers_of_frames(tmp_path):
@@ -141,24 +163,44 @@ def test_sweep_claims_count_the_numbers_of_frames(tmp_path):
     assert "lower mean for 1 of 2" in better.by
     assert "M = 24: 70.0 ≥ 35.0" in better.by
     assert not steadier.holds
-    assert "below 8-point in 11 of 12, below RANSAC in 12 of 12, below PoseLib in 0 of 12 cells" in section.body
-    assert "embedded (synthetic) Human3.6M" in section.figures["comparison-to-8-point"].axes[0].get_title()
-    several = made_up([embedded(1), embedded(2)], BY_LABEL["comparison-to-8-point"], tmp_path, sweep_cells)
+    assert (
+        "below 8-point in 11 of 12, below RANSAC in 12 of 12, below PoseLib in 0 of 12 cells"
+        in section.body
+    )
+    assert (
+        "embedded (synthetic) Human3.6M"
+        in section.figures["comparison-to-8-point"].axes[0].get_title()
+    )
+    several = made_up(
+        [embedded(1), embedded(2)], BY_LABEL["comparison-to-8-point"], tmp_path, sweep_cells
+    )
     assert [claim.holds for claim in several.claims] == [True, True]
     assert "4 draws" in several.body
 
 
 def metrics(e3d: dict[str, float | None], alone: tuple[float, float]) -> dict[str, Any]:
     """metrics.json of one draw with these E_3D of every method, E_2D a tenth of it."""
-    parts = dict(zip(("estimated_R", "estimated_t"), ({"E_2D": x / 10, "E_3D": x} for x in alone), strict=True))
+    parts = dict(
+        zip(
+            ("estimated_R", "estimated_t"),
+            ({"E_2D": x / 10, "E_3D": x} for x in alone),
+            strict=True,
+        )
+    )
     pairs = {
         pair: {"E_R": 0.001, "E_t": 5.0, "E_2D": None if x is None else x / 10, "E_3D": x} | parts
         for pair, x in e3d.items()
     }
     worse = {pair: numbers | {"E_3D": 100.0} for pair, numbers in pairs.items()}
     names = ("average", "best", "ransac", "usac_magsac", "usac_accurate", "poselib", "rig")
-    return {"draws": 1, "selections": {"weight": {"pairs": pairs}, "eight_point": {"pairs": worse},
-                                       **{name: {"pairs": pairs} for name in names}}}  # fmt: skip
+    return {
+        "draws": 1,
+        "selections": {
+            "weight": {"pairs": pairs},
+            "eight_point": {"pairs": worse},
+            **{name: {"pairs": pairs} for name in names},
+        },
+    }
 
 
 @pytest.mark.parametrize(
@@ -170,15 +212,25 @@ def metrics(e3d: dict[str, float | None], alone: tuple[float, float]) -> dict[st
     ],
 )
 def test_claims_of_the_tables(tmp_path, monkeypatch, e3d, alone, evaluated, dissected):
-    monkeypatch.setattr("ghpt.paper.camera.tables._shapes", lambda results: dict.fromkeys(PAIRS, ("1", "2")))
+    monkeypatch.setattr(
+        "ghpt.paper.camera.tables._shapes", lambda results: dict.fromkeys(PAIRS, ("1", "2"))
+    )
     content = metrics(dict(zip(PAIRS, e3d, strict=True)), alone)
     sections = [
-        made_up([embedded()], BY_LABEL[f"fundamental-{name}"], tmp_path, lambda *_: content, "metrics.json")
+        made_up(
+            [embedded()],
+            BY_LABEL[f"fundamental-{name}"],
+            tmp_path,
+            lambda *_: content,
+            "metrics.json",
+        )
         for name in ("evaluation", "dissection")
     ]
     assert [claim.holds for claim in sections[0].claims] == evaluated
     assert [claim.holds for claim in sections[1].claims] == dissected
-    assert [c.what for c in sections[0].compared if c.ours is None] == ([] if e3d[0] else ["1-2 E_2D", "1-2 E_3D"])
+    assert [c.what for c in sections[0].compared if c.ours is None] == (
+        [] if e3d[0] else ["1-2 E_2D", "1-2 E_3D"]
+    )
 
 
 def poses(known: float, R: float, t: float, both: float) -> dict[str, dict[str, float]]:
@@ -196,7 +248,12 @@ def poses(known: float, R: float, t: float, both: float) -> dict[str, dict[str, 
 )
 def test_claims_on_unknown_extrinsics(tmp_path, base, inter, held):
     item = BY_LABEL["unknown-extrinsics-evaluation"]
-    section = made_up([embedded(0), embedded(1)], item, tmp_path, lambda _, name: base if "h36m" in name else inter)
+    section = made_up(
+        [embedded(0), embedded(1)],
+        item,
+        tmp_path,
+        lambda _, name: base if "h36m" in name else inter,
+    )
     assert [claim.holds for claim in section.claims] == held
     assert len(section.compared) == 8
     assert section.compared[3].ours.values == (base["both"]["relative"],) * 2

@@ -8,7 +8,9 @@ from scenes import random_scene
 def test_projection_is_the_textbook_formula_one_point_at_a_time():
     scene = random_scene(0, frames=2, views=3)
     pixels, depth = project(scene.cameras, scene.points)
-    K, R, t, points = (x.numpy() for x in (scene.cameras.K, scene.cameras.R, scene.cameras.t, scene.points))
+    K, R, t, points = (
+        x.numpy() for x in (scene.cameras.K, scene.cameras.R, scene.cameras.t, scene.points)
+    )
     for b, v, j in np.ndindex(2, 3, 17):
         u, w, z = K[b, v] @ (R[b, v] @ points[b, j] + t[b, v])
         np.testing.assert_allclose(pixels[b, v, j].numpy(), [u / z, w / z], rtol=1e-12)
@@ -58,7 +60,10 @@ def test_moving_and_indexing_keep_the_cameras():
 
 def test_a_point_in_the_camera_s_plane_has_no_error_but_infinity():
     scene = random_scene(6, frames=1, views=1)
-    eye, zero = torch.eye(3, dtype=torch.float64)[None, None], torch.zeros(1, 1, 3, dtype=torch.float64)
+    eye, zero = (
+        torch.eye(3, dtype=torch.float64)[None, None],
+        torch.zeros(1, 1, 3, dtype=torch.float64),
+    )
     cameras = Cameras(scene.cameras.K, eye, zero)
     points = torch.tensor([[[300.0, -200.0, 0.0], [300.0, -200.0, 1e-3]]], dtype=torch.float64)
     error = reprojection_error(cameras, torch.zeros(1, 1, 2, 2), points)

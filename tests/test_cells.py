@@ -1,4 +1,6 @@
-"""Cells are computed once, in the order of their needs, on several processes, and kept whatever happens."""
+"""Cells are computed once, in the order of their needs, on several processes, and kept whatever
+happens.
+"""
 
 import os
 import signal
@@ -58,7 +60,9 @@ def test_only_what_changed_is_done_again(diary, tmp_path):
 def test_an_error_names_the_cell_and_keeps_what_is_finished(diary, tmp_path, jobs):
     good = cell(diary, 1)
     bad = cell(diary, -1, good)  # after it: an error ends at once what is made beside it
-    with pytest.raises(GhptDataError, match=r"^add--1: .*is negative. Give a positive one") as caught:
+    with pytest.raises(
+        GhptDataError, match=r"^add--1: .*is negative. Give a positive one"
+    ) as caught:
         perform_all([cell(diary, 2, bad)], tmp_path / "cells", jobs, show=False)
     assert caught.value.field == "number"
     assert good.done(tmp_path / "cells")
@@ -81,7 +85,10 @@ def test_comments_docstrings_and_layout_are_no_code(tmp_path):
 
     plain = digest("a.py", "def f(x):\n    return x + 1\n")
     assert (
-        digest("b.py", '"""About."""\n\n\ndef f(x):\n    """More."""\n    # why\n    return (x\n            + 1)\n')
+        digest(
+            "b.py",
+            '"""About."""\n\n\ndef f(x):\n    """More."""\n    # why\n    return (x\n            + 1)\n',
+        )
         == plain
     )
     assert digest("c.py", "def f(x):\n    return x + 2\n") != plain
@@ -126,7 +133,10 @@ def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_pat
 
 def alive(process):
     try:
-        return Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()[0] != "Z"
+        return (
+            Path(f"/proc/{process}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()[0]
+            != "Z"
+        )
     except OSError:
         return False
 

@@ -1,4 +1,6 @@
-"""The camera doctor: every breakage is named, a good rig is left alone, and what is mended is right again."""
+"""The camera doctor: every breakage is named, a good rig is left alone, and what is mended is right
+again.
+"""
 
 import os
 from dataclasses import replace
@@ -40,8 +42,12 @@ def doctor(**changed):
 
 
 @cache
-def case(views: int = 4, reach: int = 2, noise: float = 0.006, frames: int = 90) -> tuple[Evidence, Setup]:
-    """A person walking before Panoptic's cameras, through their lenses; noise in sizes of the person, about."""
+def case(
+    views: int = 4, reach: int = 2, noise: float = 0.006, frames: int = 90
+) -> tuple[Evidence, Setup]:
+    """A person walking before Panoptic's cameras, through their lenses; noise in sizes of the
+    person, about.
+    """
     rig = panoptic_rig((10, 12, 16, 18, 22, 6)[:views])
     walk = motion(3, "P", "P/Walking", "Walking", frames, 25.0)
     points = torch.from_numpy(np.stack([walk[..., 0], -walk[..., 2], walk[..., 1]], axis=-1))
@@ -49,10 +55,29 @@ def case(views: int = 4, reach: int = 2, noise: float = 0.006, frames: int = 90)
     bent = distort(pixels.transpose(0, 1).flatten(1, 2), rig.cameras.K, rig.distortion)
     bent = bent.unflatten(1, points.shape[:2]).transpose(0, 1)
     seen = (depth > 0) & (bent >= 0).all(-1) & (bent <= rig.size[:, None] - 1).all(-1)
-    random = torch.randn(bent.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    file = CameraFile(path="", format="", names=rig.names, other_names=("",) * views, K=rig.cameras.K,
-                      distortion=rig.distortion, size=rig.size, R=rig.cameras.R, t=rig.cameras.t)  # fmt: skip
-    found = choose(rig.names, (bent + 500 * noise * random).numpy(), seen.numpy(), np.arange(frames), 20, reach, "")
+    random = torch.randn(
+        bent.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    file = CameraFile(
+        path="",
+        format="",
+        names=rig.names,
+        other_names=("",) * views,
+        K=rig.cameras.K,
+        distortion=rig.distortion,
+        size=rig.size,
+        R=rig.cameras.R,
+        t=rig.cameras.t,
+    )
+    found = choose(
+        rig.names,
+        (bent + 500 * noise * random).numpy(),
+        seen.numpy(),
+        np.arange(frames),
+        20,
+        reach,
+        "",
+    )
     return found, as_filed(file)
 
 
@@ -69,14 +94,28 @@ def checked(kind):
     return doctor()(*BREAKAGES[kind].spoil(case(reach=12 if kind in ("late", "early") else 2)))
 
 
-PUSHED = ("exchanged", "late", "lens_missing", "metres", "moved", "one_camera_to_world", "resolution", "sides_swapped")
+PUSHED = (
+    "exchanged",
+    "late",
+    "lens_missing",
+    "metres",
+    "moved",
+    "one_camera_to_world",
+    "resolution",
+    "sides_swapped",
+)
 """One of each sort; all the others, two seconds each, at night."""
 
 
 @pytest.mark.parametrize(
     "kind",
     [
-        pytest.param(kind, marks=() if kind in PUSHED else pytest.mark.skipif(not NIGHTLY, reason="GHPT_NIGHTLY=1"))
+        pytest.param(
+            kind,
+            marks=()
+            if kind in PUSHED
+            else pytest.mark.skipif(not NIGHTLY, reason="GHPT_NIGHTLY=1"),
+        )
         for kind in sorted(set(BREAKAGES) - {"one_axes_flipped", "one_camera_to_world_flipped"})
     ],
 )
@@ -93,8 +132,14 @@ def test_numbers_of_the_mistakes_are_those_that_were_made():
     kinds = ("late", "early", "metres", "centimetres", "one_metres", "resolution", "moved")
     values = {kind: checked(kind).findings[0].value for kind in kinds}
     assert values.pop("moved") == pytest.approx(3.0, abs=0.5)
-    assert values == {"late": 5, "early": -10, "metres": 1000, "centimetres": 10, "one_metres": 1000,
-                      "resolution": pytest.approx(0.5)}  # fmt: skip
+    assert values == {
+        "late": 5,
+        "early": -10,
+        "metres": 1000,
+        "centimetres": 10,
+        "one_metres": 1000,
+        "resolution": pytest.approx(0.5),
+    }
 
 
 def test_mended_poses_are_the_true_ones():
@@ -170,7 +215,9 @@ def test_a_person_of_no_human_size_is_said_without_inventing_a_unit():
 def test_views_that_nothing_explains_are_said_to_be_off():
     evidence, setup = case()
     pixels = evidence.pixels.clone()
-    pixels[3] += 300 * torch.randn(pixels[3].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    pixels[3] += 300 * torch.randn(
+        pixels[3].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
     found = doctor()(replace(evidence, pixels=pixels, at_rate=None), setup).findings
     assert [(finding.code, finding.cameras, finding.mended) for finding in found] == [
         ("off", (evidence.names[3],), False)
@@ -199,23 +246,56 @@ def test_bad_settings_are_named(changed, key):
 def test_real_rigs(shared_data):
     """Pose2Sim's third camera is off, and not in time; caliscope's rig is good."""
     folder, whole = shared_data / "pose2sim_single", doctor(frames=64, shift=20)
-    found = gather(read_key_points(folder / "pose"), read_cameras(folder / "Calib_qualisys.toml"), {}, None, 64, 20)
+    found = gather(
+        read_key_points(folder / "pose"),
+        read_cameras(folder / "Calib_qualisys.toml"),
+        {},
+        None,
+        64,
+        20,
+    )
     checkup = whole(found[0], as_filed(found[1]))
-    assert [(finding.code, finding.cameras) for finding in checkup.findings] == [("moved", ("cam03",))]
+    assert [(finding.code, finding.cameras) for finding in checkup.findings] == [
+        ("moved", ("cam03",))
+    ]
     assert checkup.findings[0].before_px > 35
     assert checkup.findings[0].after_px < 20
     folder = shared_data / "caliscope"
-    found = gather(read_key_points(folder / "xy_HOLISTIC.csv"), read_cameras(folder / "camera_array.toml"), {}, None,
-                   64, 20)  # fmt: skip
+    found = gather(
+        read_key_points(folder / "xy_HOLISTIC.csv"),
+        read_cameras(folder / "camera_array.toml"),
+        {},
+        None,
+        64,
+        20,
+    )
     assert whole(found[0], as_filed(found[1])).findings == ()
 
 
 def test_cameras_without_extrinsics_are_refused():
     rig, crowd = human36m_rig("S8"), people(frames=30)
-    file = CameraFile(path="intrinsics", format="", names=rig.names, other_names=("",) * 4, K=rig.cameras.K,
-                      distortion=rig.distortion, size=rig.size, R=None, t=None)  # fmt: skip
+    file = CameraFile(
+        path="intrinsics",
+        format="",
+        names=rig.names,
+        other_names=("",) * 4,
+        K=rig.cameras.K,
+        distortion=rig.distortion,
+        size=rig.size,
+        R=None,
+        t=None,
+    )
     values = crowd.key_points.numpy()
-    points = KeyPoints("", rig.names, JOINTS, np.arange(30), values, np.ones(values.shape[:-1]), crowd.seen.numpy(),
-                       None, (0,) * 4)  # fmt: skip
+    points = KeyPoints(
+        "",
+        rig.names,
+        JOINTS,
+        np.arange(30),
+        values,
+        np.ones(values.shape[:-1]),
+        crowd.seen.numpy(),
+        None,
+        (0,) * 4,
+    )
     with pytest.raises(GhptDataError, match="extrinsics"):
         gather(points, file, {}, None, 24, 5)

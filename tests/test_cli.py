@@ -1,4 +1,6 @@
-"""The command line as a user meets it: what it writes and says, how it fails, how it is stopped and goes on."""
+"""The command line as a user meets it: what it writes and says, how it fails, how it is stopped and
+goes on.
+"""
 
 import json
 import os
@@ -25,7 +27,13 @@ from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
 
 ROOT = Path(__file__).resolve().parents[1]
-SMALL = ("data=toy", "model.hypotheses=5", "model.scorer.layers=[4]", "trainer.accelerator=cpu", "progress_bar=false")
+SMALL = (
+    "data=toy",
+    "model.hypotheses=5",
+    "model.scorer.layers=[4]",
+    "trainer.accelerator=cpu",
+    "progress_bar=false",
+)
 
 
 @pytest.fixture(scope="module")
@@ -59,30 +67,50 @@ def test_train_then_test_as_typed(command, tmp_path):
     assert status == 0
     written = [re.sub(r"tfevents.*", "tfevents", name) for name in files(output)]
     assert written == [
-        ".ghpt/finished.json", ".ghpt/lock", ".ghpt/manifest.json",
-        ".hydra/config.yaml", ".hydra/hydra.yaml", ".hydra/overrides.yaml",
-        "best.ckpt", "events.out.tfevents", "last.ckpt", "previous.ckpt", "train.log",
-    ]  # fmt: skip
+        ".ghpt/finished.json",
+        ".ghpt/lock",
+        ".ghpt/manifest.json",
+        ".hydra/config.yaml",
+        ".hydra/hydra.yaml",
+        ".hydra/overrides.yaml",
+        "best.ckpt",
+        "events.out.tfevents",
+        "last.ckpt",
+        "previous.ckpt",
+        "train.log",
+    ]
     assert re.search(
-        r"Validation on embedded \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n", said
+        r"Validation on embedded \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
+        said,
     )
-    assert said.replace("\n", "") in re.sub(r".* INFO ghpt\.train: |\n", "", (output / "train.log").read_text())
+    assert said.replace("\n", "") in re.sub(
+        r".* INFO ghpt\.train: |\n", "", (output / "train.log").read_text()
+    )
     log = events(output)
-    assert {"train/total", "train/entropy", "validation/weight", "final/weight"} <= set(log.Tags()["scalars"])
+    assert {"train/total", "train/entropy", "validation/weight", "final/weight"} <= set(
+        log.Tags()["scalars"]
+    )
     assert "_hparams_/session_start_info" in log.summary_metadata
 
     next_command = re.search(r"Test it: python test\.py (.*) data=h36m", said)[1]
     assert next_command == f"\"ckpt='{output}/last.ckpt'\""  # quoted for the shell and for Hydra
     tested = tmp_path / "tested"
     status, table, said = command(
-        "test", next_command.strip('"'), "data=toy", f"output={tested}", "progress_bar=false", "trainer.accelerator=cpu"
+        "test",
+        next_command.strip('"'),
+        "data=toy",
+        f"output={tested}",
+        "progress_bar=false",
+        "trainer.accelerator=cpu",
     )
     assert status == 0
     assert str(tested / "report.md") in said
     assert max(map(len, table.splitlines())) <= 80
     assert "…" not in table
     log = events(tested)
-    assert {"mpjpe_relative/weight", "weights/entropy", "final/weight"} <= set(log.Tags()["scalars"])
+    assert {"mpjpe_relative/weight", "weights/entropy", "final/weight"} <= set(
+        log.Tags()["scalars"]
+    )
     assert log.Tags()["histograms"]
     assert {"skeletons", "pose_prior/S0"} <= set(log.Tags()["images"])
     assert "_hparams_/session_start_info" in log.summary_metadata
@@ -92,12 +120,28 @@ def test_train_then_test_as_typed(command, tmp_path):
 
 def test_a_frame_with_too_few_views_is_missing_in_the_file_and_never_invented(command, tmp_path):
     few = ("data=toy", "data.missing=0.6", "progress_bar=false", "trainer.accelerator=cpu")
-    assert command("train", *few, "model.hypotheses=5", "model.scorer.layers=[4]", f"output={tmp_path / 'a'}")[0] == 0
-    assert command("test", *few, f"ckpt={tmp_path / 'a' / 'last.ckpt'}", f"output={tmp_path / 'b'}")[0] == 0
-    data = toys.ToyData(**{k: v for k, v in (toys.DATA | {"missing": 0.6}).items() if k != "_target_"})
+    assert (
+        command(
+            "train",
+            *few,
+            "model.hypotheses=5",
+            "model.scorer.layers=[4]",
+            f"output={tmp_path / 'a'}",
+        )[0]
+        == 0
+    )
+    assert (
+        command("test", *few, f"ckpt={tmp_path / 'a' / 'last.ckpt'}", f"output={tmp_path / 'b'}")[0]
+        == 0
+    )
+    data = toys.ToyData(
+        **{k: v for k, v in (toys.DATA | {"missing": 0.6}).items() if k != "_target_"}
+    )
     data.setup("test")
     enough = torch.from_numpy(
-        np.concatenate([recording.seen[::3].sum(axis=1) >= 2 for recording in data.frames["test"].recordings])
+        np.concatenate(
+            [recording.seen[::3].sum(axis=1) >= 2 for recording in data.frames["test"].recordings]
+        )
     ).numpy()
     assert 0.2 < enough.mean() < 0.9
     with np.load(tmp_path / "b" / "predictions.npz") as arrays:
@@ -105,7 +149,9 @@ def test_a_frame_with_too_few_views_is_missing_in_the_file_and_never_invented(co
         assert {"weight", "best", "linear", "ransac", "lo_ransac"} <= set(names)
         for name in names:
             assert not arrays[f"estimated_{name}"][~enough].any(), name
-            np.testing.assert_array_equal(np.isnan(arrays[f"points_{name}"]).all(-1), ~arrays[f"estimated_{name}"])
+            np.testing.assert_array_equal(
+                np.isnan(arrays[f"points_{name}"]).all(-1), ~arrays[f"estimated_{name}"]
+            )
     metrics = json.loads((tmp_path / "b" / "metrics.json").read_text())
     assert metrics["selections"]["linear"]["coverage"] == pytest.approx(enough.mean(), abs=0.02)
 
@@ -118,7 +164,10 @@ def test_a_sweep_runs_on_after_a_failure_and_says_which(command, tmp_path):
     assert failed.startswith("  0_model.temperature--1.0: error: model.temperature: is -1.0.")
     assert re.fullmatch(r"  1_model\.temperature-2\.0: weight \d.* mm, random \d.* mm", done)
     assert not (tmp_path / "0_model.temperature--1.0" / "last.ckpt").exists()
-    assert "error: model.temperature: is -1.0" in (tmp_path / "0_model.temperature--1.0" / "train.log").read_text()
+    assert (
+        "error: model.temperature: is -1.0"
+        in (tmp_path / "0_model.temperature--1.0" / "train.log").read_text()
+    )
     assert read_checkpoint(tmp_path / "1_model.temperature-2.0" / "last.ckpt")
 
 
@@ -180,7 +229,10 @@ def test_a_mistake_ends_in_one_line_that_names_it(command, tmp_path, typo):
     ("word", "message"),
     [
         (None, "ckpt: is missing. Name one: python test.py ckpt="),
-        ("ckpt=/no/such.ckpt", "/no/such.ckpt: there is no such file. Give the last.ckpt or best.ckpt"),
+        (
+            "ckpt=/no/such.ckpt",
+            "/no/such.ckpt: there is no such file. Give the last.ckpt or best.ckpt",
+        ),
         ("ckpt=3", "ckpt: is 3, not text or null"),
         ("hypotheses=many", "hypotheses: is 'many', not an integer or null"),
         (
@@ -210,7 +262,9 @@ def test_the_trace_is_shown_to_who_asks_for_it(conf, tmp_path):
     words = [sys.executable, str(ROOT / "train.py"), f"output={tmp_path}", "data=cmu9"]
     quiet = subprocess.run(words, capture_output=True, text=True)
     assert (quiet.returncode, quiet.stderr.count("\n"), quiet.stdout) == (1, 1, "")
-    loud = subprocess.run(words, capture_output=True, text=True, env=os.environ | {"HYDRA_FULL_ERROR": "1"})
+    loud = subprocess.run(
+        words, capture_output=True, text=True, env=os.environ | {"HYDRA_FULL_ERROR": "1"}
+    )
     assert loud.returncode == 1
     assert "Traceback" in loud.stderr
     assert "GhptConfigError: data: there is no 'cmu9'" in loud.stderr
@@ -243,12 +297,16 @@ def uninterrupted(tmp_path_factory):
 
 @pytest.mark.posix
 @pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(tmp_path, uninterrupted, number, status):
+def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(
+    tmp_path, uninterrupted, number, status
+):
     script = ROOT / "tests" / "reliability" / "run_toy.py"
     child = subprocess.Popen(
-        [sys.executable, str(script), str(tmp_path), json.dumps(STOPPED)], text=True, stderr=subprocess.PIPE,
+        [sys.executable, str(script), str(tmp_path), json.dumps(STOPPED)],
+        text=True,
+        stderr=subprocess.PIPE,
         env=os.environ | {"PYTHONPATH": str(ROOT / "tests"), "OMP_NUM_THREADS": "1"},
-    )  # fmt: skip
+    )
     last = tmp_path / "last.ckpt"
     while not last.exists():
         assert child.poll() is None, "training ended before its first save"
@@ -262,7 +320,12 @@ def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(tmp_path
     assert f"Go on with the same command and output={tmp_path} resume=true" in said
     assert "Traceback" not in said
     assert not [path for path in tmp_path.iterdir() if path.name.endswith(".tmp")]
-    train(toys.TRAIN | STOPPED["train"] | {"resume": True, "trainer": toys.TRAINER | STOPPED["trainer"]}, tmp_path)
+    train(
+        toys.TRAIN
+        | STOPPED["train"]
+        | {"resume": True, "trainer": toys.TRAINER | STOPPED["trainer"]},
+        tmp_path,
+    )
     resumed = read_checkpoint(last)
     assert resumed["global_step"] == uninterrupted["global_step"]
     for key, value in uninterrupted["state_dict"].items():
@@ -292,12 +355,18 @@ def test_a_second_interrupt_takes_effect_at_once(tmp_path, monkeypatch):
     ("numbers", "reached", "saved"),
     [
         (["SIGHUP"], ["within"], True),
-        (["SIGHUP", "SIGHUP"], ["within", "within"], True),  # a closed terminal and its shell both send it
+        (
+            ["SIGHUP", "SIGHUP"],
+            ["within", "within"],
+            True,
+        ),  # a closed terminal and its shell both send it
         (["SIGHUP", "SIGTERM"], ["within"], False),
         (["SIGTERM", "SIGHUP"], ["within", "within"], True),
     ],
 )
-def test_a_closed_terminal_stops_a_training_as_sigterm_does(tmp_path, monkeypatch, numbers, reached, saved):
+def test_a_closed_terminal_stops_a_training_as_sigterm_does(
+    tmp_path, monkeypatch, numbers, reached, saved
+):
     found = []
     step = StochasticEstimator.training_step
 
@@ -342,6 +411,8 @@ def test_an_interrupt_while_the_data_are_prepared_leaves_nothing(tmp_path, monke
 
     monkeypatch.setattr(toys.ToyData, "make", interrupted)
     with restored(signal.SIGINT), pytest.raises(SystemExit) as stop:
-        train(toys.TRAIN | {"data": toys.DATA | {"cache": str(tmp_path / "cache")}}, tmp_path / "run")
+        train(
+            toys.TRAIN | {"data": toys.DATA | {"cache": str(tmp_path / "cache")}}, tmp_path / "run"
+        )
     assert stop.value.code == 130
     assert files(tmp_path) == []

@@ -17,10 +17,17 @@ CAMERAS = [
     ("PINHOLE", [500, 510, 320, 240], [500, 510, 0, 0, 0, 0, 0]),
     ("SIMPLE_RADIAL", [500, 320, 240, 0.1], [500, 500, 0.1, 0, 0, 0, 0]),
     ("RADIAL", [500, 320, 240, 0.1, 0.02], [500, 500, 0.1, 0.02, 0, 0, 0]),
-    ("OPENCV", [500, 510, 320, 240, 0.1, 0.02, 0.003, 0.004], [500, 510, 0.1, 0.02, 0.003, 0.004, 0]),
-    ("FULL_OPENCV", [500, 510, 320, 240, 0.1, 0.02, 0.003, 0.004, 0.005, 0, 0, 0],
-     [500, 510, 0.1, 0.02, 0.003, 0.004, 0.005]),
-]  # fmt: skip
+    (
+        "OPENCV",
+        [500, 510, 320, 240, 0.1, 0.02, 0.003, 0.004],
+        [500, 510, 0.1, 0.02, 0.003, 0.004, 0],
+    ),
+    (
+        "FULL_OPENCV",
+        [500, 510, 320, 240, 0.1, 0.02, 0.003, 0.004, 0.005, 0, 0, 0],
+        [500, 510, 0.1, 0.02, 0.003, 0.004, 0.005],
+    ),
+]
 
 
 def model(folder, form="binary", cameras=CAMERAS, name="cam{}.png", points=0):
@@ -28,7 +35,9 @@ def model(folder, form="binary", cameras=CAMERAS, name="cam{}.png", points=0):
     rng = np.random.default_rng(1)
     scene = pycolmap.Reconstruction()
     for number, (kind, parameters, *_) in enumerate(cameras, start=1):
-        camera = pycolmap.Camera(model=kind, width=640, height=480, params=parameters, camera_id=number)
+        camera = pycolmap.Camera(
+            model=kind, width=640, height=480, params=parameters, camera_id=number
+        )
         scene.add_camera_with_trivial_rig(camera)
         image = pycolmap.Image(name=name.format(number), camera_id=number, image_id=number)
         if points:
@@ -77,14 +86,20 @@ def test_images_called_alike_are_told_apart_by_their_folders(tmp_path):
     for file in ("images.txt", "images.bin"):
         path = tmp_path / file
         path.write_bytes(path.read_bytes().replace(b"view3", b"view2"))
-    with pytest.raises(GhptDataError, match=r"with names that tell no cameras apart.*keep one image of each"):
+    with pytest.raises(
+        GhptDataError, match=r"with names that tell no cameras apart.*keep one image of each"
+    ):
         read_cameras(tmp_path, unit_mm=1)
 
 
 @pytest.mark.parametrize(
     ("kind", "parameters", "says"),
     [
-        ("OPENCV_FISHEYE", [500, 510, 320, 240, 0, 0, 0, 0], "is of the model .* with .*undistort the images first"),
+        (
+            "OPENCV_FISHEYE",
+            [500, 510, 320, 240, 0, 0, 0, 0],
+            "is of the model .* with .*undistort the images first",
+        ),
         ("FULL_OPENCV", [500, 510, 320, 240, 0, 0, 0, 0, 0, 0.1, 0, 0], "has k4, k5 or k6"),
     ],
 )
@@ -109,7 +124,9 @@ def test_human36m_s_camera_parameters(shared_data, tmp_path):
         found, ours = read_cameras(path, subject=subject), human36m_rig(subject)
         assert found.names == ours.names
         for field in ("K", "R", "t"):
-            torch.testing.assert_close(getattr(found, field), getattr(ours.cameras, field), rtol=1e-9, atol=1e-6)
+            torch.testing.assert_close(
+                getattr(found, field), getattr(ours.cameras, field), rtol=1e-9, atol=1e-6
+            )
         torch.testing.assert_close(found.distortion, ours.distortion)
     with pytest.raises(GhptDataError, match=r"different for each subject.*S1, S2"):
         read_cameras(path)

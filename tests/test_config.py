@@ -9,7 +9,13 @@ from ghpt.config import build, check_plain
 from ghpt.errors import GhptConfigError
 from ghpt.models.scorer import Scorer
 
-SCORER = {"_target_": "ghpt.models.scorer.Scorer", "size": 3, "layers": [4, 5], "clip": 10.0, "bfloat16": False}
+SCORER = {
+    "_target_": "ghpt.models.scorer.Scorer",
+    "size": 3,
+    "layers": [4, 5],
+    "clip": 10.0,
+    "bfloat16": False,
+}
 
 
 def test_builds_nested_and_partial():
@@ -20,7 +26,9 @@ def test_builds_nested_and_partial():
 
 
 def test_an_unknown_argument_says_what_exists():
-    with pytest.raises(GhptConfigError, match=r"model\.layer: Scorer has no such setting\. Did you mean 'layers'\?"):
+    with pytest.raises(
+        GhptConfigError, match=r"model\.layer: Scorer has no such setting\. Did you mean 'layers'\?"
+    ):
         build(SCORER | {"layer": 3}, "model")
 
 
@@ -29,14 +37,20 @@ def test_a_missing_argument_is_named():
         build({k: v for k, v in SCORER.items() if k != "clip"}, "model")
 
 
-@pytest.mark.parametrize("target", ["ghpt.models.scorer.Scorr", "ghpt.nothing.Scorer", "nothing", ""])
+@pytest.mark.parametrize(
+    "target", ["ghpt.models.scorer.Scorr", "ghpt.nothing.Scorer", "nothing", ""]
+)
 def test_an_unknown_target_is_named(target):
     with pytest.raises(GhptConfigError, match="no class"):
         build(SCORER | {"_target_": target})
 
 
 def test_values_without_an_annotation_are_of_any_kind():
-    assert build({"_target_": "test_config.Free", "a": 3, "b": "text", "c": None}) == (3, "text", None)
+    assert build({"_target_": "test_config.Free", "a": 3, "b": "text", "c": None}) == (
+        3,
+        "text",
+        None,
+    )
 
 
 def Free(a, b, c):

@@ -27,20 +27,34 @@ def compose(name: str, *overrides: str) -> dict[str, Any]:
 def test_the_groups_hold_the_issue_s_choices():
     assert {"cmu1", "cmu2", "cmu3", "cmu4", "h36m"} <= set(choices("data"))
     assert choices("model") == ["camera", "pose"]
-    assert choices("experiment") == ["coordinates_only", "lengths_only", "no_gumbel", "selection_stochastic"]
+    assert choices("experiment") == [
+        "coordinates_only",
+        "lengths_only",
+        "no_gumbel",
+        "selection_stochastic",
+    ]
 
 
 @pytest.mark.parametrize("experiment", [None, *choices("experiment")])
 @pytest.mark.parametrize("data", choices("data"))
 def test_every_choice_composes_and_builds(data, experiment):
     small = ["model.scorer.layers=[2]"]  # only the widths, for the time
-    config = compose("train", f"data={data}", "model=pose", *small, *([f"experiment={experiment}"] * bool(experiment)))
+    config = compose(
+        "train",
+        f"data={data}",
+        "model=pose",
+        *small,
+        *([f"experiment={experiment}"] * bool(experiment)),
+    )
     assert build(config["data"], "data").name == data
     built = build(config["model"], "model")
-    assert built.problem.feature_size == {"coordinates_only": 51, "lengths_only": 16}.get(experiment, 67)
+    assert built.problem.feature_size == {"coordinates_only": 51, "lengths_only": 16}.get(
+        experiment, 67
+    )
     assert (built.gumbel, built.selection) == {
-        "no_gumbel": (False, "weight"), "selection_stochastic": (True, "stochastic"),
-    }.get(experiment, (True, "weight"))  # fmt: skip
+        "no_gumbel": (False, "weight"),
+        "selection_stochastic": (True, "stochastic"),
+    }.get(experiment, (True, "weight"))
     check_arguments(L.Trainer, config["trainer"], "trainer")
 
 
@@ -66,7 +80,12 @@ def test_the_camera_s_numbers_are_those_of_the_paper_s_table_of_hyperparameters(
 
 @pytest.mark.parametrize("scale", choices("scale_of_t"))
 def test_the_length_of_t_has_its_choices(scale):
-    model = compose("train", "model=camera", f"scale_of_t@model.problem.scale={scale}", "model.scorer.layers=[2]")
+    model = compose(
+        "train",
+        "model=camera",
+        f"scale_of_t@model.problem.scale={scale}",
+        "model.scorer.layers=[2]",
+    )
     kinds = {"known": "KnownScale", "height": "BodyHeight", "segments": "SegmentLengths"}
     assert type(build(model["model"], "model").problem.scale).__name__ == kinds[scale]
 
@@ -76,17 +95,29 @@ def test_every_test_configuration_builds(data):
     config = compose("test", f"data={data}")
     assert build(config["data"], "data").name == data
     assert sorted(build(config["baselines"], "baselines")) == [
-        "adaptive_ransac", "linear", "lo_ransac", "m_estimator", "ransac", "weighted_linear",
-    ]  # fmt: skip
+        "adaptive_ransac",
+        "linear",
+        "lo_ransac",
+        "m_estimator",
+        "ransac",
+        "weighted_linear",
+    ]
     assert sorted(build(config["camera_baselines"], "camera_baselines")) == [
-        "eight_point", "poselib", "ransac", "rig", "usac_accurate", "usac_magsac",
-    ]  # fmt: skip
+        "eight_point",
+        "poselib",
+        "ransac",
+        "rig",
+        "usac_accurate",
+        "usac_magsac",
+    ]
 
 
 def test_the_adaptive_ransac_of_the_tables_is_everyone_s():
     config = compose("predict")
-    users = (config["view_weights"]["consensus"], *(config["estimator"][kind]["swaps"]["estimator"] for kind in
-             ("classical", "learned")))  # fmt: skip
+    users = (
+        config["view_weights"]["consensus"],
+        *(config["estimator"][kind]["swaps"]["estimator"] for kind in ("classical", "learned")),
+    )
     assert all(settings == config["baselines"]["adaptive_ransac"] for settings in users)
 
 
@@ -95,12 +126,19 @@ def test_an_experiment_changes_one_setting_and_says_which_ablation_it_is(experim
     def leaves(node, path=""):
         if not isinstance(node, dict):
             return {path: node}
-        return {k: v for name, value in node.items() for k, v in leaves(value, f"{path}.{name}").items()}
+        return {
+            k: v for name, value in node.items() for k, v in leaves(value, f"{path}.{name}").items()
+        }
 
     usual, changed = leaves(compose("train")), leaves(compose("train", f"experiment={experiment}"))
     assert sum(usual[key] != changed[key] for key in usual) == 1
     assert usual.keys() == changed.keys()
-    assert (CONF / f"experiment/{experiment}.yaml").read_text().splitlines()[1].startswith("# Ablation")
+    assert (
+        (CONF / f"experiment/{experiment}.yaml")
+        .read_text()
+        .splitlines()[1]
+        .startswith("# Ablation")
+    )
 
 
 def test_the_numbers_are_those_of_the_paper_s_table_of_hyperparameters():
@@ -117,7 +155,10 @@ def test_the_numbers_are_those_of_the_paper_s_table_of_hyperparameters():
 
 
 def test_the_arrangements_are_those_of_section_4():
-    assert {name: compose("train", f"data={name}")["data"]["cameras"] for name in ("cmu1", "cmu2", "cmu3", "cmu4")} == {
+    assert {
+        name: compose("train", f"data={name}")["data"]["cameras"]
+        for name in ("cmu1", "cmu2", "cmu3", "cmu4")
+    } == {
         "cmu1": [1, 2, 3, 4, 6, 7, 10],
         "cmu2": [12, 16, 18, 19, 22, 23, 30],
         "cmu3": [10, 12, 16, 18],
@@ -127,6 +168,8 @@ def test_the_arrangements_are_those_of_section_4():
 
 @pytest.mark.parametrize("name", ["train", "test"])
 def test_the_help_names_every_choice(name):
-    text = (CONF / f"{name}.yaml").read_text().split("== Choices ==")[1].split("== Configuration")[0]
+    text = (
+        (CONF / f"{name}.yaml").read_text().split("== Choices ==")[1].split("== Configuration")[0]
+    )
     for group in ("data", "model", "experiment") if name == "train" else ("data",):
         assert all(choice in text for choice in choices(group))

@@ -1,4 +1,6 @@
-"""Training and testing on two processes, as typed: the numbers of one, everything written and said once."""
+"""Training and testing on two processes, as typed: the numbers of one, everything written and said
+once.
+"""
 
 import json
 import os
@@ -27,10 +29,16 @@ SMALL = ("data=toy", "progress_bar=false", "trainer.accelerator=cpu")
 MODELS = {
     "pose": ("model=pose", "model.hypotheses=5", "model.scorer.layers=[8]"),
     "camera": (
-        "model=camera", "model.hypotheses=5", "model.scorer.layers=[8]", "trainer.max_epochs=2",
-        "model.problem.frames=6", "model.problem.draws=3", "model.problem.sample=30", "model.problem.points=20",
+        "model=camera",
+        "model.hypotheses=5",
+        "model.scorer.layers=[8]",
+        "trainer.max_epochs=2",
+        "model.problem.frames=6",
+        "model.problem.draws=3",
+        "model.problem.sample=30",
+        "model.problem.points=20",
     ),
-}  # fmt: skip
+}
 TWO = ("trainer.devices=2", "trainer.strategy=ddp")
 
 
@@ -39,7 +47,9 @@ def project(tmp_path_factory):
     """The project's commands and configuration, with a toy data set of 77 training samples."""
     folder = tmp_path_factory.mktemp("project")
     shutil.copytree(ROOT / "conf", folder / "conf")
-    (folder / "conf" / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA | {"train_samples": 77}))
+    (folder / "conf" / "data" / "toy.yaml").write_text(
+        yaml.safe_dump(toys.DATA | {"train_samples": 77})
+    )
     for name in ("train.py", "test.py"):
         shutil.copy(ROOT / name, folder)
     return folder
@@ -53,8 +63,11 @@ def typed_for_two(project):
     environment.pop("HYDRA_FULL_ERROR", None)
     return lambda name, *words: subprocess.Popen(
         [sys.executable, str(project / f"{name}.py"), *SMALL, *TWO, *words],
-        env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
+        env=environment,
+        text=True,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+    )
 
 
 @pytest.fixture(scope="module")
@@ -84,7 +97,9 @@ def scalars(folder):
 
 
 def children_of(pid):
-    listed = subprocess.run(["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True).stdout
+    listed = subprocess.run(
+        ["ps", "-o", "pid=", "--ppid", str(pid)], capture_output=True, text=True
+    ).stdout
     return [int(word) for word in listed.split()]
 
 
@@ -102,7 +117,9 @@ def until_saved(child, folder):
 
 
 def written(folder):
-    return sorted(re.sub(r"tfevents.*", "tfevents", path.name) for path in folder.iterdir() if path.is_file())
+    return sorted(
+        re.sub(r"tfevents.*", "tfevents", path.name) for path in folder.iterdir() if path.is_file()
+    )
 
 
 def test_training_on_two_processes(trained):
@@ -116,7 +133,12 @@ def test_training_on_two_processes(trained):
     assert sorted(ours) == sorted([*written(folder), "train.log"])
     assert (other / process).read_text() == ""
     assert out == ""
-    assert [line.split()[0] for line in errors.splitlines()] == ["Validation", "weight", "Checkpoint:", "Test"]
+    assert [line.split()[0] for line in errors.splitlines()] == [
+        "Validation",
+        "weight",
+        "Checkpoint:",
+        "Test",
+    ]
 
 
 def test_testing_on_two_processes(composed, typed_for_two, tmp_path, capsys):
@@ -133,14 +155,23 @@ def test_testing_on_two_processes(composed, typed_for_two, tmp_path, capsys):
     with np.load(one / "predictions.npz") as first, np.load(two / "predictions.npz") as second:
         assert first.files == second.files
         for name in set(first.files) - {"meta"}:
-            exact = name.startswith("points_") and name.removeprefix("points_") in composed("test")["baselines"]
+            exact = (
+                name.startswith("points_")
+                and name.removeprefix("points_") in composed("test")["baselines"]
+            )
             if exact or first[name].dtype.kind != "f":
                 np.testing.assert_array_equal(first[name], second[name], err_msg=name)
             else:
-                np.testing.assert_allclose(first[name], second[name], rtol=1e-5, atol=1e-3, err_msg=name)
-    first, second = (json.loads((folder / "metrics.json").read_text())["selections"] for folder in (one, two))
+                np.testing.assert_allclose(
+                    first[name], second[name], rtol=1e-5, atol=1e-3, err_msg=name
+                )
+    first, second = (
+        json.loads((folder / "metrics.json").read_text())["selections"] for folder in (one, two)
+    )
     for name, numbers in first.items():
-        assert numbers["mpjpe_relative"] == pytest.approx(second[name]["mpjpe_relative"], rel=1e-6), name
+        assert numbers["mpjpe_relative"] == pytest.approx(
+            second[name]["mpjpe_relative"], rel=1e-6
+        ), name
 
 
 def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
@@ -153,13 +184,17 @@ def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
 
 @pytest.mark.posix
 def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
-    child = typed_for_two("train", *MODELS["pose"], "trainer.max_epochs=5000", "save_every=2", f"output={tmp_path}")
+    child = typed_for_two(
+        "train", *MODELS["pose"], "trainer.max_epochs=5000", "save_every=2", f"output={tmp_path}"
+    )
     until_saved(child, tmp_path)
     others = children_of(child.pid)
     child.send_signal(signal.SIGINT)
     _, errors = child.communicate(timeout=300)
     assert child.returncode == 130
-    assert re.match(r"Stopped\. .*last\.ckpt holds training step \d+\.\nGo on with the same command and", errors)
+    assert re.match(
+        r"Stopped\. .*last\.ckpt holds training step \d+\.\nGo on with the same command and", errors
+    )
     assert errors.count("\n") == 2
     assert others
     assert not any(alive(pid) for pid in others)
@@ -167,7 +202,9 @@ def test_an_interrupt_of_the_first_stops_both(typed_for_two, tmp_path):
 
 @pytest.mark.posix
 @pytest.mark.parametrize("dies", ["the second", "the first"])
-def test_a_killed_process_ends_both_in_a_line_and_the_training_goes_on(typed_for_two, tmp_path, dies):
+def test_a_killed_process_ends_both_in_a_line_and_the_training_goes_on(
+    typed_for_two, tmp_path, dies
+):
     """E6: not in a hang, and in less than a minute."""
     words = (*MODELS["pose"], "save_every=2", f"output={tmp_path}")
     child = typed_for_two("train", *words, "trainer.max_epochs=5000")

@@ -18,14 +18,32 @@ from ghpt.skeleton import JOINT, JOINTS, MIRROR
 CONF = Path(__file__).parents[1] / "conf" / "detector"
 RIG = human36m_rig("S9")
 PERFECT = {
-    "noise": 1e-9, "noise_seconds": 0.2, "noise_white": 0.3, "noise_slow": 0.3,
-    "noise_slow_seconds": 1.0, "joints": dict.fromkeys(KINDS, 1.0),
-    "bias": 0.0, "bias_seed": 0, "bias_of_subject": 0.3, "drift": 0.0, "drift_seconds": 1.0,
-    "occluded_noise": 1.0, "outlier_rate": 0.0, "outlier_rate_occluded": 0.0, "outlier_size": 0.03,
-    "outlier_seconds": 0.5, "swap_rate": 0.0, "swap_seconds": 0.4, "miss_rate": 0.0, "miss_rate_occluded": 0.0,
-    "miss_seconds": 0.3, "confidence_typical": 1.0, "confidence_slope": 0.5, "confidence_knowledge": 0.5,
+    "noise": 1e-9,
+    "noise_seconds": 0.2,
+    "noise_white": 0.3,
+    "noise_slow": 0.3,
+    "noise_slow_seconds": 1.0,
+    "joints": dict.fromkeys(KINDS, 1.0),
+    "bias": 0.0,
+    "bias_seed": 0,
+    "bias_of_subject": 0.3,
+    "drift": 0.0,
+    "drift_seconds": 1.0,
+    "occluded_noise": 1.0,
+    "outlier_rate": 0.0,
+    "outlier_rate_occluded": 0.0,
+    "outlier_size": 0.03,
+    "outlier_seconds": 0.5,
+    "swap_rate": 0.0,
+    "swap_seconds": 0.4,
+    "miss_rate": 0.0,
+    "miss_rate_occluded": 0.0,
+    "miss_seconds": 0.3,
+    "confidence_typical": 1.0,
+    "confidence_slope": 0.5,
+    "confidence_knowledge": 0.5,
     "familiar": 0.5,
-}  # fmt: skip
+}
 
 
 def take(action: str = "Greeting", frames: int = 600) -> np.ndarray:
@@ -75,7 +93,11 @@ def test_noise_has_the_size_asked_for_in_statures():
 def test_familiar_people_are_found_better():
     points = take()
     error = [
-        np.nanmean(np.linalg.norm(residual(points, detect(points, noise=0.005, bias=0.01, familiar=f)), axis=-1))
+        np.nanmean(
+            np.linalg.norm(
+                residual(points, detect(points, noise=0.005, bias=0.01, familiar=f)), axis=-1
+            )
+        )
         for f in (False, True)
     ]
     assert error[1] == pytest.approx(0.5 * error[0], rel=0.02)
@@ -89,10 +111,19 @@ def test_bias_turns_with_the_body_and_is_the_same_in_all_views():
     in_trunk = (trunk_frame(points).mT @ offset[:, JOINT["spine"], :, None])[..., 0]
     np.testing.assert_allclose(in_trunk, np.broadcast_to(in_trunk[0], in_trunk.shape), atol=1e-6)
     limb = points[:, JOINT["left_wrist"]] - points[:, JOINT["left_elbow"]]
-    assert np.ptp((offset[:, JOINT["left_wrist"]] * limb).sum(axis=-1) / np.linalg.norm(limb, axis=-1)) < 40
+    assert (
+        np.ptp((offset[:, JOINT["left_wrist"]] * limb).sum(axis=-1) / np.linalg.norm(limb, axis=-1))
+        < 40
+    )
     seen = residual(points, detect(points, bias=0.01))
-    expected, _ = project(RIG.cameras, torch.from_numpy(detector.shown(
-        points, detector.body_error(len(points), 50.0, 0, "S9", "S9/Greeting-1"), False)))  # fmt: skip
+    expected, _ = project(
+        RIG.cameras,
+        torch.from_numpy(
+            detector.shown(
+                points, detector.body_error(len(points), 50.0, 0, "S9", "S9/Greeting-1"), False
+            )
+        ),
+    )
     ideal, depth = project(RIG.cameras, torch.from_numpy(points))
     size = 1145.0 * stature(points) / depth[:, :, JOINT["pelvis"], None, None]
     difference = seen - ((expected - ideal) / size).numpy()
@@ -108,7 +139,9 @@ def test_the_definition_is_mirrored_between_the_sides():
 
 def facing_joints(yaw: float) -> np.ndarray:
     """A standing person in camera coordinates, 4 m away; yaw 0 faces the camera."""
-    standing = move(random_body(np.random.default_rng(0)), "Waiting", 2, 50.0, np.random.default_rng(1))
+    standing = move(
+        random_body(np.random.default_rng(0)), "Waiting", 2, 50.0, np.random.default_rng(1)
+    )
     standing = (standing - standing[:, [JOINT["pelvis"]]])[:1]
     local = (trunk_frame(standing).mT @ standing.mT).mT
     c, s = np.cos(yaw), np.sin(yaw)
@@ -117,10 +150,16 @@ def facing_joints(yaw: float) -> np.ndarray:
 
 
 def test_the_body_hides_the_nose_from_behind_and_the_far_side_from_the_side():
-    front, side, back = (occlusion(facing_joints(yaw), 1730.0)[0] for yaw in (0.0, np.pi / 2, np.pi))
+    front, side, back = (
+        occlusion(facing_joints(yaw), 1730.0)[0] for yaw in (0.0, np.pi / 2, np.pi)
+    )
     assert front[JOINT["nose"]] == 0
     assert front.mean() < 0.3
-    near, far = ("right", "left") if facing_joints(np.pi / 2)[0, JOINT["left_hip"], 2] > 4000 else ("left", "right")
+    near, far = (
+        ("right", "left")
+        if facing_joints(np.pi / 2)[0, JOINT["left_hip"], 2] > 4000
+        else ("left", "right")
+    )
     assert side[JOINT[f"{far}_hip"]] + side[JOINT[f"{far}_shoulder"]] > side[JOINT[f"{near}_hip"]]
     assert side[JOINT[f"{near}_shoulder"]] == 0
     assert back[JOINT["nose"]] > 0.3
@@ -144,7 +183,9 @@ def test_swaps_exchange_the_sides_of_legs_or_arms():
     found = detect(points, swap_rate=0.05)
     ideal = project(RIG.cameras, torch.from_numpy(points))[0].numpy()
     wrong = np.linalg.norm(found.key_points - ideal, axis=-1) > 0.5
-    legs = [JOINT[f"{side}_{part}"] for side in ("right", "left") for part in ("hip", "knee", "ankle")]
+    legs = [
+        JOINT[f"{side}_{part}"] for side in ("right", "left") for part in ("hip", "knee", "ankle")
+    ]
     mirrored = np.linalg.norm(found.key_points - ideal[:, :, list(MIRROR)], axis=-1) < 0.5
     swapped = wrong[..., legs].any(axis=-1) & found.seen[..., legs].all(axis=-1)
     assert 0.005 < swapped.mean() < 0.15
@@ -168,9 +209,18 @@ def test_confidence_knows_something_of_the_error_and_not_everything():
 
 def test_a_view_does_not_depend_on_the_other_views():
     points = take(frames=100)
-    numbers = {"noise": 0.005, "outlier_rate": 0.1, "swap_rate": 0.01, "miss_rate": 0.05, "bias": 0.01, "drift": 0.01}
+    numbers = {
+        "noise": 0.005,
+        "outlier_rate": 0.1,
+        "swap_rate": 0.01,
+        "miss_rate": 0.05,
+        "bias": 0.01,
+        "drift": 0.01,
+    }
     every = detect(points, **numbers)
-    two = Rig(RIG.names[2:0:-1], RIG.cameras.index([2, 1]), RIG.distortion[[2, 1]], RIG.size[[2, 1]])
+    two = Rig(
+        RIG.names[2:0:-1], RIG.cameras.index([2, 1]), RIG.distortion[[2, 1]], RIG.size[[2, 1]]
+    )
     some = detect(points, rig=two, **numbers)
     np.testing.assert_array_equal(some.key_points, every.key_points[:, [2, 1]])
     np.testing.assert_array_equal(some.confidence, every.confidence[:, [2, 1]])

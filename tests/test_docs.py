@@ -34,13 +34,18 @@ MAINS = {
 
 QUICK = ("trainer.accelerator=cpu", "progress_bar=false")
 SMALL = {
-    "train.py": (*QUICK, "data.train_samples=16", "model.hypotheses=8", "model.scorer.layers=[8]",
-                 "trainer.max_epochs=1"),
+    "train.py": (
+        *QUICK,
+        "data.train_samples=16",
+        "model.hypotheses=8",
+        "model.scorer.layers=[8]",
+        "trainer.max_epochs=1",
+    ),
     "test.py": (*QUICK, "data.stride=40"),
     "predict.py": (*QUICK, "evaluated_frames=8"),
     "cameras.py": ("doctor.frames=16", "doctor.shift=2"),
     "calibrate.py": ("evaluated_frames=8", "calibration.frames=40"),
-}  # fmt: skip
+}
 """What makes a command quick, where it does not say otherwise itself."""
 SMALL_PAIRS = ("model.problem.draws=1", "model.problem.frames=20")
 
@@ -67,7 +72,9 @@ def models(tmp_path_factory):
 def small(tmp_path_factory, monkeypatch):
     """Little embedded data, in a cache of its own, and a wide terminal."""
     monkeypatch.setattr(embedded, "HUMAN36M_FRAMES", {"train": 16, "validation": 16, "test": 80})
-    monkeypatch.setattr(embedded, "HUMAN36M_SUBJECTS", {"train": ("S1",), "validation": ("S8",), "test": ("S9",)})
+    monkeypatch.setattr(
+        embedded, "HUMAN36M_SUBJECTS", {"train": ("S1",), "validation": ("S8",), "test": ("S9",)}
+    )
     monkeypatch.setattr(embedded, "PANOPTIC_FRAMES", 400)
     monkeypatch.setattr(embedded, "PANOPTIC_SUBJECTS", ("P1",))
     monkeypatch.setenv("GHPT_CACHE", str(tmp_path_factory.getbasetemp() / "small"))
@@ -77,7 +84,9 @@ def small(tmp_path_factory, monkeypatch):
 class Page:
     """Runs what a page holds, in a folder that has what the page speaks of."""
 
-    def __init__(self, folder: Path, typed: Callable[..., tuple[int, str, str]], monkeypatch: Any) -> None:
+    def __init__(
+        self, folder: Path, typed: Callable[..., tuple[int, str, str]], monkeypatch: Any
+    ) -> None:
         self.folder, self.typed, self.monkeypatch = documented.workplace(folder), typed, monkeypatch
         self.conf = documented.own_conf(folder)
         self.names: dict[str, Any] = {"detect": documented.detected}
@@ -114,7 +123,9 @@ class Page:
         more = SMALL[command.script] + (SMALL_PAIRS if "model=camera" in words else ())
         words += [word for word in more if word.split("=")[0] not in given]
         main, files = MAINS[command.script]
-        output = next((word.split("=")[1].rstrip("/") for word in words if word.startswith("output=")), None)
+        output = next(
+            (word.split("=")[1].rstrip("/") for word in words if word.startswith("output=")), None
+        )
         if command.script == "train.py" and output in self.laid_out:
             shutil.rmtree(self.folder / output)  # the page's reader has no such folder yet
             self.laid_out.discard(output)
@@ -132,7 +143,9 @@ class Page:
 
 def check_pip(command: Command) -> None:
     """What it installs is there to be installed: the file of pins, the extras."""
-    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
     words = command.words[2:]
     assert command.words[1] == "install"
     for option, value in zip(words, [*words[1:], ""], strict=True):
@@ -149,7 +162,9 @@ def check_program(command: Command) -> None:
     """The program is installed, and its folders are there."""
     assert importlib.util.find_spec(command.words[0]), command.where
     paths = [word for word in command.words[1:] if not word.startswith("-") and not word.isdigit()]
-    assert all((ROOT / path).exists() for path in paths if path not in ("check", "format", "serve")), command.where
+    assert all(
+        (ROOT / path).exists() for path in paths if path not in ("check", "format", "serve")
+    ), command.where
 
 
 def check_tensorboard(command: Command) -> None:
@@ -167,11 +182,15 @@ SHELL = {
     ("mkdocs", "serve"): check_program,
     ("tensorboard",): check_tensorboard,
 }
-"""Commands that need a shell, or that this test suite is part of: how they are checked instead, by how they begin."""
+"""Commands that need a shell, or that this test suite is part of: how they are checked instead, by
+how they begin.
+"""
 
 
 def check_arguments(command: Command, monkeypatch: Any) -> None:
-    """Scripts and benchmarks of many minutes: started, and stopped when they have understood their arguments."""
+    """Scripts and benchmarks of many minutes: started, and stopped when they have understood their
+    arguments.
+    """
 
     def stop(function: Callable[..., Any]) -> Callable[..., Any]:
         def stopping(*args: Any, **kwargs: Any) -> None:
@@ -186,7 +205,9 @@ def check_arguments(command: Command, monkeypatch: Any) -> None:
         import measure
 
         patch.setattr(measure, "settings", stop(measure.settings))
-        patch.setattr(argparse.ArgumentParser, "parse_args", stop(argparse.ArgumentParser.parse_args))
+        patch.setattr(
+            argparse.ArgumentParser, "parse_args", stop(argparse.ArgumentParser.parse_args)
+        )
         patch.setattr(sys, "argv", list(command.words[1:]))
         with pytest.raises(Accepted):
             runpy.run_path(str(path), run_name="__main__")
@@ -204,14 +225,21 @@ def composed(name: str, command: Command, first: int = 2) -> None:
 
 SCRIPTS = {
     "scripts/real_recordings.py": lambda command: composed("predict", command, 3),
-    "tests/test_memory.py": lambda command: None,  # run by test_memory.py itself, with a folder and a number
+    "tests/test_memory.py": lambda command: (
+        None
+    ),  # run by test_memory.py itself, with a folder and a number
     "reproduce.py": lambda command: None,  # below; tests/test_reproduce.py runs it
 }
 """Scripts without a parser of their own."""
 
 
 def commands(page: Path) -> list[Command]:
-    fenced = [c for block in documented.blocks(page) if block.language == "bash" for c in documented.commands_of(block)]
+    fenced = [
+        c
+        for block in documented.blocks(page)
+        if block.language == "bash"
+        for c in documented.commands_of(block)
+    ]
     return [*fenced, *documented.inline_commands(page)]
 
 
@@ -222,9 +250,16 @@ for _page in PAGES:
 
 
 def wanted(command: Command, page: Path) -> bool:
-    """Whether it is to be run here: no earlier page has it, or a command of this page goes on from its output."""
-    output = next((word.split("=")[1].rstrip("/") for word in command.words if word.startswith("output=")), None)
-    again = output and any(f"={output}/" in " ".join(c.words) for c in commands(page) if c.line > command.line)
+    """Whether it is to be run here: no earlier page has it, or a command of this page goes on from
+    its output.
+    """
+    output = next(
+        (word.split("=")[1].rstrip("/") for word in command.words if word.startswith("output=")),
+        None,
+    )
+    again = output and any(
+        f"={output}/" in " ".join(c.words) for c in commands(page) if c.line > command.line
+    )
     return FIRST[command.words] == page or bool(again and output not in LAID_OUT)
 
 
@@ -250,13 +285,17 @@ def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, 
     monkeypatch.setattr(registry, "PARTS", copy.deepcopy(registry.PARTS))
     runner = Page(tmp_path, typed, monkeypatch)
     for block in documented.blocks(page):
-        assert block.language or not re.search(r"^python ", block.text, re.MULTILINE), f"{page}:{block.line}: bash?"
+        assert block.language or not re.search(r"^python ", block.text, re.MULTILINE), (
+            f"{page}:{block.line}: bash?"
+        )
         if block.language in ("python", "yaml"):
             runner.execute(block)
         elif block.language == "bash":
             for command in documented.commands_of(block):
                 attempt(runner, command, page, models)
-        elif block.language == "console":  # of a cluster or several processes; other tests run their like
+        elif (
+            block.language == "console"
+        ):  # of a cluster or several processes; other tests run their like
             for command in documented.commands_of(block):
                 check_overrides(runner.conf, Path(command.script).stem, settings_of(command))
     for command in documented.inline_commands(page):
@@ -280,7 +319,9 @@ def attempt(runner: Page, command: Command, page: Path, models: Path) -> None:
         known[0](command)
 
 
-REPRODUCE = [command for page in PAGES for command in commands(page) if command.script == "reproduce.py"]
+REPRODUCE = [
+    command for page in PAGES for command in commands(page) if command.script == "reproduce.py"
+]
 
 
 @pytest.mark.parametrize("command", REPRODUCE, ids=lambda command: command.where)

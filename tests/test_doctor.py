@@ -17,7 +17,11 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def settings(*overrides: str) -> dict:
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        return plain(hydra.compose("cameras", ["output=unused", "doctor.frames=24", "doctor.shift=4", *overrides]))
+        return plain(
+            hydra.compose(
+                "cameras", ["output=unused", "doctor.frames=24", "doctor.shift=4", *overrides]
+            )
+        )
 
 
 def test_good_cameras_end_well_and_nothing_is_mended(tmp_path):
@@ -43,4 +47,6 @@ def test_what_cannot_be_is_named(tmp_path):
     with pytest.raises(GhptConfigError, match="spoil"):
         examine(settings("data=h36m", "spoil=nothing_known"), tmp_path)
     with pytest.raises(GhptDataError, match="missing"):
-        examine(settings(f"keypoints={tmp_path}/missing", f"cameras={tmp_path}/missing.toml"), tmp_path)
+        examine(
+            settings(f"keypoints={tmp_path}/missing", f"cameras={tmp_path}/missing.toml"), tmp_path
+        )

@@ -15,7 +15,10 @@ from ghpt.geometry.cameras import project
 from ghpt.skeleton import BONES, JOINT
 
 CONF = Path(__file__).parents[1] / "conf" / "detector"
-DETECTOR = {name: Detector(**yaml.safe_load((CONF / f"{name}.yaml").read_text())) for name in ("human36m", "panoptic")}
+DETECTOR = {
+    name: Detector(**yaml.safe_load((CONF / f"{name}.yaml").read_text()))
+    for name in ("human36m", "panoptic")
+}
 
 
 def first(data: str, split: str = "test", seed: int = 0, count: int = 1, cameras=None):
@@ -32,7 +35,12 @@ def test_recordings_are_complete(human36m):
     for recording in human36m:
         frames, views, joints = len(recording), 4, 17
         assert recording.key_points.shape == (frames, views, joints, 2)
-        assert recording.key_points.dtype == recording.confidence.dtype == recording.truth.dtype == np.float32
+        assert (
+            recording.key_points.dtype
+            == recording.confidence.dtype
+            == recording.truth.dtype
+            == np.float32
+        )
         assert recording.seen.dtype == recording.truth_seen.dtype == bool
         assert np.isfinite(recording.key_points).all()
         assert recording.truth_seen.all()
@@ -52,7 +60,9 @@ def test_key_points_are_near_the_projected_truth(human36m):
 
 def test_a_subject_is_one_person_and_takes_differ(human36m):
     lengths = [
-        np.stack([np.linalg.norm(r.truth[:, a] - r.truth[:, b], axis=-1) for a, b in BONES[:6]]).mean(axis=1)
+        np.stack(
+            [np.linalg.norm(r.truth[:, a] - r.truth[:, b], axis=-1) for a, b in BONES[:6]]
+        ).mean(axis=1)
         for r in human36m
     ]
     np.testing.assert_allclose(lengths[1], lengths[0], rtol=1e-5)
@@ -62,7 +72,11 @@ def test_a_subject_is_one_person_and_takes_differ(human36m):
 
 
 def test_splits_hold_their_subjects_and_all_actions():
-    assert HUMAN36M_SUBJECTS == {"train": ("S1", "S5", "S6", "S7"), "validation": ("S8",), "test": ("S9", "S11")}
+    assert HUMAN36M_SUBJECTS == {
+        "train": ("S1", "S5", "S6", "S7"),
+        "validation": ("S8",),
+        "test": ("S9", "S11"),
+    }
     names = [r.name for r in first("h36m", "validation", count=99)]
     assert len(names) == len(set(names)) == 30
     assert len({name.split("/")[1].split("-")[0] for name in names}) == 15
@@ -79,7 +93,9 @@ def test_a_camera_sees_the_same_in_every_arrangement():
     cmu1, cmu3, alone = first("cmu1")[0], first("cmu3")[0], first("panoptic", cameras=(10, 5))[0]
     expected = cmu1.key_points[:, cmu1.camera_names.index("00_10")]
     for other in (cmu3, alone):
-        np.testing.assert_array_equal(other.key_points[:, other.camera_names.index("00_10")], expected)
+        np.testing.assert_array_equal(
+            other.key_points[:, other.camera_names.index("00_10")], expected
+        )
         np.testing.assert_array_equal(other.truth, cmu1.truth)
 
 
@@ -113,7 +129,9 @@ def test_bad_choices_are_named_at_once(data, split, cameras, error, word):
 
 
 def test_the_learning_free_rows_of_the_paper_come_out():
-    """The fit holds for the motion and the detector as they are now (scripts/fit_detector.py --check)."""
+    """The fit holds for the motion and the detector as they are now (scripts/fit_detector.py
+    --check).
+    """
     path = Path(__file__).parents[1] / "scripts" / "fit_detector.py"
     spec = importlib.util.spec_from_file_location("fit_detector", path)
     fit = importlib.util.module_from_spec(spec)

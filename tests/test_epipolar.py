@@ -34,9 +34,13 @@ def two_views(seed, frames=20):
 
 
 def images(rig, points, sigma=0.0, dtype=torch.float64):
-    """The points in both views, normalised image coordinates, from pixels of that dtype with noise (pixels)."""
+    """The points in both views, normalised image coordinates, from pixels of that dtype with noise
+    (pixels).
+    """
     pixels = project(rig, points)[0]
-    noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0), dtype=pixels.dtype)
+    noise = torch.randn(
+        pixels.shape, generator=torch.Generator().manual_seed(0), dtype=pixels.dtype
+    )
     return normalise(rig.K, (pixels + sigma * noise).to(dtype)).unbind(-3)
 
 
@@ -65,7 +69,9 @@ def batch(seeds=range(4), sigma=2.0):
 def rotated(rig):
     """The second camera at the place of the first, turned."""
     Q = vector_to_matrix(torch.tensor([0.05, 0.1, 0.02], dtype=torch.float64))
-    return Cameras(rig.K, torch.stack((rig.R[0], Q @ rig.R[0])), torch.stack((rig.t[0], Q @ rig.t[0])))
+    return Cameras(
+        rig.K, torch.stack((rig.R[0], Q @ rig.R[0])), torch.stack((rig.t[0], Q @ rig.t[0]))
+    )
 
 
 def degenerate(name, seed):
@@ -108,7 +114,9 @@ def test_an_exact_scene_gives_the_true_pose_and_depths(seed):
     length = t.norm()
     E, determined = eight_point(a, b, ones(a))
     assert determined
-    torch.testing.assert_close(torch.linalg.svdvals(E), torch.tensor([1.0, 1, 0], dtype=torch.float64))
+    torch.testing.assert_close(
+        torch.linalg.svdvals(E), torch.tensor([1.0, 1, 0], dtype=torch.float64)
+    )
     assert ((homogeneous(b) @ E) * homogeneous(a)).sum(-1).abs().max() < 1e-11
     torch.testing.assert_close(
         E / E.norm() * torch.sign((E * essential(R, t)).sum()), essential(R, t / length) / 2**0.5
@@ -147,7 +155,8 @@ def test_noisy_points_give_what_numpy_and_opencv_give(seed):
     expected = slow_eight_point(a.numpy(), b.numpy(), weights.numpy())
     torch.testing.assert_close(E * torch.sign((E * expected).sum()), expected, rtol=0, atol=1e-9)
     squared = [
-        cv2.sampsonDistance(x, y, E.numpy()) for x, y in zip(*(homogeneous(p).numpy() for p in (a, b)), strict=True)
+        cv2.sampsonDistance(x, y, E.numpy())
+        for x, y in zip(*(homogeneous(p).numpy() for p in (a, b)), strict=True)
     ]
     np.testing.assert_allclose(sampson_error(E[None], a, b)[0] ** 2, squared, rtol=1e-8)
     R, t, ok = pose_in_front(E, a, b, ones(a) > 0)
@@ -162,7 +171,9 @@ def slow_eight_point(a, b, weights):
     matrices, normalised = [], []
     for points in (a, b):
         mean = sum(w * p for w, p in zip(weights, points, strict=True)) / sum(weights)
-        distance = sum(w * np.hypot(*(p - mean)) for w, p in zip(weights, points, strict=True)) / sum(weights)
+        distance = sum(
+            w * np.hypot(*(p - mean)) for w, p in zip(weights, points, strict=True)
+        ) / sum(weights)
         s = np.sqrt(2) / distance
         T = np.array([[s, 0, -s * mean[0]], [0, s, -s * mean[1]], [0, 0, 1]])
         matrices.append(T)
@@ -184,10 +195,14 @@ def test_ray_distances_are_those_of_the_nearest_points():
     for h in range(2):
         alpha, beta = depths(Rs[h], ts[h], a, b)
         one = alpha[:, None] * (homogeneous(a) @ Rs[h].T) + ts[h]
-        torch.testing.assert_close(found[h], (one - beta[:, None] * homogeneous(b)).norm(dim=-1), rtol=1e-6, atol=1e-12)
+        torch.testing.assert_close(
+            found[h], (one - beta[:, None] * homogeneous(b)).norm(dim=-1), rtol=1e-6, atol=1e-12
+        )
 
 
-@pytest.mark.parametrize("frames", [8, 40])  # 136 correspondences, and 680, of which every third makes the median
+@pytest.mark.parametrize(
+    "frames", [8, 40]
+)  # 136 correspondences, and 680, of which every third makes the median
 def test_robust_weights_are_those_of_sampson_distances_under_geman_and_mcclure(frames):
     a, b = images(*two_views(4, frames), sigma=3)
     E = essential(*(x[None] for x in relative(two_views(4)[0])))
@@ -199,7 +214,9 @@ def test_robust_weights_are_those_of_sampson_distances_under_geman_and_mcclure(f
     expected = torch.where(used, (r / residual) ** 2 / (1 + (r / scale) ** 2) ** 2, 0.0)
     found = robust_weights(E, a, b, used)
     torch.testing.assert_close(found[0], expected / expected.max(), rtol=1e-7, atol=0)
-    torch.testing.assert_close(robust_weights(2 * E.expand(3, 3, 3), a, b, used), found.expand(3, -1))
+    torch.testing.assert_close(
+        robust_weights(2 * E.expand(3, 3, 3), a, b, used), found.expand(3, -1)
+    )
 
 
 def test_robust_weights_of_nothing_are_0():
@@ -224,7 +241,9 @@ def test_the_resolution_is_nothing():
     rig, points = two_views(1)
     pixels = project(rig, points)[0]
     zoom = torch.tensor([4.0, 4.0, 1.0], dtype=torch.float64).diag()
-    torch.testing.assert_close(normalise(zoom @ rig.K, 4 * pixels), normalise(rig.K, pixels), rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        normalise(zoom @ rig.K, 4 * pixels), normalise(rig.K, pixels), rtol=0, atol=1e-14
+    )
 
 
 def test_exchanging_the_views_gives_the_inverse_pose():
@@ -237,7 +256,9 @@ def test_exchanging_the_views_gives_the_inverse_pose():
 
 def test_a_batch_is_a_stack_of_singles():
     a, b = batch()
-    weights = torch.rand(a.shape[:-1], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    weights = torch.rand(
+        a.shape[:-1], generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
     together = solve(a.reshape(2, 2, -1, 2), b.reshape(2, 2, -1, 2), weights.reshape(2, 2, -1))
     for i in range(4):
         for x, y in zip(solve(a[i], b[i], weights[i]), together, strict=True):
@@ -258,10 +279,16 @@ def test_hypotheses_are_a_batch():
         for h in range(30):
             E1, ok1 = eight_point(a[i], b[i], subsets[i, h].double())
             assert ok[i, h] == ok1 == (h != 20)
-            # all subsets share one normalisation, which weighs the equations of more than 8 points a little differently
+            # all subsets share one normalisation, which weighs the equations of more than 8 points
+            # a little differently
             tolerance = 1e-7 if h < 10 else 0.02
-            torch.testing.assert_close(E[i, h] * torch.sign((E[i, h] * E1).sum()), E1, rtol=0, atol=tolerance)
-            found, expected = (R[i, h], t[i, h], front[i, h]), slow_pose(E[i, h], a[i], b[i], subsets[i, h] & ok1)
+            torch.testing.assert_close(
+                E[i, h] * torch.sign((E[i, h] * E1).sum()), E1, rtol=0, atol=tolerance
+            )
+            found, expected = (
+                (R[i, h], t[i, h], front[i, h]),
+                slow_pose(E[i, h], a[i], b[i], subsets[i, h] & ok1),
+            )
             for x, y in zip(found, expected, strict=True):
                 torch.testing.assert_close(x, y, rtol=0, atol=1e-12)
             one = ray_distances(R[i, h][None], t[i, h][None], a[i], b[i])[0]
@@ -330,11 +357,18 @@ def test_a_person_in_3d_is_never_masked(frames):
 
 
 def test_a_small_person_s_float32_pixels_are_judged_rightly():
-    """In float32 a person of 50 pixels at the far corner of a full-HD image is rounded at 1e-6 of its size."""
+    """In float32 a person of 50 pixels at the far corner of a full-HD image is rounded at 1e-6 of
+    its size.
+    """
     rig, points = two_views(0)
     shift = torch.tensor([[1.0, 0, 1800], [0, 1, 1000], [0, 0, 1]], dtype=torch.float64)
     K = shift @ torch.tensor([0.1, 0.1, 1.0], dtype=torch.float64).diag() @ rig.K
-    for name, expected in (("honest", True), ("plane", False), ("rotation", False), ("line", False)):
+    for name, expected in (
+        ("honest", True),
+        ("plane", False),
+        ("rotation", False),
+        ("line", False),
+    ):
         rig, points = degenerate(name, 0)
         a, b = images(Cameras(K, rig.R, rig.t), points, dtype=torch.float32)
         assert eight_point(a, b, ones(a))[1] == expected
@@ -343,7 +377,11 @@ def test_a_small_person_s_float32_pixels_are_judged_rightly():
 def test_minimal_samples_are_hardly_ever_masked():
     for seed in range(4):
         a, b = images(*two_views(seed), sigma=3)
-        chosen = torch.rand(500, len(a), generator=torch.Generator().manual_seed(seed)).topk(8, dim=-1).indices
+        chosen = (
+            torch.rand(500, len(a), generator=torch.Generator().manual_seed(seed))
+            .topk(8, dim=-1)
+            .indices
+        )
         ok = eight_point(a[chosen], b[chosen], ones(a[chosen]))[1]
         assert ok.double().mean() > 0.99
 
@@ -352,14 +390,26 @@ def bad_pairs():
     """Correspondences and weights that determine nothing, each in place of one pair of a batch."""
     a, b = batch([7])
     n = a.shape[1]
-    cases = {name: images(*degenerate(name, 7)) for name in ("plane", "line", "identical", "rotation")}
+    cases = {
+        name: images(*degenerate(name, 7)) for name in ("plane", "line", "identical", "rotation")
+    }
     for name, (x, y) in cases.items():
         yield name, x, y, torch.ones(n, dtype=torch.float64)
     yield "all NaN", torch.full_like(a[0], torch.nan), b[0], torch.ones(n, dtype=torch.float64)
     yield "infinite", torch.full_like(a[0], torch.inf), b[0], torch.ones(n, dtype=torch.float64)
     yield "huge", a[0] * 1e200, b[0], torch.ones(n, dtype=torch.float64)
-    yield "one place", a[0, :1].expand(n, 2), b[0, :1].expand(n, 2), torch.ones(n, dtype=torch.float64)
-    for name, value in (("no weight", 0.0), ("negative", -1.0), ("NaN", torch.nan), ("infinite weights", torch.inf)):
+    yield (
+        "one place",
+        a[0, :1].expand(n, 2),
+        b[0, :1].expand(n, 2),
+        torch.ones(n, dtype=torch.float64),
+    )
+    for name, value in (
+        ("no weight", 0.0),
+        ("negative", -1.0),
+        ("NaN", torch.nan),
+        ("infinite weights", torch.inf),
+    ):
         yield name, a[0], b[0], torch.full((n,), value, dtype=torch.float64)
     yield "seven", a[0], b[0], (torch.arange(n) < 7).double()
 
@@ -404,7 +454,9 @@ def test_parallel_rays_have_no_depth():
 def test_no_points_in_front_of_any_give_no_pose():
     a, b = batch([0])
     R, t = relative(two_views(0)[0])
-    Rf, tf, ok = pose_in_front(essential(R, t)[None], a, b, torch.zeros(a.shape[:-1], dtype=torch.bool))
+    Rf, tf, ok = pose_in_front(
+        essential(R, t)[None], a, b, torch.zeros(a.shape[:-1], dtype=torch.bool)
+    )
     assert not ok
     assert torch.equal(Rf[0], EYE)
     assert torch.equal(tf[0], ZERO)

@@ -11,7 +11,13 @@ from ghpt.recording import PoseEstimate, Recording
 from ghpt.skeleton import JOINTS, PELVIS, SIX_JOINTS
 
 TAKES = ("S9/Greeting-2", "S9/Greeting-1", "S11/Walking-1", "S11/Eating-1")
-META = {"data": "h36m", "source": "embedded", "split": "test", "seed": 7, "provenance": {"commit": "abc"}}
+META = {
+    "data": "h36m",
+    "source": "embedded",
+    "split": "test",
+    "seed": 7,
+    "provenance": {"commit": "abc"},
+}
 MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 
 
@@ -20,8 +26,20 @@ def recording(name: str) -> Recording:
     cameras = Cameras(torch.zeros(2, 3, 3), torch.zeros(2, 3, 3), torch.zeros(2, 3))
     views, mask = np.zeros((0, 2, 17, 2), np.float32), np.zeros((0, 2, 17), bool)
     subject, action = name.split("/")
-    return Recording(name, subject, action.split("-")[0], 50.0, ("a", "b"), cameras, views, views[..., 0], mask,
-                     np.zeros((0, 17, 3), np.float32), mask[:, 0], np.zeros(0, np.int64))  # fmt: skip
+    return Recording(
+        name,
+        subject,
+        action.split("-")[0],
+        50.0,
+        ("a", "b"),
+        cameras,
+        views,
+        views[..., 0],
+        mask,
+        np.zeros((0, 17, 3), np.float32),
+        mask[:, 0],
+        np.zeros(0, np.int64),
+    )
 
 
 def content(count: int = 60, takes: int = len(TAKES)) -> dict:
@@ -30,14 +48,20 @@ def content(count: int = 60, takes: int = len(TAKES)) -> dict:
     recording = torch.arange(count) % takes
     noise = torch.where(recording == 0, 100.0, 10.0)[:, None, None]
     estimates = {
-        name: PoseEstimate(truth + (i + 1) * noise * torch.randn(count, 17, 3, generator=g),
-                           torch.rand(count, 17, generator=g) > 0.1)
+        name: PoseEstimate(
+            truth + (i + 1) * noise * torch.randn(count, 17, 3, generator=g),
+            torch.rand(count, 17, generator=g) > 0.1,
+        )
         for i, name in enumerate(("linear", "worst", "weight"))
-    }  # fmt: skip
+    }
     return {
-        "estimates": estimates, "truth": truth, "truth_seen": torch.rand(count, 17, generator=g) > 0.1,
-        "recording": recording, "frame": torch.arange(count), "weights": {w: torch.zeros(count) for w in WEIGHTS},
-    }  # fmt: skip
+        "estimates": estimates,
+        "truth": truth,
+        "truth_seen": torch.rand(count, 17, generator=g) > 0.1,
+        "recording": recording,
+        "frame": torch.arange(count),
+        "weights": {w: torch.zeros(count) for w in WEIGHTS},
+    }
 
 
 def predictions(tmp_path, values: dict, takes=TAKES):
@@ -64,13 +88,19 @@ def test_numbers_equal_numpy_on_the_same_arrays(tmp_path):
     for name, numbers in metrics["selections"].items():
         errors = relative(values, name)
         assert numbers["mpjpe_relative"] == pytest.approx(np.nanmean(errors), rel=1e-6)
-        assert numbers["mpjpe_6_joints"] == pytest.approx(np.nanmean(errors[:, SIX_JOINTS]), rel=1e-6)
+        assert numbers["mpjpe_6_joints"] == pytest.approx(
+            np.nanmean(errors[:, SIX_JOINTS]), rel=1e-6
+        )
         assert numbers["per_joint"]["left_wrist"] == pytest.approx(
             np.nanmean(errors[:, JOINTS.index("left_wrist")]), rel=1e-6
         )
-        assert numbers["per_action"]["Greeting"] == pytest.approx(np.nanmean(errors[recording <= 1]), rel=1e-6)
+        assert numbers["per_action"]["Greeting"] == pytest.approx(
+            np.nanmean(errors[recording <= 1]), rel=1e-6
+        )
         sound = errors[recording != 0]
-        assert numbers["without_damaged"]["mpjpe_relative"] == pytest.approx(np.nanmean(sound), rel=1e-6)
+        assert numbers["without_damaged"]["mpjpe_relative"] == pytest.approx(
+            np.nanmean(sound), rel=1e-6
+        )
         estimated, seen = values["estimates"][name].estimated, values["truth_seen"]
         assert numbers["coverage"] == (estimated & seen).sum().item() / seen.sum().item()
         assert numbers["mpjpe_aligned"] < numbers["mpjpe_relative"]
@@ -78,17 +108,38 @@ def test_numbers_equal_numpy_on_the_same_arrays(tmp_path):
 
 def test_form_is_the_documented_one(tmp_path):
     metrics = evaluate(predictions(tmp_path, content()))
-    assert list(metrics) == ["format_version", "data", "source", "split", "frames", "seed", "provenance", "selections"]
+    assert list(metrics) == [
+        "format_version",
+        "data",
+        "source",
+        "split",
+        "frames",
+        "seed",
+        "provenance",
+        "selections",
+    ]
     assert metrics["frames"] == 60
     assert metrics["seed"] == 7
     assert list(metrics["selections"]) == ["weight", "worst", "linear"]
     for numbers in metrics["selections"].values():
-        assert list(numbers) == [*MEANS, "coverage", "per_joint", "per_action", "pose_prior", "without_damaged"]
+        assert list(numbers) == [
+            *MEANS,
+            "coverage",
+            "per_joint",
+            "per_action",
+            "pose_prior",
+            "without_damaged",
+        ]
         assert list(numbers["without_damaged"]) == list(MEANS)
         assert list(numbers["pose_prior"]) == ["S11", "S9"]
         assert set(numbers["pose_prior"]["S9"]) == {
-            "upper_arm", "lower_arm", "shoulder", "hip", "upper_leg", "lower_leg"
-        }  # fmt: skip
+            "upper_arm",
+            "lower_arm",
+            "shoulder",
+            "hip",
+            "upper_leg",
+            "lower_leg",
+        }
     assert len(NAMES) == 15
 
 

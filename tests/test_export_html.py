@@ -1,4 +1,6 @@
-"""The page's data, its player's logic in Node, and the page itself in a headless browser, where these are installed."""
+"""The page's data, its player's logic in Node, and the page itself in a headless browser, where
+these are installed.
+"""
 
 import json
 import re
@@ -52,11 +54,27 @@ def data_of(text):
 
 
 def in_browser(path, *options):
-    browser = next((found for name in ("chromium", "google-chrome", "chrome") if (found := shutil.which(name))), None)
+    browser = next(
+        (
+            found
+            for name in ("chromium", "google-chrome", "chrome")
+            if (found := shutil.which(name))
+        ),
+        None,
+    )
     if browser is None:
         pytest.skip("no browser: chromium or google-chrome")
-    command = [browser, "--headless=new", "--no-sandbox", "--disable-gpu", "--window-size=900,700", *options]
-    run = subprocess.run([*command, f"{path.as_uri()}"], capture_output=True, text=True, timeout=300, check=True)
+    command = [
+        browser,
+        "--headless=new",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--window-size=900,700",
+        *options,
+    ]
+    run = subprocess.run(
+        [*command, f"{path.as_uri()}"], capture_output=True, text=True, timeout=300, check=True
+    )
     return run.stdout
 
 
@@ -94,7 +112,9 @@ def test_up_is_the_body_s(tmp_path):
         assert (turn @ up)[2] == 50
         torch.testing.assert_close(turn @ turn.T, torch.eye(3, dtype=torch.float64))
         assert torch.linalg.det(turn) == 1
-    assert torch.equal(to_z_up(torch.zeros(3, dtype=torch.float64)), torch.eye(3, dtype=torch.float64))
+    assert torch.equal(
+        to_z_up(torch.zeros(3, dtype=torch.float64)), torch.eye(3, dtype=torch.float64)
+    )
 
 
 def test_the_corners_of_a_frustum_are_the_image_s():
@@ -116,7 +136,9 @@ def test_the_player_s_logic(tmp_path):
     (tmp_path / "logic.js").write_text(LOGIC, encoding="utf-8")
     player = resources.files("ghpt.export") / "player.js"
     command = [node, tmp_path / "logic.js", str(player), tmp_path / "poses.html"]
-    found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout)
+    found = json.loads(
+        subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
+    )
     assert found["count"] == 6
     for t, joints in enumerate(found["drawn"]):
         placed = torch.nonzero(made.placed[t])[:, 0].tolist()
@@ -130,10 +152,14 @@ def test_the_player_s_logic(tmp_path):
 
 
 def test_the_page_in_a_browser_draws_observed_filled_and_nothing_missing(tmp_path):
-    """Blue for the left side, orange for the right one, hollow or not, and no colour in a frame without joints."""
+    """Blue for the left side, orange for the right one, hollow or not, and no colour in a frame
+    without joints.
+    """
     made = random_reconstruction(3, missing=0.0)
     state = torch.full_like(made.state, State.FEW_VIEWS)
-    left = [JOINT[f"left_{joint}"] for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")]
+    left = [
+        JOINT[f"left_{joint}"] for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+    ]
     state[0, left] = State.OBSERVED
     state[1, [JOINT["right_hip"], JOINT["right_knee"], JOINT["right_ankle"]]] = State.FILLED
     page(tmp_path, replace(made, state=state), scene=scene())
@@ -141,8 +167,12 @@ def test_the_page_in_a_browser_draws_observed_filled_and_nothing_missing(tmp_pat
     for frame in range(3):
         shot = tmp_path / f"{frame}.png"
         copy = tmp_path / f"{frame}.html"
-        copy.write_text((tmp_path / "poses.html").read_text(encoding="utf-8").replace(
-            "window.location.hash", f'"#frame={frame}"'), encoding="utf-8")  # fmt: skip
+        copy.write_text(
+            (tmp_path / "poses.html")
+            .read_text(encoding="utf-8")
+            .replace("window.location.hash", f'"#frame={frame}"'),
+            encoding="utf-8",
+        )
         in_browser(copy, f"--screenshot={shot}", "--virtual-time-budget=2000")
         image = np.round(matplotlib.image.imread(shot)[:500, :, :3] * 255).astype(int)
         near = [np.abs(image - colour).max(-1) < 12 for colour in ((0, 114, 178), (213, 94, 0))]

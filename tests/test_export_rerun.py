@@ -28,11 +28,20 @@ def test_the_recording_has_cameras_rays_key_points_joints_and_hypotheses(tmp_pat
     parts = [Evidence(*(value[a:b] for value in evidence)) for a, b in ((0, 7), (7, 20))]
     scene = Scene(rig(3), lambda: iter(parts))
     WRITERS["rerun"].write(
-        tmp_path / "poses.rrd", about(cameras=("a/b", "..", "c d")), in_parts(part(made, 0, 7), part(made, 7, 20)),
+        tmp_path / "poses.rrd",
+        about(cameras=("a/b", "..", "c d")),
+        in_parts(part(made, 0, 7), part(made, 7, 20)),
         scene=scene,
-    )  # fmt: skip
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["poses.rrd"]
     command = [sys.executable, "-m", "rerun_cli", "rrd", "stats", str(tmp_path / "poses.rrd")]
     stats = subprocess.run(command, capture_output=True, text=True, check=True, timeout=300).stdout
-    for entity in ("/world/joints", "/world/bones", "/world/hypotheses", "/world/rays/", "key_points", "reprojected"):
+    for entity in (
+        "/world/joints",
+        "/world/bones",
+        "/world/hypotheses",
+        "/world/rays/",
+        "key_points",
+        "reprojected",
+    ):
         assert entity in stats

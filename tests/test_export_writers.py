@@ -29,7 +29,9 @@ def trc_points(path):
 
 def test_pieces_are_bounded_and_lose_nothing(tmp_path):
     made = random_reconstruction(PIECE + 10, joints=1)
-    found = list(pieces(tmp_path, about(("a",)), in_parts(part(made, 0, 3), part(made, 3, len(made)))))
+    found = list(
+        pieces(tmp_path, about(("a",)), in_parts(part(made, 0, 3), part(made, 3, len(made))))
+    )
     assert [len(piece) for piece in found] == [3, PIECE, 7]
     assert torch.equal(torch.cat([piece.points for piece in found]), made.points)
 
@@ -42,7 +44,10 @@ def test_absent_frames_are_rows_without_joints_where_rows_are_equally_spaced(tmp
     full = list(without_gaps(tmp_path, who, chunks, extent(tmp_path, who, chunks)))
     frames = torch.cat([piece.frame for piece in full])
     assert frames.tolist() == list(range(5, 35))
-    points, state = torch.cat([piece.points for piece in full]), torch.cat([piece.state for piece in full])
+    points, state = (
+        torch.cat([piece.points for piece in full]),
+        torch.cat([piece.state for piece in full]),
+    )
     assert torch.equal(points[keep], gappy.points)
     absent = torch.ones(30, dtype=torch.bool)
     absent[keep] = False
@@ -70,7 +75,9 @@ def test_frames_that_do_not_rise_are_refused_and_nothing_is_left(tmp_path, forma
     with pytest.raises(GhptDataError, match="frame: 0 comes after 3"):
         WRITERS[format].write(tmp_path / "file", about(), in_parts(made, made))
     with pytest.raises(GhptDataError, match="3 and 17 in name, 2 and 17 in number"):
-        WRITERS[format].write(tmp_path / "file", about(), in_parts(random_reconstruction(4, views=2)))
+        WRITERS[format].write(
+            tmp_path / "file", about(), in_parts(random_reconstruction(4, views=2))
+        )
     assert list(tmp_path.iterdir()) == []
 
 
@@ -93,7 +100,9 @@ def test_the_world_s_up_becomes_y_by_a_rotation(tmp_path, up):
     WRITERS["trc"].write(tmp_path / "poses.trc", about(), in_parts(made), world_up=up)
     _, found = trc_points(tmp_path / "poses.trc")
     own = made.points.numpy().astype(float)
-    np.testing.assert_allclose(found[..., 1], own[..., "xyz".index(up[-1])] * (-1 if "-" in up else 1), atol=1e-4)
+    np.testing.assert_allclose(
+        found[..., 1], own[..., "xyz".index(up[-1])] * (-1 if "-" in up else 1), atol=1e-4
+    )
     turn = np.linalg.lstsq(own.reshape(-1, 3), found.reshape(-1, 3), rcond=None)[0]
     np.testing.assert_allclose(turn @ turn.T, np.eye(3), atol=1e-6)
     assert np.linalg.det(turn) == pytest.approx(1.0)
@@ -122,7 +131,9 @@ def test_nothing_missing_is_placed_after_any_round_trip(tmp_path):
 
 
 def found_out(path):
-    """Whether reading raises the named error; what it raises else is passed on, and what it reads must be right."""
+    """Whether reading raises the named error; what it raises else is passed on, and what it reads
+    must be right.
+    """
     try:
         who, parts = read_reconstruction(path)
         assert len(list(parts)) == 1

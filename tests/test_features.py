@@ -2,18 +2,27 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ghpt.models.pose.features import body_part_lengths, centre_on_pelvis, normalised_coordinates, torso_normal_to_z
+from ghpt.models.pose.features import (
+    body_part_lengths,
+    centre_on_pelvis,
+    normalised_coordinates,
+    torso_normal_to_z,
+)
 from ghpt.skeleton import BONES, JOINT, PELVIS
 
 ALL = torch.ones(5, 17, dtype=torch.bool)
 
 
 def poses(seed=0):
-    return 300 * torch.randn(5, 17, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    return 300 * torch.randn(
+        5, 17, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(seed)
+    )
 
 
 def normal(points):
-    left, right, pelvis = (points[..., JOINT[n], :] for n in ("left_shoulder", "right_shoulder", "pelvis"))
+    left, right, pelvis = (
+        points[..., JOINT[n], :] for n in ("left_shoulder", "right_shoulder", "pelvis")
+    )
     return torch.nn.functional.normalize(torch.linalg.cross(right - left, pelvis - left), dim=-1)
 
 
@@ -28,9 +37,13 @@ def test_normal_meets_z_and_nothing_is_deformed():
 def test_invariant_to_translation_and_equivariant_lengths():
     x = poses()
     shift = torch.tensor([1e4, -5e3, 77.0]).double()
-    torch.testing.assert_close(normalised_coordinates(x + shift, ALL), normalised_coordinates(x, ALL))
+    torch.testing.assert_close(
+        normalised_coordinates(x + shift, ALL), normalised_coordinates(x, ALL)
+    )
     turn = torch.from_numpy(Rotation.random(None, 3).as_matrix())
-    torch.testing.assert_close(body_part_lengths(x @ turn.T + shift, ALL), body_part_lengths(x, ALL))
+    torch.testing.assert_close(
+        body_part_lengths(x @ turn.T + shift, ALL), body_part_lengths(x, ALL)
+    )
 
 
 def test_a_turn_about_z_of_an_upright_normal_only_turns_the_coordinates():
@@ -41,7 +54,9 @@ def test_a_turn_about_z_of_an_upright_normal_only_turns_the_coordinates():
 
 
 def test_opposite_and_collinear_cases_give_a_rotation():
-    flipped = normalised_coordinates(poses(), ALL).reshape(5, 17, 3) * torch.tensor([1.0, -1.0, -1.0])
+    flipped = normalised_coordinates(poses(), ALL).reshape(5, 17, 3) * torch.tensor(
+        [1.0, -1.0, -1.0]
+    )
     turn = torso_normal_to_z(flipped, ALL)
     eye = torch.eye(3, dtype=torch.float64).expand(5, 3, 3)
     torch.testing.assert_close(turn @ turn.mT, eye)
@@ -62,9 +77,14 @@ def test_a_missing_joint_is_zero_and_its_value_does_not_matter(missing):
     for describe in (normalised_coordinates, body_part_lengths):
         torch.testing.assert_close(describe(x, seen), describe(other, seen))
         assert torch.isfinite(describe(x, seen)).all()
-    assert torch.equal(normalised_coordinates(x, seen).reshape(5, 17, 3)[:, JOINT[missing]], torch.zeros(5, 3).double())
+    assert torch.equal(
+        normalised_coordinates(x, seen).reshape(5, 17, 3)[:, JOINT[missing]],
+        torch.zeros(5, 3).double(),
+    )
     touching = [i for i, bone in enumerate(BONES) if JOINT[missing] in bone]
-    assert torch.equal(body_part_lengths(x, seen)[:, touching], torch.zeros(5, len(touching)).double())
+    assert torch.equal(
+        body_part_lengths(x, seen)[:, touching], torch.zeros(5, len(touching)).double()
+    )
 
 
 def test_without_a_pelvis_the_mean_of_the_others_is_the_origin():

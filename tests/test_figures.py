@@ -17,13 +17,24 @@ from ghpt.report.tensorboard import SHOWN, write_events
 from ghpt.skeleton import JOINT, JOINTS, PELVIS
 
 STANDING = {
-    "right_ankle": (-110, 0, 80), "right_knee": (-120, -60, 480), "right_hip": (-130, 0, 920),
-    "left_hip": (130, 0, 920), "left_knee": (130, -180, 520), "left_ankle": (120, -40, 140),
-    "pelvis": (0, 0, 920), "spine": (0, -20, 1150), "thorax": (0, -10, 1420), "head_top": (0, -20, 1690),
-    "right_wrist": (-330, 150, 1000), "right_elbow": (-290, 0, 1150), "right_shoulder": (-170, 0, 1400),
-    "left_shoulder": (170, 0, 1400), "left_elbow": (300, -50, 1180), "left_wrist": (280, -280, 1240),
+    "right_ankle": (-110, 0, 80),
+    "right_knee": (-120, -60, 480),
+    "right_hip": (-130, 0, 920),
+    "left_hip": (130, 0, 920),
+    "left_knee": (130, -180, 520),
+    "left_ankle": (120, -40, 140),
+    "pelvis": (0, 0, 920),
+    "spine": (0, -20, 1150),
+    "thorax": (0, -10, 1420),
+    "head_top": (0, -20, 1690),
+    "right_wrist": (-330, 150, 1000),
+    "right_elbow": (-290, 0, 1150),
+    "right_shoulder": (-170, 0, 1400),
+    "left_shoulder": (170, 0, 1400),
+    "left_elbow": (300, -50, 1180),
+    "left_wrist": (280, -280, 1240),
     "nose": (0, -110, 1560),
-}  # fmt: skip
+}
 PERSON = np.array([STANDING[joint] for joint in JOINTS], float)
 """Faces -y; z is up."""
 META = {"data": "h36m", "source": "embedded", "split": "test", "seed": 0, "provenance": {}}
@@ -33,13 +44,27 @@ def run(tmp_path, with_truth: bool = True):
     """Predictions of 40 frames, and their metrics."""
     cameras = Cameras(torch.zeros(2, 3, 3), torch.zeros(2, 3, 3), torch.zeros(2, 3))
     views, mask = np.zeros((0, 2, 17, 2), np.float32), np.zeros((0, 2, 17), bool)
-    take = Recording("S9/Eating", "S9", "Eating", 50.0, ("a", "b"), cameras, views, views[..., 0], mask,
-                     np.zeros((0, 17, 3), np.float32), mask[:, 0], np.zeros(0, np.int64))  # fmt: skip
+    take = Recording(
+        "S9/Eating",
+        "S9",
+        "Eating",
+        50.0,
+        ("a", "b"),
+        cameras,
+        views,
+        views[..., 0],
+        mask,
+        np.zeros((0, 17, 3), np.float32),
+        mask[:, 0],
+        np.zeros(0, np.int64),
+    )
     g = torch.Generator().manual_seed(0)
     truth = torch.from_numpy(PERSON).float().expand(40, 17, 3) + torch.arange(40)[:, None, None]
     writer = PredictionWriter(tmp_path / "rows", 40, SHOWN)
     estimates = {
-        name: PoseEstimate(truth + 20 * torch.randn(40, 17, 3, generator=g), torch.rand(40, 17, generator=g) > 0.02)
+        name: PoseEstimate(
+            truth + 20 * torch.randn(40, 17, 3, generator=g), torch.rand(40, 17, generator=g) > 0.02
+        )
         for name in SHOWN
     }
     seen = torch.full((40, 17), with_truth)
@@ -64,7 +89,9 @@ def test_view_shows_a_person_from_the_front_and_upright_in_any_world():
         images.append((person - person[PELVIS]) @ view.T)
     for image in images:
         np.testing.assert_allclose(image, images[0], atol=1e-9)
-    assert images[0][JOINT["left_shoulder"], 0] > images[0][JOINT["right_shoulder"], 0]  # facing the viewer
+    assert (
+        images[0][JOINT["left_shoulder"], 0] > images[0][JOINT["right_shoulder"], 0]
+    )  # facing the viewer
     assert images[0][JOINT["head_top"], 1] > 700
 
 
@@ -75,7 +102,12 @@ def test_skeletons_say_the_3d_error_and_draw_what_is_there():
     partial[JOINT["left_knee"]] = PERSON[JOINT["left_knee"]]
     poses = {"weight": moved, "most": partial, "least": np.full((17, 3), np.nan)}
     figure = figures.skeletons(PERSON, poses, np.array([0.0, 0, 1]), "heading")
-    assert [axes.get_title() for axes in figure.axes] == ["truth", "weight\n10.0 mm", "most\n0.0 mm", "least\nmissing"]
+    assert [axes.get_title() for axes in figure.axes] == [
+        "truth",
+        "weight\n10.0 mm",
+        "most\n0.0 mm",
+        "least\nmissing",
+    ]
     bones = [sum(len(c.get_segments()) for c in axes.collections) for axes in figure.axes]
     assert bones == [16, 32, 16, 16]
     assert {axes.get_xlim() for axes in figure.axes} == {figure.axes[0].get_xlim()}
@@ -118,7 +150,9 @@ def test_events_hold_the_numbers_of_metrics_json(tmp_path):
     assert set(tags["images"]) == {"skeletons", "pose_prior/S9"}
     assert set(tags["histograms"]) == {f"weights/{summary}" for summary in WEIGHTS}
     entropy = predictions.read(0, 40).weights["entropy"]
-    assert events.Scalars("weights/entropy")[0].value == pytest.approx(entropy.mean().item(), rel=1e-6)
+    assert events.Scalars("weights/entropy")[0].value == pytest.approx(
+        entropy.mean().item(), rel=1e-6
+    )
     assert "final/weight" in tags["scalars"]
     assert any(tag.startswith("_hparams_") for tag in events.summary_metadata)
 

@@ -57,7 +57,9 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
 
 
 def test_only_what_dead_writers_left_is_swept(tmp_path):
-    child = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True)
+    child = subprocess.run(
+        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
+    )
     dead = tmp_path / f".a.{files._HOST}-{int(child.stdout)}-00000000.tmp"
     alive = tmp_path / f".a.{files._HOST}-{os.getpid()}-00000000.tmp"
     elsewhere = tmp_path / f".a.other-machine-{int(child.stdout)}-00000000.tmp"
@@ -78,8 +80,8 @@ def test_nothing_else_in_the_package_writes_files():
         r"""np\.savez?|torch\.save\(|\.to_csv\(|write_text\(|write_bytes\(|open\([^)]*["'][wax]b?\+?["']"""
     )
     package = Path(files.__file__).parent
-    # the writer; into atomic_write's handle; torch.save into memory; the files of an atomic_folder; rows that
-    # finish() zips through atomic_write
+    # the writer; into atomic_write's handle; torch.save into memory; the files of an atomic_folder;
+    # rows that finish() zips through atomic_write
     allowed = {
         "files.py": 1,
         "data/formats/own_npz.py": 1,

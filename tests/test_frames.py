@@ -42,9 +42,13 @@ def test_a_batch_is_its_frames(recordings):
     for row, (r, t) in enumerate(places):
         assert batch.recording[row] == r
         for field in ("key_points", "confidence", "seen", "truth", "truth_seen"):
-            np.testing.assert_array_equal(getattr(batch, field)[row], getattr(recordings[r], field)[t])
+            np.testing.assert_array_equal(
+                getattr(batch, field)[row], getattr(recordings[r], field)[t]
+            )
         assert torch.equal(batch.cameras.K[row], recordings[r].cameras.K)
-    np.testing.assert_array_equal(frames.frame_numbers(range(5)), [recordings[r].frame[t] for r, t in places])
+    np.testing.assert_array_equal(
+        frames.frame_numbers(range(5)), [recordings[r].frame[t] for r, t in places]
+    )
     assert len(frames[[]]) == 0
     assert frames[[]].key_points.shape == (0, 3, 17, 2)
 
@@ -63,7 +67,9 @@ def test_trainable_needs_the_pelvis_and_enough_joints(recordings):
 @pytest.mark.parametrize("count", [97, 96, 5, 1])
 @pytest.mark.parametrize("world", [1, 2, 3])
 def test_every_sample_once_in_the_same_global_batches_on_any_number_of_processes(count, world):
-    orders = [list(BatchOrder(count, 16, rank, world, seed=3, done=lambda: 0)) for rank in range(world)]
+    orders = [
+        list(BatchOrder(count, 16, rank, world, seed=3, done=lambda: 0)) for rank in range(world)
+    ]
     alone = list(BatchOrder(count, 16, 0, 1, seed=3, done=lambda: 0))
     assert {len(o) for o in orders} == {len(alone)}
     for batch, *shares in zip(alone, *orders, strict=True):
@@ -72,7 +78,9 @@ def test_every_sample_once_in_the_same_global_batches_on_any_number_of_processes
 
 
 def test_the_order_goes_on_where_training_stopped():
-    whole = [batch for epoch in range(3) for batch in BatchOrder(40, 16, 0, 1, 5, lambda e=epoch: 3 * e)]
+    whole = [
+        batch for epoch in range(3) for batch in BatchOrder(40, 16, 0, 1, 5, lambda e=epoch: 3 * e)
+    ]
     assert whole[:3] != whole[3:6]
     for done in range(9):
         rest = list(BatchOrder(40, 16, 0, 1, 5, lambda d=done: d))

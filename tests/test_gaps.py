@@ -1,4 +1,6 @@
-"""Filling and smoothing: only on request, only between what was observed, the same however it is cut up."""
+"""Filling and smoothing: only on request, only between what was observed, the same however it is
+cut up.
+"""
 
 from dataclasses import replace
 
@@ -112,7 +114,9 @@ def test_runs_end_where_a_number_is_left_out():
     assert runs(np.arange(3), np.zeros(3, bool), 1) == []
 
 
-@pytest.mark.parametrize("gaps", [filling(3, "pchip"), smoothing(5.0), Gaps(3, "linear", 5.0, 100.0)])
+@pytest.mark.parametrize(
+    "gaps", [filling(3, "pchip"), smoothing(5.0), Gaps(3, "linear", 5.0, 100.0)]
+)
 @pytest.mark.parametrize("size", [7, 40, 1000])
 def test_the_borders_between_shards_do_not_show(tmp_path, gaps, size):
     whole = random_reconstruction(90)
@@ -124,15 +128,23 @@ def test_the_borders_between_shards_do_not_show(tmp_path, gaps, size):
     shards.close()
     points = torch.cat([chunk.points for chunk in found[0]])
     state = torch.cat([chunk.state for chunk in found[0]])
-    assert torch.equal(points, torch.cat([chunk.points for chunk in found[1]]))  # called more than once
+    assert torch.equal(
+        points, torch.cat([chunk.points for chunk in found[1]])
+    )  # called more than once
     for joint in range(17):
-        expected = gaps(whole.frame.numpy(), whole.points[:, joint].numpy(), whole.state[:, joint].numpy())
+        expected = gaps(
+            whole.frame.numpy(), whole.points[:, joint].numpy(), whole.state[:, joint].numpy()
+        )
         np.testing.assert_array_equal(points[:, joint], expected[0])
         np.testing.assert_array_equal(state[:, joint], expected[1])
     filled = (state == State.FILLED) & (whole.state != State.FILLED)
     assert bool(filled.any()) == (gaps.longest is not None)
     assert not torch.cat([chunk.error for chunk in found[0]])[filled].any()
-    assert not [p for p in tmp_path.iterdir() if p.suffix != ".npz" and p.name not in ("manifest.jsonl", "lock")]
+    assert not [
+        p
+        for p in tmp_path.iterdir()
+        if p.suffix != ".npz" and p.name not in ("manifest.jsonl", "lock")
+    ]
 
 
 def test_without_a_request_nothing_is_done(tmp_path):
@@ -151,9 +163,15 @@ def test_gaps_are_given_in_frames_or_seconds(fill, rate, frames):
 
 @pytest.mark.parametrize(
     ("fill", "rate", "said"),
-    [(0, 60.0, "is 0"), (-1, 60.0, "is -1"), ("6", 60.0, "'6'"), ("long", 60.0, "'long'"), ("0.1s", None, "frame rate"),
-     ("0.001s", 60.0, "less than a frame")],
-)  # fmt: skip
+    [
+        (0, 60.0, "is 0"),
+        (-1, 60.0, "is -1"),
+        ("6", 60.0, "'6'"),
+        ("long", 60.0, "'long'"),
+        ("0.1s", None, "frame rate"),
+        ("0.001s", 60.0, "less than a frame"),
+    ],
+)
 def test_other_gaps_are_named_errors(fill, rate, said):
     with pytest.raises(GhptConfigError, match=f"fill: .*{said}"):
         gap_frames(fill, rate)
@@ -161,10 +179,14 @@ def test_other_gaps_are_named_errors(fill, rate, said):
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
-    [((1, "cubic", None, None), "interpolation: is 'cubic'"), ((None, "pchip", 6.0, None), "smooth: needs the frame"),
-     ((None, "pchip", 6.0, 12.0), "smooth: is 6 Hz"), ((None, "pchip", 0.0, 12.0), "smooth: is 0 Hz"),
-     ((None, "pchip", -1.0, 12.0), "smooth: is -1 Hz")],
-)  # fmt: skip
+    [
+        ((1, "cubic", None, None), "interpolation: is 'cubic'"),
+        ((None, "pchip", 6.0, None), "smooth: needs the frame"),
+        ((None, "pchip", 6.0, 12.0), "smooth: is 6 Hz"),
+        ((None, "pchip", 0.0, 12.0), "smooth: is 0 Hz"),
+        ((None, "pchip", -1.0, 12.0), "smooth: is -1 Hz"),
+    ],
+)
 def test_a_filter_that_cannot_be_is_a_named_error(arguments, said):
     with pytest.raises(GhptConfigError, match=said):
         Gaps(*arguments)
@@ -210,7 +232,9 @@ def test_what_is_missing_keeps_its_reason_and_place():
     assert np.array_equal(found[1:4], points[1:4])
 
 
-@pytest.mark.parametrize(("frame", "step"), [([], 1), ([7], 1), ([0, 10], 10), ([0, 1, 2, 9], 1), ([0, 2, 4, 5], 2)])
+@pytest.mark.parametrize(
+    ("frame", "step"), [([], 1), ([7], 1), ([0, 10], 10), ([0, 1, 2, 9], 1), ([0, 2, 4, 5], 2)]
+)
 def test_the_step_is_the_usual_distance(frame, step):
     assert frame_step(np.array(frame, np.int64)) == step
 
@@ -221,7 +245,9 @@ def test_runs_of_every_tenth_frame_end_where_one_is_left_out():
     assert [run.tolist() for run in found] == [[0, 1, 2], [3, 4]]
 
 
-@pytest.mark.parametrize(("fill", "rate", "frames"), [(1, None, 1), ("0.1s", 10.0, 1), ("4s", 0.5, 2), ("2s", 0.75, 1)])
+@pytest.mark.parametrize(
+    ("fill", "rate", "frames"), [(1, None, 1), ("0.1s", 10.0, 1), ("4s", 0.5, 2), ("2s", 0.75, 1)]
+)
 def test_a_gap_of_one_frame_and_a_slow_rate_are_some(fill, rate, frames):
     assert gap_frames(fill, rate) == frames
 

@@ -43,21 +43,30 @@ def root(tmp_path: Path, takes: list) -> Path:
     return tmp_path / "h36m"
 
 
-def read(root: Path, split: str, numbers: tuple[int, ...] = (0, 1, 2, 3), damaged: bool = True) -> list[Recording]:
+def read(
+    root: Path, split: str, numbers: tuple[int, ...] = (0, 1, 2, 3), damaged: bool = True
+) -> list[Recording]:
     return list(human36m_recordings(root, split, numbers, damaged))
 
 
 @pytest.mark.parametrize(
-    ("split", "subjects"), [("train", ["S1", "S5", "S6", "S7"]), ("validation", ["S8"]), ("test", ["S9", "S11"])]
+    ("split", "subjects"),
+    [("train", ["S1", "S5", "S6", "S7"]), ("validation", ["S8"]), ("test", ["S9", "S11"])],
 )
-def test_round_trip_through_crop_chunks_and_lens(root: Path, takes: list, split: str, subjects: list[str]) -> None:
+def test_round_trip_through_crop_chunks_and_lens(
+    root: Path, takes: list, split: str, subjects: list[str]
+) -> None:
     expected = {f"{s}/{a}": (s, a, poses) for s, a, poses in takes if s in subjects}
     recordings = read(root, split)
     assert {r.name for r in recordings} == set(expected)
     for recording in recordings:
         subject, action, poses = expected[recording.name]
         rig = human36m_rig(subject)
-        assert (recording.subject, recording.action, recording.rate_hz) == (subject, action[:-2], 50)
+        assert (recording.subject, recording.action, recording.rate_hz) == (
+            subject,
+            action[:-2],
+            50,
+        )
         assert recording.camera_names == rig.names
         assert np.abs(recording.cameras.centre.numpy() - rig.cameras.centre.numpy()).max() < 0.01
         assert recording.seen.all()
@@ -76,7 +85,9 @@ def test_views_are_the_chosen_ones_in_their_order(root: Path) -> None:
 
 
 def test_damaged_takes_are_kept_or_left_out(root: Path) -> None:
-    kept, left = ({r.name for r in read(root, "test", damaged=damaged)} for damaged in (True, False))
+    kept, left = (
+        {r.name for r in read(root, "test", damaged=damaged)} for damaged in (True, False)
+    )
     assert kept - left == DAMAGED
     assert "S11/Greeting-2" in left
 
@@ -146,7 +157,9 @@ def test_scale_is_the_boxes_height_and_the_corner_is_x_y() -> None:
 def test_a_point_beyond_the_lens_is_not_seen() -> None:
     rig = human36m_rig("S1")
     K, distortion = rig.cameras.K[0].numpy(), rig.distortion[0].numpy()
-    pixels, seen = undistorted(np.full((1, 2, 2), [[600.0, 600.0], [1e7, 0]]), np.ones((1, 2), bool), K, distortion)
+    pixels, seen = undistorted(
+        np.full((1, 2, 2), [[600.0, 600.0], [1e7, 0]]), np.ones((1, 2), bool), K, distortion
+    )
     assert seen.tolist() == [[True, False]]
     assert pixels[0, 1].tolist() == [0, 0]
 
@@ -179,17 +192,32 @@ def renumber(root: Path) -> None:
 
 BAD = {
     "no labels": (lambda root: (root / LABELS_FILE).unlink(), LABELS_FILE),
-    "no subject": (lambda root: (root / "S8").rename(root / "S2"), "S8/all_2d_preds0.npy: there is no such file"),
+    "no subject": (
+        lambda root: (root / "S8").rename(root / "S2"),
+        "S8/all_2d_preds0.npy: there is no such file",
+    ),
     "gap in the chunks": (renumber, "all_2d_preds0.npy: there is no such file"),
-    "no boxes": (lambda root: (root / "S8/all_bboxes0.npy").unlink(), "all_bboxes0.npy: there is no such file"),
+    "no boxes": (
+        lambda root: (root / "S8/all_bboxes0.npy").unlink(),
+        "all_bboxes0.npy: there is no such file",
+    ),
     "truncated": (cut, "all_2d_preds0.npy: claims"),
-    "3 views": (save("all_2d_preds0.npy", np.ones((5, 3, 17, 2), "f4")), "all_2d_preds0.npy: has shape 5 x 3 x 17 x 2"),
+    "3 views": (
+        save("all_2d_preds0.npy", np.ones((5, 3, 17, 2), "f4")),
+        "all_2d_preds0.npy: has shape 5 x 3 x 17 x 2",
+    ),
     "fewer boxes": (
         save("all_bboxes0.npy", np.ones((4, 4, 2, 2))),
         "all_bboxes0.npy: has shape 4 x 4 x 2 x 2 instead of 5",
     ),
-    "32 joints": (save("all_3d_gt0.npy", np.ones((5, 32, 3))), "all_3d_gt0.npy: has shape 5 x 32 x 3"),
-    "text": (save("all_3d_gt0.npy", np.full((5, 17, 3), "a")), "all_3d_gt0.npy: holds <U1, not floating-point"),
+    "32 joints": (
+        save("all_3d_gt0.npy", np.ones((5, 32, 3))),
+        "all_3d_gt0.npy: has shape 5 x 32 x 3",
+    ),
+    "text": (
+        save("all_3d_gt0.npy", np.full((5, 17, 3), "a")),
+        "all_3d_gt0.npy: holds <U1, not floating-point",
+    ),
 }
 
 
@@ -202,7 +230,11 @@ def test_bad_files_are_named(root: Path, case: str) -> None:
 
 
 def test_bad_cameras_and_arguments(root: Path, takes: list) -> None:
-    for numbers, message in (((0, 4), "there is no camera 4"), ((1, 1), "listed twice"), ((2,), "at least two")):
+    for numbers, message in (
+        ((0, 4), "there is no camera 4"),
+        ((1, 1), "listed twice"),
+        ((2,), "at least two"),
+    ):
         with pytest.raises(GhptDataError, match=message):
             read(root, "validation", numbers)
     with pytest.raises(GhptConfigError, match="Existing: train, validation, test"):

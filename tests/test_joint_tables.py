@@ -1,8 +1,10 @@
-"""The joint tables against literal ones: the detectors' own documentation, and people whom the detectors saw.
+"""The joint tables against literal ones: the detectors' own documentation, and people whom the
+detectors saw.
 
-Nothing here is made from the tables that it tests. The words and their order are those of OpenPose's output format
-(BODY_25, BODY_25B, COCO), COCO's and Halpe's annotation formats, MediaPipe's pose landmarks, CMU Panoptic's tool box,
-and the order of the paper's authors for Human3.6M.
+Nothing here is made from the tables that it tests. The words and their order are those of
+OpenPose's output format (BODY_25, BODY_25B, COCO), COCO's and Halpe's annotation formats,
+MediaPipe's pose landmarks, CMU Panoptic's tool box, and the order of the paper's authors for
+Human3.6M.
 """
 
 from itertools import combinations, pairwise
@@ -51,30 +53,166 @@ DOCUMENTED = {
         28 right ankle, 29 left heel, 30 right heel, 31 left foot index, 32 right foot index""",
 }
 OUR_WORDS = {
-    "Nose": "nose", "Neck": "neck", "MidHip": "mid_hip", "BodyCenter": "mid_hip", "Hip": "mid_hip",
-    "UpperNeck": "upper_neck", "HeadTop": "head_top", "Head": "head_top",
-    "left foot index": "left_big_toe", "right foot index": "right_big_toe",
-}  # fmt: skip
+    "Nose": "nose",
+    "Neck": "neck",
+    "MidHip": "mid_hip",
+    "BodyCenter": "mid_hip",
+    "Hip": "mid_hip",
+    "UpperNeck": "upper_neck",
+    "HeadTop": "head_top",
+    "Head": "head_top",
+    "left foot index": "left_big_toe",
+    "right foot index": "right_big_toe",
+}
 PARTS = {
-    "Shoulder": "shoulder", "Elbow": "elbow", "Wrist": "wrist", "Hip": "hip", "Knee": "knee", "Ankle": "ankle",
-    "Eye": "eye", "Ear": "ear", "BigToe": "big_toe", "SmallToe": "small_toe", "Heel": "heel",
-}  # fmt: skip
+    "Shoulder": "shoulder",
+    "Elbow": "elbow",
+    "Wrist": "wrist",
+    "Hip": "hip",
+    "Knee": "knee",
+    "Ankle": "ankle",
+    "Eye": "eye",
+    "Ear": "ear",
+    "BigToe": "big_toe",
+    "SmallToe": "small_toe",
+    "Heel": "heel",
+}
 SOURCES = {  # of each of the 17 joints, in their order, the detector's joints whose mean it is
     "human36m": [[k] for k in range(17)],
-    "coco_17": [[16], [14], [12], [11], [13], [15], [11, 12], [5, 6, 11, 12], [5, 6], [1, 2, 3, 4], [10], [8], [6],
-                [5], [7], [9], [0]],
-    "coco_18": [[10], [9], [8], [11], [12], [13], [8, 11], [1, 1, 8, 11], [1], [14, 15, 16, 17], [4], [3], [2], [5],
-                [6], [7], [0]],
-    "coco_19": [[14], [13], [12], [6], [7], [8], [2], [0, 2], [0], [15, 16, 17, 18], [11], [10], [9], [3], [4], [5],
-                [1]],
-    "body_25": [[11], [10], [9], [12], [13], [14], [8], [1, 8], [1], [15, 16, 17, 18], [4], [3], [2], [5], [6], [7],
-                [0]],
-    "body_25b": [[16], [14], [12], [11], [13], [15], [11, 12], [5, 6, 11, 12], [5, 6], [18], [10], [8], [6], [5], [7],
-                 [9], [0]],
-    "halpe_26": [[16], [14], [12], [11], [13], [15], [19], [18, 19], [18], [17], [10], [8], [6], [5], [7], [9], [0]],
-    "mediapipe_33": [[28], [26], [24], [23], [25], [27], [23, 24], [11, 12, 23, 24], [11, 12], [2, 5, 7, 8], [16],
-                     [14], [12], [11], [13], [15], [0]],
-}  # fmt: skip
+    "coco_17": [
+        [16],
+        [14],
+        [12],
+        [11],
+        [13],
+        [15],
+        [11, 12],
+        [5, 6, 11, 12],
+        [5, 6],
+        [1, 2, 3, 4],
+        [10],
+        [8],
+        [6],
+        [5],
+        [7],
+        [9],
+        [0],
+    ],
+    "coco_18": [
+        [10],
+        [9],
+        [8],
+        [11],
+        [12],
+        [13],
+        [8, 11],
+        [1, 1, 8, 11],
+        [1],
+        [14, 15, 16, 17],
+        [4],
+        [3],
+        [2],
+        [5],
+        [6],
+        [7],
+        [0],
+    ],
+    "coco_19": [
+        [14],
+        [13],
+        [12],
+        [6],
+        [7],
+        [8],
+        [2],
+        [0, 2],
+        [0],
+        [15, 16, 17, 18],
+        [11],
+        [10],
+        [9],
+        [3],
+        [4],
+        [5],
+        [1],
+    ],
+    "body_25": [
+        [11],
+        [10],
+        [9],
+        [12],
+        [13],
+        [14],
+        [8],
+        [1, 8],
+        [1],
+        [15, 16, 17, 18],
+        [4],
+        [3],
+        [2],
+        [5],
+        [6],
+        [7],
+        [0],
+    ],
+    "body_25b": [
+        [16],
+        [14],
+        [12],
+        [11],
+        [13],
+        [15],
+        [11, 12],
+        [5, 6, 11, 12],
+        [5, 6],
+        [18],
+        [10],
+        [8],
+        [6],
+        [5],
+        [7],
+        [9],
+        [0],
+    ],
+    "halpe_26": [
+        [16],
+        [14],
+        [12],
+        [11],
+        [13],
+        [15],
+        [19],
+        [18, 19],
+        [18],
+        [17],
+        [10],
+        [8],
+        [6],
+        [5],
+        [7],
+        [9],
+        [0],
+    ],
+    "mediapipe_33": [
+        [28],
+        [26],
+        [24],
+        [23],
+        [25],
+        [27],
+        [23, 24],
+        [11, 12, 23, 24],
+        [11, 12],
+        [2, 5, 7, 8],
+        [16],
+        [14],
+        [12],
+        [11],
+        [13],
+        [15],
+        [0],
+    ],
+}
 
 
 def in_our_words(word: str) -> str:
@@ -118,34 +256,91 @@ def test_panoptic_s_own_map_is_the_documented_one():
     points = np.random.default_rng(0).uniform(0, 1000, (1, 19, 3))
     found = panoptic.joints17(points, np.ones((1, 19), bool))[0]
     for joint, places in enumerate(SOURCES["coco_19"]):
-        np.testing.assert_allclose(found[0, joint], points[0, places].mean(0), rtol=1e-6, err_msg=JOINTS[joint])
+        np.testing.assert_allclose(
+            found[0, joint], points[0, places].mean(0), rtol=1e-6, err_msg=JOINTS[joint]
+        )
 
 
 def test_the_body_s_parts_are_the_documented_ones():
     """Of the 17 joints by number: what is mirrored, connected, compared and one of the six."""
     assert MIRROR == (5, 4, 3, 2, 1, 0, 6, 7, 8, 9, 15, 14, 13, 12, 11, 10, 16)
     assert BONES == (
-        (0, 1), (1, 2), (2, 6), (5, 4), (4, 3), (3, 6), (6, 7), (7, 8), (8, 9), (9, 16), (8, 12), (12, 11), (11, 10),
-        (8, 13), (13, 14), (14, 15),
-    )  # fmt: skip
+        (0, 1),
+        (1, 2),
+        (2, 6),
+        (5, 4),
+        (4, 3),
+        (3, 6),
+        (6, 7),
+        (7, 8),
+        (8, 9),
+        (9, 16),
+        (8, 12),
+        (12, 11),
+        (11, 10),
+        (8, 13),
+        (13, 14),
+        (14, 15),
+    )
     assert SYMMETRIC_PARTS == {
-        "upper_arm": ((13, 14), (12, 11)), "lower_arm": ((14, 15), (11, 10)), "shoulder": ((13, 8), (12, 8)),
-        "hip": ((3, 6), (2, 6)), "upper_leg": ((3, 4), (2, 1)), "lower_leg": ((4, 5), (1, 0)),
-    }  # fmt: skip
+        "upper_arm": ((13, 14), (12, 11)),
+        "lower_arm": ((14, 15), (11, 10)),
+        "shoulder": ((13, 8), (12, 8)),
+        "hip": ((3, 6), (2, 6)),
+        "upper_leg": ((3, 4), (2, 1)),
+        "lower_leg": ((4, 5), (1, 0)),
+    }
     assert SIX_JOINTS == (11, 14, 10, 15, 1, 4)
 
 
 def test_the_words_of_mmpose_s_human36m_are_understood():
-    words = ("root", "right_hip", "right_knee", "right_foot", "left_hip", "left_knee", "left_foot", "spine", "thorax",
-             "neck_base", "head", "left_shoulder", "left_elbow", "left_wrist", "right_shoulder", "right_elbow",
-             "right_wrist")  # fmt: skip
-    ours = ("pelvis", "right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle", "spine",
-            "thorax", "nose", "head_top", "left_shoulder", "left_elbow", "left_wrist", "right_shoulder", "right_elbow",
-            "right_wrist")  # fmt: skip
+    words = (
+        "root",
+        "right_hip",
+        "right_knee",
+        "right_foot",
+        "left_hip",
+        "left_knee",
+        "left_foot",
+        "spine",
+        "thorax",
+        "neck_base",
+        "head",
+        "left_shoulder",
+        "left_elbow",
+        "left_wrist",
+        "right_shoulder",
+        "right_elbow",
+        "right_wrist",
+    )
+    ours = (
+        "pelvis",
+        "right_hip",
+        "right_knee",
+        "right_ankle",
+        "left_hip",
+        "left_knee",
+        "left_ankle",
+        "spine",
+        "thorax",
+        "nose",
+        "head_top",
+        "left_shoulder",
+        "left_elbow",
+        "left_wrist",
+        "right_shoulder",
+        "right_elbow",
+        "right_wrist",
+    )
     assert canonical(words) == ours
 
 
-LINKS = [("nose", "left_eye"), ("nose", "right_eye"), ("left_shoulder", "right_shoulder"), ("left_hip", "right_hip")]
+LINKS = [
+    ("nose", "left_eye"),
+    ("nose", "right_eye"),
+    ("left_shoulder", "right_shoulder"),
+    ("left_hip", "right_hip"),
+]
 for side in ("left", "right"):
     chain = ("eye", "ear", "shoulder", "elbow", "wrist")
     LINKS += [(f"{side}_{a}", f"{side}_{b}") for a, b in pairwise(chain)]

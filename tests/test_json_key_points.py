@@ -1,4 +1,6 @@
-"""COCO results and MMPose's JSON: who is where, in which view and frame, and what is not right is named."""
+"""COCO results and MMPose's JSON: who is where, in which view and frame, and what is not right is
+named.
+"""
 
 import json
 
@@ -16,20 +18,34 @@ COCO = SKELETONS["coco_17"]
 
 def result(image, shift=0.0, joints=BODY):
     shifted = joints + np.array([shift, 0, 0])
-    return {"image_id": image, "category_id": 1, "keypoints": shifted.ravel().tolist(), "score": 0.9}
+    return {
+        "image_id": image,
+        "category_id": 1,
+        "keypoints": shifted.ravel().tolist(),
+        "score": 0.9,
+    }
 
 
 def mmpose(frames, meta=True, names=COCO):
     people = [
-        {"frame_id": number, "instances": [
-            {"keypoints": (BODY[:, :2] + [shift, 0]).tolist(), "keypoint_scores": BODY[:, 2].tolist(), "bbox": [[0]]}
-            for shift in shifts
-        ]}
+        {
+            "frame_id": number,
+            "instances": [
+                {
+                    "keypoints": (BODY[:, :2] + [shift, 0]).tolist(),
+                    "keypoint_scores": BODY[:, 2].tolist(),
+                    "bbox": [[0]],
+                }
+                for shift in shifts
+            ],
+        }
         for number, shifts in frames
-    ]  # fmt: skip
+    ]
     named = {str(i): name for i, name in enumerate(names)}
     return (
-        {"meta_info": {"dataset_name": "coco", "keypoint_id2name": named}, "instance_info": people} if meta else people
+        {"meta_info": {"dataset_name": "coco", "keypoint_id2name": named}, "instance_info": people}
+        if meta
+        else people
     )
 
 
@@ -51,7 +67,9 @@ def test_coco_results_with_a_file_for_each_camera(tmp_path):
     np.testing.assert_allclose(chosen.confidence[0, 0], BODY[:, 2])
 
 
-@pytest.mark.parametrize("form", ["{view}/{frame:06d}.jpg", "{view}_{frame:04d}.png", "x\\{view}\\img{frame}.jpg"])
+@pytest.mark.parametrize(
+    "form", ["{view}/{frame:06d}.jpg", "{view}_{frame:04d}.png", "x\\{view}\\img{frame}.jpg"]
+)
 def test_one_coco_file_whose_images_name_the_views(form, tmp_path):
     images = [(view, frame) for view in ("left", "right") for frame in (3, 4, 12)]
     listed = [result(form.format(view=view, frame=frame), frame) for view, frame in images]
@@ -110,13 +128,31 @@ def test_the_joints_are_those_that_mmpose_names(tmp_path):
     order = RNG.permutation(17)
     write(tmp_path / "a.json", mmpose([(1, [0.0])], names=[names[i] for i in order]))
     assert read_people(tmp_path).joints == tuple(COCO[i] for i in order)
-    h36m = ["root", "right_hip", "right_knee", "right_foot", "left_hip", "left_knee", "left_foot", "spine", "thorax",
-            "neck_base", "head", "left_shoulder", "left_elbow", "left_wrist", "right_shoulder", "right_elbow",
-            "right_wrist"]  # fmt: skip
+    h36m = [
+        "root",
+        "right_hip",
+        "right_knee",
+        "right_foot",
+        "left_hip",
+        "left_knee",
+        "left_foot",
+        "spine",
+        "thorax",
+        "neck_base",
+        "head",
+        "left_shoulder",
+        "left_elbow",
+        "left_wrist",
+        "right_shoulder",
+        "right_elbow",
+        "right_wrist",
+    ]
     write(tmp_path / "a.json", mmpose([(1, [0.0])], names=h36m))
     assert set(read_people(tmp_path).joints) == set(SKELETONS["human36m"])
     write(tmp_path / "a.json", mmpose([(1, [0.0])], names=[f"paw {i}" for i in range(17)]))
-    with pytest.raises(GhptDataError, match=r"joints: lack right_ankle.*Name the joints as in human36m, coco_17"):
+    with pytest.raises(
+        GhptDataError, match=r"joints: lack right_ankle.*Name the joints as in human36m, coco_17"
+    ):
         read_people(tmp_path)
     assert read_people(tmp_path, "coco_17").joints == COCO
 
@@ -125,16 +161,25 @@ def test_the_joints_are_those_that_mmpose_names(tmp_path):
     ("change", "says"),
     [
         ([3], "instance_info: is not a list of frames"),
-        ([{"frame_id": "1", "instances": []}], r"instance_info\[0\]\.frame_id: is not a frame number"),
+        (
+            [{"frame_id": "1", "instances": []}],
+            r"instance_info\[0\]\.frame_id: is not a frame number",
+        ),
         ([{"frame_id": 1, "instances": 2}], r"\[0\]\.instances: is not a list of people"),
         ([{"frame_id": 1, "instances": []}] * 2, "frame_id: is there twice"),
-        ([{"frame_id": 1, "instances": [{"keypoints": [1]}]}], r"keypoints: is not a list of \[x, y\]"),
-        ([{"frame_id": 1, "instances": [{"keypoints": [[1, 2]]}]}], "keypoint_scores: is not a list"),
+        (
+            [{"frame_id": 1, "instances": [{"keypoints": [1]}]}],
+            r"keypoints: is not a list of \[x, y\]",
+        ),
+        (
+            [{"frame_id": 1, "instances": [{"keypoints": [[1, 2]]}]}],
+            "keypoint_scores: is not a list",
+        ),
         ({"meta_info": {"keypoint_id2name": {"0": "nose"}}}, "names 1 joints, and people have 17"),
         ({"meta_info": {"keypoint_id2name": {"1": "nose"}}}, "does not name the joints from 0 on"),
         ({"meta_info": {"keypoint_id2name": ["nose"]}}, "does not name the joints from 0 on"),
     ],
-)  # fmt: skip
+)
 def test_bad_mmpose_files_are_named(change, says, tmp_path):
     change = {"instance_info": change} if isinstance(change, list) else change
     write(tmp_path / "a.json", mmpose([(1, [0.0])]) | change)

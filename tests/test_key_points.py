@@ -1,4 +1,6 @@
-"""Our own npz, the matching of views to cameras by name, and what stands between a detector and a calibration."""
+"""Our own npz, the matching of views to cameras by name, and what stands between a detector and a
+calibration.
+"""
 
 import json
 from dataclasses import replace
@@ -21,10 +23,20 @@ from scenes import random_scene
 
 def camera_file(names, other=None, lens: float = 0.0) -> CameraFile:
     views = len(names)
-    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(views, 3, 3)
+    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(
+        views, 3, 3
+    )
     distortion = torch.tensor([lens, lens / 2, 0, 0, 0], dtype=torch.float64).expand(views, 5)
     return CameraFile(
-        "Calib.toml", "Pose2Sim", tuple(names), tuple(other or [""] * views), K, distortion, None, None, None
+        "Calib.toml",
+        "Pose2Sim",
+        tuple(names),
+        tuple(other or [""] * views),
+        K,
+        distortion,
+        None,
+        None,
+        None,
     )
 
 
@@ -61,16 +73,24 @@ def test_a_rate_that_no_camera_has_is_refused(rate, tmp_path):
     """In the file, as a setting, and in a file that is read in parts."""
     path = tmp_path / "points.npz"
     write_key_points(path, key_points())
-    with pytest.raises(GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"):
+    with pytest.raises(
+        GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"
+    ):
         read_people(path, rate_hz=rate)
     write_key_points(path, replace(key_points(), rate_hz=rate))
-    with pytest.raises(GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"):
+    with pytest.raises(
+        GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"
+    ):
         read_people(path)
     with np.load(path) as arrays:
         np.savez(path, **arrays)
-    with pytest.raises(GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"):
+    with pytest.raises(
+        GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"
+    ):
         open_stored(path, None, None)
-    with pytest.raises(GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"):
+    with pytest.raises(
+        GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"
+    ):
         open_stored(path, None, rate)
 
 
@@ -86,7 +106,12 @@ def test_a_rate_that_is_not_a_number_is_unknown(tmp_path):
 def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):
     points = key_points()
     values = np.where(points.seen[..., None], points.key_points, np.nan)
-    np.savez(tmp_path / "p.npz", key_points=values, views=np.array(["a", "b"]), skeleton=np.array("COCO-17"))
+    np.savez(
+        tmp_path / "p.npz",
+        key_points=values,
+        views=np.array(["a", "b"]),
+        skeleton=np.array("COCO-17"),
+    )
     found = read_key_points(tmp_path / "p.npz")
     np.testing.assert_array_equal(found.seen, points.seen)
     assert np.isfinite(found.key_points).all()
@@ -104,7 +129,10 @@ def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):
         ({"views": np.array(["a"])}, "views: names 1 for 2"),
         ({"views": np.array([1, 2])}, "views: is not a list of texts"),
         ({"joints": np.array(["nose"])}, "lack right_ankle|joints: names 1 for 17"),
-        ({"skeleton": np.array("body_25"), "joints": None}, "body_25 has 25 joints and the key points have 17"),
+        (
+            {"skeleton": np.array("body_25"), "joints": None},
+            "body_25 has 25 joints and the key points have 17",
+        ),
         ({"skeleton": np.array("mine"), "joints": None}, "there is no skeleton 'mine'"),
         ({"key_points": np.zeros((5, 2, 17))}, "key_points: has shape 5 x 2 x 17"),
         ({"confidence": np.ones((5, 2, 16))}, "confidence: has shape 5 x 2 x 16"),
@@ -115,7 +143,11 @@ def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):
 )
 def test_a_bad_npz_is_named(change, says, tmp_path):
     points = key_points()
-    arrays = {name: np.array(value) for name, value in vars(points).items() if name not in ("path", "several")}
+    arrays = {
+        name: np.array(value)
+        for name, value in vars(points).items()
+        if name not in ("path", "several")
+    }
     arrays = {name: value for name, value in (arrays | change).items() if value is not None}
     np.savez(tmp_path / "p.npz", **arrays)
     with pytest.raises(GhptDataError, match=says):
@@ -133,7 +165,12 @@ def test_a_cut_npz_is_named(tmp_path):
     ("views", "names", "other", "expected"),
     [
         (["b", "a"], ["a", "b"], None, [(1, 0), (0, 1)]),
-        (["cam1_json", "cam2_json", "cam10_json"], ["cam01", "cam02", "cam10"], None, [(0, 0), (1, 1), (2, 2)]),
+        (
+            ["cam1_json", "cam2_json", "cam10_json"],
+            ["cam01", "cam02", "cam10"],
+            None,
+            [(0, 0), (1, 1), (2, 2)],
+        ),
         (["cam_10", "cam_2"], ["left", "right"], ["cam_2", "cam_10"], [(1, 0), (0, 1)]),
         (["Cam.01", "cam1x"], ["cam1", "cam1x"], None, [(0, 0), (1, 1)]),
         (["cam1", "cam01"], ["cam1", "cam01"], None, [(0, 0), (1, 1)]),
@@ -147,7 +184,11 @@ def test_views_find_their_cameras_by_name(views, names, other, expected):
 @pytest.mark.parametrize(
     ("views", "names", "says"),
     [
-        (["a", "c"], ["a", "b"], r"view c has no camera \(views: a, c; cameras of Calib.toml: a, b\)"),
+        (
+            ["a", "c"],
+            ["a", "b"],
+            r"view c has no camera \(views: a, c; cameras of Calib.toml: a, b\)",
+        ),
         (["a"], ["a", "b"], "camera b has no view"),
         (["cam_1", "Cam1"], ["cam1", "cam2"], "camera cam1 has more than one view"),
         (["cam1", "x"], ["cam01", "cam001"], "view cam1 has more than one camera"),
@@ -164,7 +205,9 @@ def test_the_user_says_which_is_which_and_which_to_use():
     assert pairs == [(1, 0), (0, 1), (2, 2)]
     assert matched("pose", ["front", "top", "x"], cameras, {}, ["top", "front"]) == [(0, 0), (1, 2)]
     for wrong in ({"3": "back"}, {"1": "side"}):
-        with pytest.raises(GhptDataError, match=r"match says .*, of which one is not there \(views: 1, 2, top;"):
+        with pytest.raises(
+            GhptDataError, match=r"match says .*, of which one is not there \(views: 1, 2, top;"
+        ):
             matched("pose", ["1", "2", "top"], cameras, wrong, None)
     with pytest.raises(GhptDataError, match="there is no view back with a camera"):
         matched("pose", ["front", "top"], cameras, {}, ["top", "back"])
@@ -180,10 +223,14 @@ def test_the_lens_is_undone_before_means_are_taken():
     cameras = camera_file(["a", "b"], lens=-0.2)
     cameras = replace(cameras, K=scene.cameras.K[0])
     pixels, _ = project(scene.cameras, scene.points)
-    seen_by_lens = torch.stack([distort(pixels[0, v], cameras.K[v], cameras.distortion[v]) for v in range(2)])
+    seen_by_lens = torch.stack(
+        [distort(pixels[0, v], cameras.K[v], cameras.distortion[v]) for v in range(2)]
+    )
     joints = SKELETONS["coco_17"]
     points = replace(
-        key_points(joints=joints, frames=1), key_points=seen_by_lens.numpy()[None], seen=np.ones((1, 2, 17), bool)
+        key_points(joints=joints, frames=1),
+        key_points=seen_by_lens.numpy()[None],
+        seen=np.ones((1, 2, 17), bool),
     )
     views = look_through(points, cameras)
     mean = pixels[0, :, [joints.index("left_shoulder"), joints.index("right_shoulder")]].mean(1)
@@ -200,12 +247,16 @@ def test_a_damaged_npz_is_read_or_named(tmp_path):
 
 
 def test_a_damaged_json_is_read_or_named(tmp_path):
-    body = np.concatenate([np.random.default_rng(0).uniform(0, 400, (25, 2)), np.full((25, 1), 0.5)], -1)
+    body = np.concatenate(
+        [np.random.default_rng(0).uniform(0, 400, (25, 2)), np.full((25, 1), 0.5)], -1
+    )
     for view in ("a", "b"):
         (tmp_path / view).mkdir()
         content = {"people": [{"pose_keypoints_2d": body.ravel().tolist()}]}
         (tmp_path / view / "x_000000000001.json").write_text(json.dumps(content))
-    assert damage(tmp_path / "a" / "x_000000000001.json", lambda _: read_key_points(tmp_path, "body_25"), 150) == {
+    assert damage(
+        tmp_path / "a" / "x_000000000001.json", lambda _: read_key_points(tmp_path, "body_25"), 150
+    ) == {
         "read",
         "named",
     }

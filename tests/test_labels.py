@@ -35,9 +35,15 @@ def test_reads_what_numpy_1_and_2_write(tmp_path: Path, protocol: int, module_na
     assert labels.subject.tolist() == [0] * 5 + [5] * 3
     assert labels.action.tolist() == [0] * 5 + [1] * 3
     assert labels.frame.tolist() == [0, 5, 10, 15, 20, 0, 5, 10]
-    assert np.array_equal(labels.key_points, np.concatenate([poses for *_, poses in TAKES]).astype("f4"))
+    assert np.array_equal(
+        labels.key_points, np.concatenate([poses for *_, poses in TAKES]).astype("f4")
+    )
     rig = human36m_rig("S9")
-    for read, exact in ((labels.K, rig.cameras.K), (labels.R, rig.cameras.R), (labels.t, rig.cameras.t)):
+    for read, exact in (
+        (labels.K, rig.cameras.K),
+        (labels.R, rig.cameras.R),
+        (labels.t, rig.cameras.t),
+    ):
         assert np.array_equal(read[5], exact.numpy().astype("f4"))
     assert np.array_equal(labels.distortion[5], rig.distortion.numpy().astype("f4"))
 
@@ -51,7 +57,10 @@ def test_reads_numpy_save(tmp_path: Path) -> None:
 def test_reads_a_fortran_ordered_and_a_big_endian_array(tmp_path: Path) -> None:
     content = layout.human36m_labels(TAKES)
     content["cameras"] = np.asfortranarray(content["cameras"])
-    big = [(name, content["table"].dtype[name].newbyteorder(">")) for name in content["table"].dtype.names]
+    big = [
+        (name, content["table"].dtype[name].newbyteorder(">"))
+        for name in content["table"].dtype.names
+    ]
     content["table"] = content["table"].astype(big)
     layout.write_pickle(tmp_path / "l.npy", content)
     labels = read_labels(tmp_path / "l.npy")
@@ -74,18 +83,36 @@ CAMERAS = layout.human36m_labels(TAKES)["cameras"]
 BAD = {
     "a list": ([1, 2], "holds a list, not a dict"),
     "no names": (spoiled(subject_names=[]), "subject_names: is not a list of names"),
-    "numbers for names": (spoiled(camera_names=[1, 2, 3, 4]), "camera_names: is not a list of names"),
-    "no actions": ({k: v for k, v in spoiled().items() if k != "action_names"}, "action_names: is not"),
+    "numbers for names": (
+        spoiled(camera_names=[1, 2, 3, 4]),
+        "camera_names: is not a list of names",
+    ),
+    "no actions": (
+        {k: v for k, v in spoiled().items() if k != "action_names"},
+        "action_names: is not",
+    ),
     "no table": ({k: v for k, v in spoiled().items() if k != "table"}, "table: is missing"),
     "table of objects": (spoiled(table=np.array([{}], object)), "table: is not a numpy array"),
     "plain table": (spoiled(table=np.ones(3)), "table: holds float64, not records"),
-    "table without points": (spoiled(table=table()[["subject_idx", "action_idx", "frame_idx"]]), "keypoints'.*missing"),
-    "32 joints": (spoiled(table=np.zeros(3, [*table().dtype.descr[:3], ("keypoints", "f4", (32, 3))])), "3 x 32 x 3"),
-    "subject 9": (spoiled(table=table(subject_idx=9)), "subject_idx'.*goes from 9 to 9, with 7 subject_names"),
+    "table without points": (
+        spoiled(table=table()[["subject_idx", "action_idx", "frame_idx"]]),
+        "keypoints'.*missing",
+    ),
+    "32 joints": (
+        spoiled(table=np.zeros(3, [*table().dtype.descr[:3], ("keypoints", "f4", (32, 3))])),
+        "3 x 32 x 3",
+    ),
+    "subject 9": (
+        spoiled(table=table(subject_idx=9)),
+        "subject_idx'.*goes from 9 to 9, with 7 subject_names",
+    ),
     "action -1": (spoiled(table=table(action_idx=-1)), "action_idx'.*goes from -1"),
     "6 subjects": (spoiled(cameras=CAMERAS[:6]), "cameras: has shape 6 x 4 instead of 7 x 4"),
     "no R": (spoiled(cameras=CAMERAS[["t", "K", "dist"]]), "cameras.'R'.*missing"),
-    "4 coefficients": (spoiled(cameras=np.zeros((7, 4), [*CAMERAS.dtype.descr[:3], ("dist", "f4", 4)])), "7 x 4 x 4"),
+    "4 coefficients": (
+        spoiled(cameras=np.zeros((7, 4), [*CAMERAS.dtype.descr[:3], ("dist", "f4", 4)])),
+        "7 x 4 x 4",
+    ),
 }
 
 
@@ -139,8 +166,12 @@ FORGED = {
     "field before the start": forged(
         forged_dtype(3, "|", None, ("a",), {"a": (np.dtype("f8"), -8)}, 8, 1, 0), (1,), b"1" * 8
     ),
-    "pointers as bytes": forged(forged_dtype(3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 0), (1,), b"1" * 8),
-    "subarray of 1e15": forged(forged_dtype(3, "|", (np.dtype("f8"), (10**15,)), None, None, 8, 1, 0), (1,), b"1" * 8),
+    "pointers as bytes": forged(
+        forged_dtype(3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 0), (1,), b"1" * 8
+    ),
+    "subarray of 1e15": forged(
+        forged_dtype(3, "|", (np.dtype("f8"), (10**15,)), None, None, 8, 1, 0), (1,), b"1" * 8
+    ),
     "no state": Fake(*np.zeros(3).__reduce__()[:2]),
     "a list as data": forged(np.dtype("f4"), (1,), [1.0]),
     "negative shape": forged(np.dtype("f4"), (-1, -1), b"1234"),

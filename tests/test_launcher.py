@@ -1,4 +1,6 @@
-"""Sweeps end alike under Hydra's own launcher, in a local pool of submitit's, and through Slurm's commands."""
+"""Sweeps end alike under Hydra's own launcher, in a local pool of submitit's, and through Slurm's
+commands.
+"""
 
 import json
 import os
@@ -38,9 +40,15 @@ SLURM = {  # stand-ins: an array's jobs run at once, on this machine
 
 @pytest.fixture
 def toy(tmp_path):
-    """``toy(*words)`` starts toy_sweep.py, with the settings of Hydra that the project's commands have."""
+    """``toy(*words)`` starts toy_sweep.py, with the settings of Hydra that the project's commands
+    have.
+    """
     hydra = yaml.safe_load((ROOT / "conf" / "train.yaml").read_text())["hydra"]
-    content = {"how": "well", "output": str(tmp_path / "out"), "hydra": {k: v for k, v in hydra.items() if k != "help"}}
+    content = {
+        "how": "well",
+        "output": str(tmp_path / "out"),
+        "hydra": {k: v for k, v in hydra.items() if k != "help"},
+    }
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "toy.yaml").write_text(yaml.safe_dump(content))
     environment = os.environ | {"TOY_CONF": str(tmp_path / "conf"), "PYTHON": sys.executable}
@@ -49,7 +57,11 @@ def toy(tmp_path):
     def start(*words, path=""):
         environment["PATH"] = f"{path}{os.pathsep}{os.environ['PATH']}"
         return subprocess.Popen(
-            [*TOY, *words], env=environment, text=True, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+            [*TOY, *words],
+            env=environment,
+            text=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
         )
 
     return start
@@ -75,15 +87,18 @@ WELL_AND_NOT = ["  0_how-well: done", "  1_how-user: error: how: is user. Say we
 @pytest.mark.posix
 @pytest.mark.parametrize("launcher", ["basic", "submitit_local", "submitit_slurm"])
 def test_a_sweep_says_the_same_wherever_its_jobs_run(toy, tmp_path, launcher):
-    child = toy("-m", "how=well,user", f"hydra/launcher={launcher}", path=commands(tmp_path, **SLURM))
+    child = toy(
+        "-m", "how=well,user", f"hydra/launcher={launcher}", path=commands(tmp_path, **SLURM)
+    )
     said, errors = child.communicate(timeout=300)
     jobs, after = lines(said)
     assert child.returncode == 1, errors
     assert jobs == WELL_AND_NOT
     assert "Traceback" not in errors
     assert [(job["name"], job["how"], job["failed"]) for job in after["jobs"]] == [
-        ("0_how-well", "well", False), ("1_how-user", "user", True)
-    ]  # fmt: skip
+        ("0_how-well", "well", False),
+        ("1_how-user", "user", True),
+    ]
     assert after["jobs"][1]["result"] is None
     assert (after["jobs"][0]["result"]["pid"] == after["pid"]) is (launcher == "basic")
     assert "error: how: is user" in (tmp_path / "out" / "1_how-user" / "train.log").read_text()
@@ -95,9 +110,15 @@ def test_a_job_that_dies_is_named_and_the_others_finish(toy, tmp_path):
     said, errors = child.communicate(timeout=300)
     (killed, *others), after = lines(said)
     assert child.returncode == 1, errors
-    log = re.fullmatch(r"  0_how-killed: error: it ended without a result; (.*_log\.err) may say why", killed)[1]
+    log = re.fullmatch(
+        r"  0_how-killed: error: it ended without a result; (.*_log\.err) may say why", killed
+    )[1]
     assert log.startswith(str(tmp_path / "out" / ".submitit"))
-    assert others == ["  1_how-fault: error: KeyError: 'lost'", "  2_how-exits: stopped", "  3_how-well: done"]
+    assert others == [
+        "  1_how-fault: error: KeyError: 'lost'",
+        "  2_how-exits: stopped",
+        "  3_how-well: done",
+    ]
     assert [job["failed"] for job in after["jobs"]] == [True, True, True, False]
     assert "Traceback" in (tmp_path / "out" / "1_how-fault" / "train.log").read_text()
 
@@ -118,21 +139,42 @@ def test_an_interrupt_stops_every_job(toy, tmp_path):
 
 @pytest.mark.posix
 def test_what_sbatch_refuses_is_said_in_one_line(toy, tmp_path):
-    refusing = SLURM | {"sbatch": "echo 'sbatch: error: invalid partition specified: gpuu' >&2; exit 1"}
-    words = ("-m", "how=well,user", "hydra/launcher=submitit_slurm", "hydra.launcher.partition=gpuu")
+    refusing = SLURM | {
+        "sbatch": "echo 'sbatch: error: invalid partition specified: gpuu' >&2; exit 1"
+    }
+    words = (
+        "-m",
+        "how=well,user",
+        "hydra/launcher=submitit_slurm",
+        "hydra.launcher.partition=gpuu",
+    )
     child = toy(*words, path=commands(tmp_path, **refusing))
     _, errors = child.communicate(timeout=300)
     assert child.returncode == 1
-    assert errors.splitlines()[-1].startswith("error: hydra.launcher: sbatch: error: invalid partition specified: gpuu")
+    assert errors.splitlines()[-1].startswith(
+        "error: hydra.launcher: sbatch: error: invalid partition specified: gpuu"
+    )
     assert "Traceback" not in errors
 
 
 @pytest.mark.parametrize(
     ("launcher", "installed", "message"),
     [
-        ("submitit_local", False, "submitit_local needs hydra-submitit-launcher. Run: pip install -e '.[slurm]'"),
-        ("submitit_slurm", True, "submitit_slurm needs Slurm's sbatch and srun, which are not here. Start it on"),
-        ("submitit_loca", True, "there is no 'submitit_loca'. Did you mean 'submitit_local'? Existing: basic, "),
+        (
+            "submitit_local",
+            False,
+            "submitit_local needs hydra-submitit-launcher. Run: pip install -e '.[slurm]'",
+        ),
+        (
+            "submitit_slurm",
+            True,
+            "submitit_slurm needs Slurm's sbatch and srun, which are not here. Start it on",
+        ),
+        (
+            "submitit_loca",
+            True,
+            "there is no 'submitit_loca'. Did you mean 'submitit_local'? Existing: basic, ",
+        ),
     ],
 )
 def test_a_launcher_that_is_not_there(typed, monkeypatch, tmp_path, launcher, installed, message):
@@ -144,7 +186,9 @@ def test_a_launcher_that_is_not_there(typed, monkeypatch, tmp_path, launcher, in
     assert said.startswith(f"error: hydra/launcher: {message}")
 
 
-@pytest.mark.parametrize("name", ["RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK"])
+@pytest.mark.parametrize(
+    "name", ["RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK"]
+)
 def test_one_process_of_a_run_writes_its_files(monkeypatch, name):
     monkeypatch.delenv(name, raising=False)
     assert ghpt.commands.jobs.is_first_process()
@@ -156,7 +200,11 @@ def test_one_process_of_a_run_writes_its_files(monkeypatch, name):
 
 def test_slurm_s_settings_compose_where_there_is_no_slurm(typed):
     settings = {"partition": "gpu", "gpus_per_node": 1, "timeout_min": 120, "cpus_per_task": 4}
-    words = ["hydra/launcher=submitit_slurm", *(f"hydra.launcher.{k}={v}" for k, v in settings.items()), "--cfg=hydra"]
+    words = [
+        "hydra/launcher=submitit_slurm",
+        *(f"hydra.launcher.{k}={v}" for k, v in settings.items()),
+        "--cfg=hydra",
+    ]
     status, said, _ = typed(ROOT / "conf", COMMAND, words)
     launcher = yaml.safe_load(said)["hydra"]["launcher"]
     assert status == 0
@@ -165,10 +213,14 @@ def test_slurm_s_settings_compose_where_there_is_no_slurm(typed):
 
 def test_the_commands_of_the_page_about_clusters_are_understood():
     text = (ROOT / "docs" / "clusters.md").read_text(encoding="utf-8")
-    found = [shlex.split(line) for line in re.findall(r"^\$ (python .*)$", text, flags=re.MULTILINE)]
+    found = [
+        shlex.split(line) for line in re.findall(r"^\$ (python .*)$", text, flags=re.MULTILINE)
+    ]
     launchers = set()
     for _, script, *words in found:
-        overrides = check_overrides(ROOT / "conf", script.removesuffix(".py"), [w for w in words if w != "-m"])
+        overrides = check_overrides(
+            ROOT / "conf", script.removesuffix(".py"), [w for w in words if w != "-m"]
+        )
         launchers.add(ghpt.commands.jobs.chosen_launcher(overrides, compose_only=True))
     assert launchers == {"basic", "submitit_local", "submitit_slurm"}
 
@@ -180,10 +232,22 @@ def test_trainings_of_a_local_pool_are_those_of_one_process(typed, tmp_path, mon
     (conf / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
     monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests"))
     monkeypatch.setenv("OMP_NUM_THREADS", str(torch.get_num_threads()))
-    small = ("data=toy", "model.hypotheses=5", "model.scorer.layers=[4]", "trainer.accelerator=cpu", "seed=0,1")
+    small = (
+        "data=toy",
+        "model.hypotheses=5",
+        "model.scorer.layers=[4]",
+        "trainer.accelerator=cpu",
+        "seed=0,1",
+    )
     said = {}
     for launcher in ("basic", "submitit_local"):
-        words = ("-m", *small, "progress_bar=false", f"output={tmp_path / launcher}", f"hydra/launcher={launcher}")
+        words = (
+            "-m",
+            *small,
+            "progress_bar=false",
+            f"output={tmp_path / launcher}",
+            f"hydra/launcher={launcher}",
+        )
         status, text, errors = typed(conf, COMMAND, words)
         assert status == 0, errors
         said[launcher] = lines(text)[0]

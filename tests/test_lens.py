@@ -45,14 +45,20 @@ def test_undistorting_is_opencv_s_and_undoes_distorting(coefficients):
     np.testing.assert_allclose(distort(ideal, *as_tensors(K, coefficients)), pixels, atol=1e-8)
     accurate = (cv2.TERM_CRITERIA_MAX_ITER + cv2.TERM_CRITERIA_EPS, 500, 1e-12)
     iterate = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # one function from OpenCV 5
-    theirs = iterate(pixels[:, None], K, np.array(coefficients), R=None, P=K, criteria=accurate)[:, 0]
+    theirs = iterate(pixels[:, None], K, np.array(coefficients), R=None, P=K, criteria=accurate)[
+        :, 0
+    ]
     np.testing.assert_allclose(ideal, theirs, atol=1e-4)
 
 
 def test_real_cameras_are_undistorted_over_their_whole_images(shared_data):
-    panoptic = json.loads((shared_data / "panoptic/160906_band1/calibration_160906_band1.json").read_text())["cameras"]
+    panoptic = json.loads(
+        (shared_data / "panoptic/160906_band1/calibration_160906_band1.json").read_text()
+    )["cameras"]
     cameras = [(c["K"], c["distCoef"], c["resolution"]) for c in panoptic]
-    human36m = json.loads((shared_data / "human36m/camera-parameters.json").read_text())["intrinsics"].values()
+    human36m = json.loads((shared_data / "human36m/camera-parameters.json").read_text())[
+        "intrinsics"
+    ].values()
     cameras += [(c["calibration_matrix"], c["distortion"], (1000, 1002)) for c in human36m]
     matrices, lenses = as_tensors([c[0] for c in cameras], [c[1] for c in cameras])
     pixels = torch.from_numpy(np.stack([grid(*size, count=12) for _, _, size in cameras]))
@@ -60,7 +66,9 @@ def test_real_cameras_are_undistorted_over_their_whole_images(shared_data):
     assert exists.all()
     assert (distort(ideal, matrices, lenses) - pixels).abs().max() < 1e-7
     for camera in range(0, len(cameras), 40):
-        expected = opencv_distorted(ideal[camera].numpy(), matrices[camera].numpy(), lenses[camera].numpy())
+        expected = opencv_distorted(
+            ideal[camera].numpy(), matrices[camera].numpy(), lenses[camera].numpy()
+        )
         np.testing.assert_allclose(expected, pixels[camera], atol=1e-7)
 
 
@@ -76,8 +84,12 @@ def test_a_pixel_beyond_the_fold_is_no_point():
 
 
 def test_a_pole_of_the_rational_model_ends_the_image():
-    ideal, exists = undistort(*as_tensors([[510 + 1100 * r, 495] for r in (0.1, 0.5, 5)], K, (0, 0, 0, 0, 0, -1, 0, 0)))
-    assert exists.all()  # r / (1 - r^2) grows up to the pole at radius 1, and shows everything below it
+    ideal, exists = undistort(
+        *as_tensors([[510 + 1100 * r, 495] for r in (0.1, 0.5, 5)], K, (0, 0, 0, 0, 0, -1, 0, 0))
+    )
+    assert (
+        exists.all()
+    )  # r / (1 - r^2) grows up to the pole at radius 1, and shows everything below it
     assert (((ideal - torch.tensor(K[:2, 2])) / 1100).norm(dim=-1) < 1).all()
 
 

@@ -14,13 +14,17 @@ def weights_and_errors(items=6, count=9):
 def test_terms_against_a_loop():
     weights, errors = weights_and_errors()
     estimate = errors.mean(-1)
-    terms = StochasticLoss(alpha=1.0, beta=0.5, gamma=0.25, relative_errors=True)(weights, errors, estimate)
+    terms = StochasticLoss(alpha=1.0, beta=0.5, gamma=0.25, relative_errors=True)(
+        weights, errors, estimate
+    )
     for i in range(len(weights)):
         expected = sum(w * e / max(errors[i]) for w, e in zip(weights[i], errors[i], strict=True))
         entropy = -sum(w * torch.log(w) for w in weights[i])
         assert terms.stochastic[i] == pytest.approx(expected.item())
         assert terms.entropy[i] == pytest.approx(entropy.item())
-        assert terms.total[i] == pytest.approx((expected + 0.5 * entropy + 0.25 * estimate[i]).item())
+        assert terms.total[i] == pytest.approx(
+            (expected + 0.5 * entropy + 0.25 * estimate[i]).item()
+        )
 
 
 def test_absolute_errors_keep_their_unit_and_relative_ones_do_not():
@@ -28,7 +32,8 @@ def test_absolute_errors_keep_their_unit_and_relative_ones_do_not():
     for relative, factor in ((False, 1000.0), (True, 1.0)):
         loss = StochasticLoss(alpha=1.0, beta=0.0, gamma=0.0, relative_errors=relative)
         torch.testing.assert_close(
-            loss(weights, 1000 * errors, errors[:, 0]).total, factor * loss(weights, errors, errors[:, 0]).total
+            loss(weights, 1000 * errors, errors[:, 0]).total,
+            factor * loss(weights, errors, errors[:, 0]).total,
         )
 
 
@@ -40,8 +45,13 @@ def test_entropy_is_between_zero_and_log_h_and_safe_where_a_weight_underflows():
     one_hot.requires_grad_()
     loss = StochasticLoss(alpha=0.0, beta=1.0, gamma=0.0, relative_errors=True)
     zeros = torch.zeros(1)
-    entropy = {name: loss(w, torch.ones(1, count), zeros).entropy for name, w in (("u", uniform), ("o", one_hot))}
-    assert entropy["u"].item() == pytest.approx(torch.log(torch.tensor(float(count))).item(), rel=1e-5)
+    entropy = {
+        name: loss(w, torch.ones(1, count), zeros).entropy
+        for name, w in (("u", uniform), ("o", one_hot))
+    }
+    assert entropy["u"].item() == pytest.approx(
+        torch.log(torch.tensor(float(count))).item(), rel=1e-5
+    )
     assert entropy["o"].item() < 1e-30
     logits = torch.tensor([[0.0, -1e4, 50.0]], requires_grad=True)
     loss(torch.softmax(logits, -1), torch.ones(1, 3), zeros).total.sum().backward()
@@ -50,7 +60,9 @@ def test_entropy_is_between_zero_and_log_h_and_safe_where_a_weight_underflows():
 
 def test_gradients_are_right():
     _, errors = weights_and_errors(3, 5)
-    logits = torch.randn(3, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(2), requires_grad=True)
+    logits = torch.randn(
+        3, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(2), requires_grad=True
+    )
     loss = StochasticLoss(alpha=1.0, beta=0.01, gamma=0.02, relative_errors=True)
 
     def total(values):
@@ -63,11 +75,15 @@ def test_gradients_are_right():
 def test_all_errors_zero_is_finite():
     weights, errors = weights_and_errors(2, 3)
     loss = StochasticLoss(alpha=1.0, beta=0.0, gamma=0.0, relative_errors=True)
-    assert torch.equal(loss(weights, 0 * errors, 0 * errors[:, 0]).total, torch.zeros(2, dtype=torch.float64))
+    assert torch.equal(
+        loss(weights, 0 * errors, 0 * errors[:, 0]).total, torch.zeros(2, dtype=torch.float64)
+    )
 
 
 def test_uneven_shares_average_to_the_whole():
-    """What each process returns, averaged as DDP averages gradients, is the mean over all counted items."""
+    """What each process returns, averaged as DDP averages gradients, is the mean over all counted
+    items.
+    """
     values = torch.arange(10.0, dtype=torch.float64)
     counted = torch.tensor([1, 1, 0, 1, 1, 1, 0, 0, 1, 1], dtype=torch.bool)
     whole = values[counted].mean()

@@ -1,4 +1,6 @@
-"""E6 and B7: a process that is killed, and memory that runs out, end a run in one line, and it can go on."""
+"""E6 and B7: a process that is killed, and memory that runs out, end a run in one line, and it can
+go on.
+"""
 
 import multiprocessing
 import os
@@ -32,9 +34,14 @@ from toy_cells import cell
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="kills processes with SIGKILL")
 SMALL = (
-    "data=toy", "model.hypotheses=5", "model.scorer.layers=[4]", "trainer.accelerator=cpu", "progress_bar=false",
-    "save_every=2", "trainer.max_epochs=3",
-)  # fmt: skip
+    "data=toy",
+    "model.hypotheses=5",
+    "model.scorer.layers=[4]",
+    "trainer.accelerator=cpu",
+    "progress_bar=false",
+    "save_every=2",
+    "trainer.max_epochs=3",
+)
 
 
 @pytest.fixture
@@ -91,11 +98,17 @@ def no_memory_in_torch(_):
     torch.empty(1 << 60, dtype=torch.uint8)
 
 
-@pytest.mark.parametrize(("happens", "says"), [
-    (kill_the_next_worker, "error: data.workers: a process that loads batches was killed"),
-    (no_memory, "error: memory: there is not enough (an allocation failed). Give smaller batches"),
-    (no_memory_in_torch, "error: memory: there is not enough ("),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("happens", "says"),
+    [
+        (kill_the_next_worker, "error: data.workers: a process that loads batches was killed"),
+        (
+            no_memory,
+            "error: memory: there is not enough (an allocation failed). Give smaller batches",
+        ),
+        (no_memory_in_torch, "error: memory: there is not enough ("),
+    ],
+)
 def test_what_is_lost_in_a_step_is_named_in_a_line_and_the_run_goes_on(
     training, monkeypatch, forks, tmp_path, happens, says
 ):
@@ -142,24 +155,37 @@ def test_a_killed_process_of_a_pool_is_named_with_what_it_made(tmp_path, monkeyp
 def trainer_of(*commands: str) -> Mock:
     """What `told` needs of a trainer of two processes that has started these commands."""
     trainer = Mock(spec=L.Trainer, world_size=2)
-    trainer.strategy.launcher.procs = [subprocess.Popen(["/bin/sh", "-c", command]) for command in commands]
+    trainer.strategy.launcher.procs = [
+        subprocess.Popen(["/bin/sh", "-c", command]) for command in commands
+    ]
     return trainer
 
 
-@pytest.mark.parametrize(("command", "says"), [
-    ("kill -9 $$", r"^trainer.devices: process 2 of 2 was killed by signal 9; the system does so where memory is"),
-    ("exit 3", r"^trainer.devices: process 2 of 2 ended with status 3. "),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        (
+            "kill -9 $$",
+            r"^trainer.devices: process 2 of 2 was killed by signal 9; the system does so where memory is",
+        ),
+        ("exit 3", r"^trainer.devices: process 2 of 2 ended with status 3. "),
+    ],
+)
 def test_the_others_name_the_process_that_ended(command, says):
     trainer = trainer_of(command)
     with pytest.raises(GhptConfigError, match=says), lost.told(trainer):
-        raise RuntimeError("[gloo/transport/tcp/pair.cc:534] Connection closed by peer [127.0.1.1]:21345")
+        raise RuntimeError(
+            "[gloo/transport/tcp/pair.cc:534] Connection closed by peer [127.0.1.1]:21345"
+        )
 
 
 def test_a_process_that_others_started_is_none_of_ours(monkeypatch):
     monkeypatch.setattr(lost, "_WAIT", 0.0)
     started_by_slurm = trainer_of()
-    with pytest.raises(GhptConfigError, match="one of the run's 2 processes has ended"), lost.told(started_by_slurm):
+    with (
+        pytest.raises(GhptConfigError, match="one of the run's 2 processes has ended"),
+        lost.told(started_by_slurm),
+    ):
         raise RuntimeError("NCCL communicator was aborted")
 
 

@@ -38,7 +38,9 @@ def test_rows_become_an_array_whatever_their_order(tmp_path):
 
 
 def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):
-    _, _, points, seen = read_caliscope(table(tmp_path, "0,0,0,1.5,0,10,20,,", "0,1,0,1.5,0,,,,", "0,1,0,1.5,1,3,4,,"))
+    _, _, points, seen = read_caliscope(
+        table(tmp_path, "0,0,0,1.5,0,10,20,,", "0,1,0,1.5,0,,,,", "0,1,0,1.5,1,3,4,,")
+    )
     assert seen[0, :, :2].tolist() == [[True, False], [False, True]]
     assert (points[~seen] == 0).all()
 

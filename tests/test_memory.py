@@ -17,7 +17,8 @@ BATCH = 250
 ENVIRONMENT = {
     "PYTHONPATH": str(Path(__file__).parent),
     "OMP_NUM_THREADS": "1",
-    "MALLOC_ARENA_MAX": "1",  # else what glibc keeps for later use differs from run to run by more than a leak
+    # else what glibc keeps for later use differs from run to run by more than a leak
+    "MALLOC_ARENA_MAX": "1",
     "MALLOC_MMAP_THRESHOLD_": "65536",
 }
 
@@ -42,15 +43,27 @@ def child(folder: str, frames: int) -> None:
         def make(self, split):
             rng = np.random.default_rng(0)
             for take in range(frames // FRAMES):
-                yield toys.recording(f"S{take}/Walking-1", f"S{take % 2}", FRAMES, self.views, self.missing, rng)
+                yield toys.recording(
+                    f"S{take}/Walking-1", f"S{take % 2}", FRAMES, self.views, self.missing, rng
+                )
 
         def key(self, split):
             return super().key(split) | {"frames": frames}
 
     toys.Longer = Longer
-    data = toys.DATA | {"_target_": "toys.Longer", "stride": 1, "batch_size": BATCH, "cache": folder}
+    data = toys.DATA | {
+        "_target_": "toys.Longer",
+        "stride": 1,
+        "batch_size": BATCH,
+        "cache": folder,
+    }
     baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
-    config = toys.TRAIN | {"data": data, "ckpt": f"{folder}/last.ckpt", "hypotheses": None, "baselines": baselines}
+    config = toys.TRAIN | {
+        "data": data,
+        "ckpt": f"{folder}/last.ckpt",
+        "hypotheses": None,
+        "baselines": baselines,
+    }
     peak = [0.0]
 
     def watch() -> None:
@@ -72,7 +85,9 @@ def test_testing_holds_one_batch_however_many_frames(tmp_path):
     peaks = []
     for times in (1, 6):
         command = [sys.executable, __file__, str(tmp_path), str(times * FRAMES)]
-        run = subprocess.run(command, env=os.environ | ENVIRONMENT, check=True, capture_output=True, timeout=300)
+        run = subprocess.run(
+            command, env=os.environ | ENVIRONMENT, check=True, capture_output=True, timeout=300
+        )
         result = json.loads(run.stdout.splitlines()[-1])
         assert result["frames"] == times * FRAMES
         peaks.append(result["peak"])

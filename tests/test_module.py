@@ -30,7 +30,9 @@ class Numbers:
 
 
 class GuessTheNumber:
-    """Hypotheses are the truth plus noise; the feature is the noise, so a scorer can learn to prefer little of it."""
+    """Hypotheses are the truth plus noise; the feature is the noise, so a scorer can learn to
+    prefer little of it.
+    """
 
     measures, feature_size = "distance", 1
 
@@ -71,16 +73,27 @@ def module(**changes):
         "scorer": partial(Scorer, layers=[16], clip=10.0, bfloat16=False),
         "loss": StochasticLoss(alpha=1.0, beta=0.01, gamma=0.02, relative_errors=True),
         "optimizer": partial(torch.optim.Adam, lr=0.02),
-        "hypotheses": 20, "temperature": 1.5, "gumbel": True, "spread": 1.5, "selection": "weight", "seed": 0,
-    }  # fmt: skip
+        "hypotheses": 20,
+        "temperature": 1.5,
+        "gumbel": True,
+        "spread": 1.5,
+        "selection": "weight",
+        "seed": 0,
+    }
     return StochasticEstimator(**(settings | changes))
 
 
 def trainer(tmp_path, epochs=8):
     return L.Trainer(
-        accelerator="cpu", max_epochs=epochs, logger=False, enable_checkpointing=False, enable_progress_bar=False,
-        enable_model_summary=False, default_root_dir=tmp_path, num_sanity_val_steps=0,
-    )  # fmt: skip
+        accelerator="cpu",
+        max_epochs=epochs,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        default_root_dir=tmp_path,
+        num_sanity_val_steps=0,
+    )
 
 
 @pytest.mark.parametrize("changes", [{}, {"gumbel": False}, {"selection": "stochastic"}])
@@ -88,7 +101,9 @@ def test_training_makes_the_weighted_selection_better_than_the_average(tmp_path,
     assert isinstance(GuessTheNumber(), Problem)
     run = trainer(tmp_path)
     run.fit(module(**changes), datamodule=NumbersData())
-    weight, average = (run.callback_metrics[f"validation/{n}"].item() for n in ("weight", "average"))
+    weight, average = (
+        run.callback_metrics[f"validation/{n}"].item() for n in ("weight", "average")
+    )
     assert weight < 0.6 * average
 
 
@@ -103,7 +118,9 @@ def test_test_step_gives_every_selection_and_a_summary(tmp_path):
     for name in ("most", "least", "stochastic", "random"):
         assert (errors["best"] <= errors[name]).all()
         assert (errors[name] <= errors["worst"]).all()
-    assert ((summary["entropy"] >= 0) & (summary["entropy"] <= torch.log(torch.tensor(20.0)) + 1e-5)).all()
+    assert (
+        (summary["entropy"] >= 0) & (summary["entropy"] <= torch.log(torch.tensor(20.0)) + 1e-5)
+    ).all()
     assert ((summary["effective"] >= 1 - 1e-5) & (summary["effective"] <= 20 + 1e-4)).all()
 
 
@@ -138,7 +155,11 @@ def test_a_loss_that_is_not_finite_stops_with_the_samples(tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "key"),
-    [({"hypotheses": 0}, "hypotheses"), ({"temperature": 0.0}, "temperature"), ({"selection": "best"}, "selection")],
+    [
+        ({"hypotheses": 0}, "hypotheses"),
+        ({"temperature": 0.0}, "temperature"),
+        ({"selection": "best"}, "selection"),
+    ],
 )
 def test_out_of_range_settings_are_named(change, key):
     with pytest.raises(GhptConfigError, match=rf"model\.{key}"):

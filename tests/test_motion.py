@@ -7,9 +7,22 @@ from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS
 
 RATE = 50.0
 HUMAN36M = {
-    "Directions", "Discussion", "Eating", "Greeting", "Phoning", "Posing", "Purchases", "Sitting", "SittingDown",
-    "Smoking", "TakingPhoto", "Waiting", "Walking", "WalkingDog", "WalkingTogether",
-}  # fmt: skip
+    "Directions",
+    "Discussion",
+    "Eating",
+    "Greeting",
+    "Phoning",
+    "Posing",
+    "Purchases",
+    "Sitting",
+    "SittingDown",
+    "Smoking",
+    "TakingPhoto",
+    "Waiting",
+    "Walking",
+    "WalkingDog",
+    "WalkingTogether",
+}
 
 
 def take(action: str, seed: int = 0, frames: int = 1000) -> tuple[np.ndarray, float]:
@@ -47,7 +60,9 @@ def test_motion_is_possible(action):
     for side in ("right", "left"):
         for chain in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist")):
             assert bend(joints, side, chain).max() < 155
-    lowest = joints[:, [JOINT["right_ankle"], JOINT["left_ankle"], JOINT["right_knee"], PELVIS], 2].min(axis=1)
+    lowest = joints[
+        :, [JOINT["right_ankle"], JOINT["left_ankle"], JOINT["right_knee"], PELVIS], 2
+    ].min(axis=1)
     assert lowest.min() > 0
     assert lowest.max() < 0.14 * stature
 
@@ -64,8 +79,8 @@ def test_knees_bend_backward(action):
 
 @pytest.mark.parametrize("action", actions())
 def test_elbows_bend_one_way_about_the_upper_arm(action):
-    # However the arm is turned, the shoulder-elbow-wrist plane's normal has one sign against the humeral axis' x:
-    # so a straight arm is never passed.
+    # However the arm is turned, the shoulder-elbow-wrist plane's normal has one sign against the
+    # humeral axis' x: so a straight arm is never passed.
     joints, _ = take(action, seed=2)
     for side in ("right", "left"):
         bent = bend(joints, side, ("shoulder", "elbow", "wrist"))
@@ -94,7 +109,11 @@ def test_the_walker_faces_the_way_it_goes():
     across = joints[:, JOINT["left_hip"]] - joints[:, JOINT["right_hip"]]
     forward = np.stack([across[:, 1], -across[:, 0]], axis=-1)[25:-25]
     going = joints[50:, PELVIS, :2] - joints[:-50, PELVIS, :2]
-    cosine = (forward * going).sum(-1) / np.linalg.norm(forward, axis=-1) / np.linalg.norm(going, axis=-1)
+    cosine = (
+        (forward * going).sum(-1)
+        / np.linalg.norm(forward, axis=-1)
+        / np.linalg.norm(going, axis=-1)
+    )
     assert np.median(cosine) > 0.9
 
 
@@ -112,7 +131,9 @@ def test_left_handed_people_use_the_other_hand():
     rng = np.random.default_rng
     body = random_body(rng(0))
     lifted = [
-        move(body, "Phoning", 500, RATE, rng(1), left_handed)[:, [JOINT["right_wrist"], JOINT["left_wrist"]], 2]
+        move(body, "Phoning", 500, RATE, rng(1), left_handed)[
+            :, [JOINT["right_wrist"], JOINT["left_wrist"]], 2
+        ]
         for left_handed in (False, True)
     ]
     assert (np.diff(lifted[0].mean(axis=0)) < 0).all()
@@ -122,7 +143,9 @@ def test_left_handed_people_use_the_other_hand():
 def test_keyframes_rest_in_the_postures_and_stay_between_them():
     time = np.arange(4000) / RATE
     postures = np.array([[0.0, 1.0], [1.0, 0.0]])
-    curve = keyframes(np.random.default_rng(5), time, postures, [1.0, 3.0], 0.0, hold=1.0, reach=0.5)
+    curve = keyframes(
+        np.random.default_rng(5), time, postures, [1.0, 3.0], 0.0, hold=1.0, reach=0.5
+    )
     assert curve.min() >= 0
     assert curve.max() <= 1
     resting = np.abs(np.diff(curve[:, 0])) == 0

@@ -12,16 +12,29 @@ from ghpt.errors import GhptDataError
 
 NAMES = (
     "Nose",
-    *(f"{side}_{part}" for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in "LR"),
+    *(
+        f"{side}_{part}"
+        for part in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
+        for side in "LR"
+    ),
 )
 POINTS = np.random.default_rng(0).uniform(1, 500, (5, len(NAMES), 2)).round(2)
 
 
 def csv(path, likelihood=0.9, rows=range(5)):
-    head = [["scorer", "bodyparts", "coords"], *([*("model", n, c)] for n in NAMES for c in ("x", "y", "likelihood"))]
+    head = [
+        ["scorer", "bodyparts", "coords"],
+        *([*("model", n, c)] for n in NAMES for c in ("x", "y", "likelihood")),
+    ]
     lines = [",".join(column[i] for column in head) for i in range(3)]
     for t in rows:
-        lines.append(",".join(map(str, [t, *np.column_stack([POINTS[t], np.full(len(NAMES), likelihood)]).ravel()])))
+        lines.append(
+            ",".join(
+                map(
+                    str, [t, *np.column_stack([POINTS[t], np.full(len(NAMES), likelihood)]).ravel()]
+                )
+            )
+        )
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -48,7 +61,9 @@ class Array:
 
 def movement_s(read):
     """A package movement whose every loader is ``read``."""
-    package, io, poses = (types.ModuleType(name) for name in ("movement", "movement.io", "movement.io.load_poses"))
+    package, io, poses = (
+        types.ModuleType(name) for name in ("movement", "movement.io", "movement.io.load_poses")
+    )
     poses.from_dlc_file = poses.from_lp_file = poses.from_sleap_file = read
     io.load_poses, package.io = poses, io
     return {"movement": package, "movement.io": io, "movement.io.load_poses": poses}
@@ -61,8 +76,11 @@ def test_what_movement_reads_is_taken_by_name(tmp_path, monkeypatch):
     confidence = np.full(position[:, 0].shape, 0.7)
     confidence[:, 2] = np.nan
     dims = ("time", "space", "keypoints", "individuals")
-    data = Data(position=Array(position, dims), keypoints=Array(np.array(NAMES), ("keypoints",)),
-                confidence=Array(confidence, ("time", "keypoints", "individuals")))  # fmt: skip
+    data = Data(
+        position=Array(position, dims),
+        keypoints=Array(np.array(NAMES), ("keypoints",)),
+        confidence=Array(confidence, ("time", "keypoints", "individuals")),
+    )
     for name, module in movement_s(lambda file: data).items():
         monkeypatch.setitem(sys.modules, name, module)
     for name in ("cam1DLC_resnet50_trial.csv", "cam2DLC_resnet50_trial.csv"):
@@ -82,7 +100,9 @@ def test_what_movement_cannot_read_is_named(tmp_path, monkeypatch):
     for name, module in movement_s(fail).items():
         monkeypatch.setitem(sys.modules, name, module)
     csv(tmp_path / "cam1.csv")
-    with pytest.raises(GhptDataError, match=r"cam1\.csv: is damaged, or not DeepLabCut's \('bodyparts'\)"):
+    with pytest.raises(
+        GhptDataError, match=r"cam1\.csv: is damaged, or not DeepLabCut's \('bodyparts'\)"
+    ):
         read_people(tmp_path)
 
 

@@ -52,7 +52,11 @@ def script():
 @pytest.fixture
 def toy(tmp_path: Path) -> Path:
     """A project with one module and its test."""
-    for name, text in (("src/ghpt/__init__.py", ""), ("src/ghpt/toy.py", TOY), ("tests/test_toy.py", TEST)):
+    for name, text in (
+        ("src/ghpt/__init__.py", ""),
+        ("src/ghpt/toy.py", TOY),
+        ("tests/test_toy.py", TEST),
+    ):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(text, encoding="utf-8")

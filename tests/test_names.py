@@ -1,4 +1,6 @@
-"""Names of views and cameras in settings: what the user typed is found, whatever the command line took it for."""
+"""Names of views and cameras in settings: what the user typed is found, whatever the command line
+took it for.
+"""
 
 from typing import get_type_hints
 

@@ -78,7 +78,9 @@ def test_key_points_are_usable_up_to_the_limit_in_valid_cameras():
 def test_local_cameras_see_the_same_from_their_median_centre():
     scene = random_scene(1, frames=2, views=3, place=1e6)
     local, origin = local_cameras(scene.cameras)
-    torch.testing.assert_close(origin, scene.cameras.centre.median(dim=-2).values, rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        origin, scene.cameras.centre.median(dim=-2).values, rtol=0, atol=1e-6
+    )
     pixels, depth = project(local, scene.points - origin[:, None])
     torch.testing.assert_close(pixels, scene.key_points, rtol=0, atol=1e-6)
     torch.testing.assert_close(depth, project(scene.cameras, scene.points)[1], rtol=0, atol=1e-6)
@@ -99,19 +101,26 @@ def test_the_equations_of_a_view_are_its_rows_squared():
     scene.cameras.K[..., 0, 1] = 7  # skew
     usable = torch.rand(2, 3, 17, generator=torch.Generator().manual_seed(0)) < 0.7
     found = view_equations(scene.cameras, scene.key_points, usable)
-    K, R, t, x = (array.numpy() for array in (scene.cameras.K, scene.cameras.R, scene.cameras.t, scene.key_points))
+    K, R, t, x = (
+        array.numpy()
+        for array in (scene.cameras.K, scene.cameras.R, scene.cameras.t, scene.key_points)
+    )
     for b, v, j in np.ndindex(2, 3, 17):
         P = K[b, v] @ np.column_stack([R[b, v], t[b, v]])
         rows = np.array([x[b, v, j, i] * P[2] - P[i] for i in range(2)])
         matrix, right = rows[:, :3].T @ rows[:, :3], -rows[:, :3].T @ rows[:, 3]
         expected = [matrix[place] for place in SYMMETRIC] + list(right)
-        np.testing.assert_allclose(found[b, v, j], bool(usable[b, v, j]) * np.array(expected), rtol=1e-9, atol=1e-6)
+        np.testing.assert_allclose(
+            found[b, v, j], bool(usable[b, v, j]) * np.array(expected), rtol=1e-9, atol=1e-6
+        )
 
 
 def test_a_weighted_sum_is_over_the_views():
     rng = torch.Generator().manual_seed(0)
     equations, weights = torch.rand(3, 9, 5, generator=rng), torch.rand(3, 5, generator=rng)
-    torch.testing.assert_close(weighted_sum(equations, weights), (equations * weights[:, None]).sum(0))
+    torch.testing.assert_close(
+        weighted_sum(equations, weights), (equations * weights[:, None]).sum(0)
+    )
 
 
 def test_minors_are_the_cofactors():
@@ -126,9 +135,13 @@ def test_minors_are_the_cofactors():
 def test_a_system_that_is_nearly_singular_is_not_solved(smallest, solved):
     """tr(M) tr(M^-1) of diag(1, 1, e) is about 2 / e."""
     numbers = (1.0, 0.0, 0.0, 1.0, 0.0, smallest, 2.0, 3.0, 4.0 * smallest)
-    *solution, condition = solve_symmetric(tuple(torch.tensor([n], dtype=torch.float64) for n in numbers))
+    *solution, condition = solve_symmetric(
+        tuple(torch.tensor([n], dtype=torch.float64) for n in numbers)
+    )
     if solved:
-        torch.testing.assert_close(torch.cat(solution), torch.tensor([2.0, 3.0, 4.0], dtype=torch.float64))
+        torch.testing.assert_close(
+            torch.cat(solution), torch.tensor([2.0, 3.0, 4.0], dtype=torch.float64)
+        )
         assert condition == pytest.approx((2 + smallest) * (2 + 1 / smallest))
     else:
         assert torch.cat(solution).tolist() == [0, 0, 0]

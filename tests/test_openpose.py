@@ -1,4 +1,6 @@
-"""OpenPose's folders: frames by their numbers, missing ones missing, and one person followed through each view."""
+"""OpenPose's folders: frames by their numbers, missing ones missing, and one person followed
+through each view.
+"""
 
 import json
 
@@ -22,19 +24,28 @@ def person(x: float = 0, size: float = 1, confidence: float = 0.8) -> np.ndarray
 def write(folder, people, name="cam1_{:012d}_keypoints.json", frames=None):
     folder.mkdir(parents=True, exist_ok=True)
     for frame, found in zip(frames or range(len(people)), people, strict=True):
-        content = {"version": 1.3, "people": [{"pose_keypoints_2d": p.ravel().tolist()} for p in found]}
+        content = {
+            "version": 1.3,
+            "people": [{"pose_keypoints_2d": p.ravel().tolist()} for p in found],
+        }
         (folder / name.format(frame)).write_text(json.dumps(content))
 
 
 def test_frames_keep_their_numbers_and_gaps_stay_gaps(tmp_path):
     write(tmp_path / "cam1", [[person(t)] for t in range(6)])
-    write(tmp_path / "cam2", [[person(100 + t)] for t in (0, 2, 3, 7)], "x.{:04d}.json", frames=[0, 2, 3, 7])
+    write(
+        tmp_path / "cam2",
+        [[person(100 + t)] for t in (0, 2, 3, 7)],
+        "x.{:04d}.json",
+        frames=[0, 2, 3, 7],
+    )
     found = read_key_points(tmp_path, **JOINTS)
     assert found.frame.tolist() == [0, 1, 2, 3, 4, 5, 7]
     assert found.seen[:, 0, 0].tolist() == [True] * 6 + [False]
     assert found.seen[:, 1, 0].tolist() == [True, False, True, True, False, False, True]
     np.testing.assert_allclose(
-        found.key_points[[0, 2, 3, 6], 1, :, 0] - BODY[:, 0], np.array([[100], [102], [103], [107]]) + np.zeros(25)
+        found.key_points[[0, 2, 3, 6], 1, :, 0] - BODY[:, 0],
+        np.array([[100], [102], [103], [107]]) + np.zeros(25),
     )
     assert found.joints == SKELETONS["body_25b"]
 
@@ -52,7 +63,9 @@ def test_zeros_are_missing_and_confidence_stays_in_its_range(tmp_path):
 
 
 def test_the_person_tracked_best_is_followed_wherever_the_list_has_them():
-    """A small unsure passer-by, listed first or last; and one who is larger for some frames, but passes."""
+    """A small unsure passer-by, listed first or last; and one who is larger for some frames, but
+    passes.
+    """
     rng = np.random.default_rng(1)
     people, truth = [], []
     for t in range(40):
@@ -75,9 +88,18 @@ def test_following_is_the_best_of_all_choices():
     from ghpt.data.formats.openpose import _JUMP, _jump, _quality
 
     rng = np.random.default_rng(5)
-    people = [np.stack([person(rng.uniform(0, 300), rng.uniform(0.5, 1.5), rng.uniform(0.2, 1)) for _ in range(3)])
-              for _ in range(5)]  # fmt: skip
-    quality = np.stack([_quality(found) for found in people]) / max(_quality(found).max() for found in people)
+    people = [
+        np.stack(
+            [
+                person(rng.uniform(0, 300), rng.uniform(0.5, 1.5), rng.uniform(0.2, 1))
+                for _ in range(3)
+            ]
+        )
+        for _ in range(5)
+    ]
+    quality = np.stack([_quality(found) for found in people]) / max(
+        _quality(found).max() for found in people
+    )
 
     def value(choice):
         jumps = sum(_jump(people[t], people[t + 1])[choice[t], choice[t + 1]] for t in range(4))
@@ -157,7 +179,9 @@ def test_cameras_without_a_common_frame_are_refused(tmp_path):
 
 
 def test_bad_folders_are_named(tmp_path):
-    with pytest.raises(GhptDataError, match=r"holds no folder with OpenPose's JSON files.*for each camera"):
+    with pytest.raises(
+        GhptDataError, match=r"holds no folder with OpenPose's JSON files.*for each camera"
+    ):
         read_key_points(tmp_path)
     write(tmp_path / "a", [[]] * 3)
     with pytest.raises(GhptDataError, match="people: is empty"):
@@ -176,12 +200,32 @@ def test_bad_folders_are_named(tmp_path):
         ("01.json", '{"people": []}', "has the frame number 1, as 01.json has"),
         ("9.json", '{"people": [', "is not valid JSON"),
         ("9.json", '{"people": 1}', "people: is not a list of people"),
-        ("9.json", '{"people": [{}]}', r"people\[0\]\.pose_keypoints_2d: is not a list of x, y, confidence"),
-        ("9.json", '{"people": [{"pose_keypoints_2d": [1, 2]}]}', "is not a list of x, y, confidence"),
+        (
+            "9.json",
+            '{"people": [{}]}',
+            r"people\[0\]\.pose_keypoints_2d: is not a list of x, y, confidence",
+        ),
+        (
+            "9.json",
+            '{"people": [{"pose_keypoints_2d": [1, 2]}]}',
+            "is not a list of x, y, confidence",
+        ),
         ("9.json", '{"people": [{"pose_keypoints_2d": [NaN, 2, 3]}]}', "NaN is no JSON number"),
-        ("9.json", '{"people": [{"pose_keypoints_2d": [1e300, 2, 3]}]}', "holds a number beyond 1e6"),
-        ("9.json", '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}', "people of 1 joints, the files before of 25"),
-        ("9.json", '{"people": [' + ",".join(['{"pose_keypoints_2d": []}'] * 65) + "]}", "65 people are in a frame"),
+        (
+            "9.json",
+            '{"people": [{"pose_keypoints_2d": [1e300, 2, 3]}]}',
+            "holds a number beyond 1e6",
+        ),
+        (
+            "9.json",
+            '{"people": [{"pose_keypoints_2d": [1, 2, 3]}]}',
+            "people of 1 joints, the files before of 25",
+        ),
+        (
+            "9.json",
+            '{"people": [' + ",".join(['{"pose_keypoints_2d": []}'] * 65) + "]}",
+            "65 people are in a frame",
+        ),
     ],
 )
 def test_a_bad_file_is_named(name, content, says, tmp_path):

@@ -1,4 +1,6 @@
-"""The user's files stay the user's: what an output folder lets a command replace, and who may write there."""
+"""The user's files stay the user's: what an output folder lets a command replace, and who may write
+there.
+"""
 
 import hashlib
 import json
@@ -64,7 +66,9 @@ def test_a_file_that_was_changed_since_is_foreign(tmp_path):
     with OutputFolder(tmp_path, WRITES):
         write(tmp_path, "a.txt", "ours")
     (tmp_path / "a.txt").write_text("ours, with notes of mine")
-    with pytest.raises(GhptDataError, match=r"a\.txt: was not written by ghpt, or has been changed"):
+    with pytest.raises(
+        GhptDataError, match=r"a\.txt: was not written by ghpt, or has been changed"
+    ):
         OutputFolder(tmp_path, WRITES).__enter__()
     (tmp_path / "a.txt").write_text("ours")  # the same content again is the same file
     with OutputFolder(tmp_path, WRITES):
@@ -102,7 +106,9 @@ def test_overwrite_insists_but_never_on_an_input(tmp_path):
         write(tmp_path, "a.txt", "ours")
         remove(tmp_path / "b.txt")
     assert contents(tmp_path).keys() == {"a.txt"}
-    with pytest.raises(GhptDataError, match=r"a\.txt: is an input of this command"):  # although it is ours now
+    with pytest.raises(
+        GhptDataError, match=r"a\.txt: is an input of this command"
+    ):  # although it is ours now
         OutputFolder(tmp_path, reading).__enter__()
 
 
@@ -126,7 +132,9 @@ def test_what_is_kept_is_replaced_on_request_alone(tmp_path):
     with OutputFolder(tmp_path, keeping):
         write(tmp_path, "a.txt", "first")
         write(tmp_path, "a.txt", "second")  # within a run it may be
-    with pytest.raises(GhptDataError, match=r"a\.txt: is there from an earlier run\. .*resume=true.*overwrite=true"):
+    with pytest.raises(
+        GhptDataError, match=r"a\.txt: is there from an earlier run\. .*resume=true.*overwrite=true"
+    ):
         OutputFolder(tmp_path, keeping).__enter__()
     with OutputFolder(tmp_path, keeping, overwrite=True):
         write(tmp_path, "a.txt", "third")
@@ -169,7 +177,9 @@ def test_a_crash_around_the_move_leaves_a_file_that_is_still_ours(tmp_path, monk
         write(tmp_path, "a.txt", "third")
 
 
-@pytest.mark.parametrize("damage", [b"", b"{", b"[1, 2]", b'{"version": 99}', b'{"version": 1, "files": 3}'])
+@pytest.mark.parametrize(
+    "damage", [b"", b"{", b"[1, 2]", b'{"version": 99}', b'{"version": 1, "files": 3}']
+)
 def test_with_a_damaged_manifest_nothing_is_ours(tmp_path, damage):
     with OutputFolder(tmp_path, WRITES):
         write(tmp_path, "a.txt", "ours")
@@ -185,7 +195,9 @@ def test_b10_a_second_writer_is_refused_at_once_and_a_dead_ones_lock_is_taken_ov
         "with OutputFolder(Path(sys.argv[1]), Files()):\n"
         "    print('in', flush=True); time.sleep(600)\n"
     )
-    with subprocess.Popen([sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(
+        [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    ) as child:
         try:
             assert child.stdout.readline() == "in\n"
             start = time.monotonic()
@@ -235,7 +247,12 @@ def test_the_stamp_of_a_folder_changes_with_any_file_below_it(tmp_path):
 
 
 def test_the_inputs_of_a_command_are_those_that_its_settings_name(tmp_path):
-    settings = {"ckpt": "m.ckpt", "keypoints": "pose", "cameras": str(tmp_path), "data": {"root": "/data"}}
+    settings = {
+        "ckpt": "m.ckpt",
+        "keypoints": "pose",
+        "cameras": str(tmp_path),
+        "data": {"root": "/data"},
+    }
     found = input_paths(settings)
     named = [Path("m.ckpt"), Path("pose"), tmp_path, Path("/data")]
     assert set(found) == {*named, tmp_path / "intri.yml", tmp_path / "extri.yml"}
@@ -243,21 +260,39 @@ def test_the_inputs_of_a_command_are_those_that_its_settings_name(tmp_path):
 
 
 def test_the_folder_of_key_points_is_no_output(tmp_path):
-    with pytest.raises(GhptConfigError, match=r"output: is .*, the folder that the key points are read from"):
+    with pytest.raises(
+        GhptConfigError, match=r"output: is .*, the folder that the key points are read from"
+    ):
         check_apart({"keypoints": str(tmp_path), "output": f"{tmp_path}/."})
     check_apart({"keypoints": str(tmp_path), "output": f"{tmp_path}/out"})
 
 
 COMMANDS = {
-    "predict": (predict.COMMAND, [], ["poses.npz", "poses.csv", "report.md", "prediction.json", ".shards/000000.npz"]),
+    "predict": (
+        predict.COMMAND,
+        [],
+        ["poses.npz", "poses.csv", "report.md", "prediction.json", ".shards/000000.npz"],
+    ),
     "calibrate": (
         ghpt.commands.calibrate.COMMAND,
         [],
         ["extri.yml", "rig.toml", "poses.npz", "calibration.json", "rig.png"],
     ),
-    "cameras": (ghpt.commands.cameras.COMMAND, [], ["cameras.toml", "keypoints.npz", "checkup.json", "report.md"]),
-    "train": (train.COMMAND, ["data=cmu2"], ["last.ckpt", "best.ckpt", "train.log", ".hydra/config.yaml"]),
-    "test": (testing.COMMAND, ["ckpt=last.ckpt"], ["metrics.json", "predictions.npz", ".predictions/frame"]),
+    "cameras": (
+        ghpt.commands.cameras.COMMAND,
+        [],
+        ["cameras.toml", "keypoints.npz", "checkup.json", "report.md"],
+    ),
+    "train": (
+        train.COMMAND,
+        ["data=cmu2"],
+        ["last.ckpt", "best.ckpt", "train.log", ".hydra/config.yaml"],
+    ),
+    "test": (
+        testing.COMMAND,
+        ["ckpt=last.ckpt"],
+        ["metrics.json", "predictions.npz", ".predictions/frame"],
+    ),
 }
 
 
@@ -296,7 +331,12 @@ def test_a_prediction_does_not_overwrite_its_key_points(typed, tmp_path):
     (tmp_path / "poses.npz").write_bytes(b"key points")
     before = contents(tmp_path)
     cameras = cameras_file(tmp_path)
-    words = [f"keypoints={tmp_path / 'poses.npz'}", f"cameras={cameras}", f"output={tmp_path}", "overwrite=true"]
+    words = [
+        f"keypoints={tmp_path / 'poses.npz'}",
+        f"cameras={cameras}",
+        f"output={tmp_path}",
+        "overwrite=true",
+    ]
     status, _, said = typed(ROOT / "conf", predict.COMMAND, words)
     assert (status, said.count("\n")) == (1, 1)
     assert "poses.npz: is an input of this command. Name another output." in said
@@ -311,16 +351,20 @@ def sweep(tmp_path):
     """``sweep(*words)`` runs toy_sweep.py in a child: (exit status, what it printed)."""
     hydra = yaml.safe_load((ROOT / "conf" / "train.yaml").read_text())["hydra"]
     content = {
-        "how": "well", "output": str(tmp_path / "out"), "overwrite": False,
+        "how": "well",
+        "output": str(tmp_path / "out"),
+        "overwrite": False,
         "hydra": {key: value for key, value in hydra.items() if key != "help"},
-    }  # fmt: skip
+    }
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "toy.yaml").write_text(yaml.safe_dump(content))
     environment = os.environ | {"TOY_CONF": str(tmp_path / "conf")}
     environment.pop("HYDRA_FULL_ERROR", None)
 
     def run(*words):
-        done = subprocess.run([*SWEEP, *words], env=environment, capture_output=True, text=True, timeout=300)
+        done = subprocess.run(
+            [*SWEEP, *words], env=environment, capture_output=True, text=True, timeout=300
+        )
         return done.returncode, done.stdout + done.stderr
 
     return run
@@ -372,7 +416,9 @@ def test_the_manifest_lists_what_was_written_with_its_digest(typed, tmp_path):
     status, _, _ = typed(ROOT / "conf", predict.COMMAND, words)
     assert status == 1
     manifest = json.loads((tmp_path / STATE / "manifest.json").read_text())
-    assert manifest["files"].keys() == {f".hydra/{name}.yaml" for name in ("config", "hydra", "overrides")}
+    assert manifest["files"].keys() == {
+        f".hydra/{name}.yaml" for name in ("config", "hydra", "overrides")
+    }
     for name, digests in manifest["files"].items():
         assert digests == [hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()]
     assert manifest["growing"] == [".shards", "predict.log"]

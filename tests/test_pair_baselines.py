@@ -8,15 +8,26 @@ from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.metrics.relative_pose import rotation_deg, translation_deg
-from ghpt.models.relative_pose.baselines import EightPoint, PoseLib, Ransac, Usac, _distinct, size_in_image
+from ghpt.models.relative_pose.baselines import (
+    EightPoint,
+    PoseLib,
+    Ransac,
+    Usac,
+    _distinct,
+    size_in_image,
+)
 from ghpt.randomness import key, uniform
 from ghpt.recording import PairBatch, RelativePoseEstimate
 from scenes import random_scene
 
 ROBUST = {
     "ransac": Ransac(samples=200, threshold=0.02, seed=0),
-    "usac_magsac": Usac(method="USAC_MAGSAC", threshold=0.02, pixels=200.0, confidence=0.999, iterations=1000),
-    "usac_accurate": Usac(method="USAC_ACCURATE", threshold=0.02, pixels=200.0, confidence=0.999, iterations=1000),
+    "usac_magsac": Usac(
+        method="USAC_MAGSAC", threshold=0.02, pixels=200.0, confidence=0.999, iterations=1000
+    ),
+    "usac_accurate": Usac(
+        method="USAC_ACCURATE", threshold=0.02, pixels=200.0, confidence=0.999, iterations=1000
+    ),
     "poselib": PoseLib(threshold=0.02, loss="CAUCHY", scale=0.01, iterations=1000, seed=0),
 }
 ALL = {"eight_point": EightPoint(), **ROBUST}
@@ -25,31 +36,43 @@ each_robust = pytest.mark.parametrize("baseline", ROBUST.values(), ids=ROBUST.ke
 EYE = torch.eye(3, dtype=torch.float64)
 
 
-def pairs(seeds=range(3), frames=20, sigma=0.0, views=3, change=lambda rig, points: (rig, points)) -> PairBatch:
+def pairs(
+    seeds=range(3), frames=20, sigma=0.0, views=3, change=lambda rig, points: (rig, points)
+) -> PairBatch:
     """One pair of views (2, 0) of one rig for each seed, before it a person who walks about."""
     rigs, key_points = [], []
     for seed in seeds:
         scene = random_scene(seed, frames, views)
-        place = torch.rand(frames, 1, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        place = torch.rand(
+            frames, 1, 3, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+        )
         rig, points = change(scene.cameras.index(0), scene.points + 2000 * (place - 0.5))
-        noise = torch.randn(frames, views, 17, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+        noise = torch.randn(
+            frames, views, 17, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
+        )
         everyone = Cameras(*(x.expand(frames, *x.shape) for x in (rig.K, rig.R, rig.t)))
         rigs.append(rig)
         key_points.append((project(everyone, points)[0] + sigma * noise).transpose(0, 1))
     count = len(rigs)
     shape = (count, views, frames, 17)
     return PairBatch(
-        sample=torch.arange(count), rig=torch.arange(count), draw=torch.arange(count),
+        sample=torch.arange(count),
+        rig=torch.arange(count),
+        draw=torch.arange(count),
         pair=torch.tensor([[2, 0]]).expand(count, 2),
         cameras=Cameras(*(torch.stack([getattr(r, n) for r in rigs]) for n in ("K", "R", "t"))),
-        key_points=torch.stack(key_points), confidence=torch.ones(shape, dtype=torch.float64),
-        seen=torch.ones(shape, dtype=torch.bool), points=torch.zeros(count, 1, 3, dtype=torch.float64),
-    )  # fmt: skip
+        key_points=torch.stack(key_points),
+        confidence=torch.ones(shape, dtype=torch.float64),
+        seen=torch.ones(shape, dtype=torch.bool),
+        points=torch.zeros(count, 1, 3, dtype=torch.float64),
+    )
 
 
 def part(batch: PairBatch, index) -> PairBatch:
     values = {f.name: getattr(batch, f.name) for f in fields(PairBatch)}
-    return PairBatch(**{n: v.index(index) if isinstance(v, Cameras) else v[index] for n, v in values.items()})
+    return PairBatch(
+        **{n: v.index(index) if isinstance(v, Cameras) else v[index] for n, v in values.items()}
+    )
 
 
 def with_outliers(batch: PairBatch, share=0.2) -> PairBatch:
@@ -70,7 +93,10 @@ def degrees(estimate: RelativePoseEstimate, batch: PairBatch):
 
 
 def equal(one: RelativePoseEstimate, other: RelativePoseEstimate) -> bool:
-    return all(torch.equal(getattr(one, f.name), getattr(other, f.name)) for f in fields(RelativePoseEstimate))
+    return all(
+        torch.equal(getattr(one, f.name), getattr(other, f.name))
+        for f in fields(RelativePoseEstimate)
+    )
 
 
 @each
@@ -108,7 +134,9 @@ def test_a_pair_s_estimate_depends_on_no_other_pair_and_is_the_same_again(baseli
     for index in (torch.tensor([2]), torch.tensor([3, 2, 0])):
         some = baseline(part(batch, index))
         for name in ("R", "t"):
-            torch.testing.assert_close(getattr(some, name), getattr(together, name)[index], rtol=0, atol=1e-12)
+            torch.testing.assert_close(
+                getattr(some, name), getattr(together, name)[index], rtol=0, atol=1e-12
+            )
 
 
 @each
@@ -116,7 +144,9 @@ def test_joints_that_a_view_does_not_see_are_not_used(baseline):
     batch = pairs(sigma=1)
     seen = torch.rand(batch.seen.shape, generator=torch.Generator().manual_seed(0)) < 0.7
     expected = baseline(replace(batch, seen=seen))
-    moved = torch.where(seen[..., None], batch.key_points, torch.tensor([torch.nan, 1e6], dtype=torch.float64))
+    moved = torch.where(
+        seen[..., None], batch.key_points, torch.tensor([torch.nan, 1e6], dtype=torch.float64)
+    )
     assert equal(baseline(replace(batch, key_points=moved, seen=seen)), expected)
     assert all((error < 3).all() for error in degrees(expected, batch))
 
@@ -165,27 +195,40 @@ def pure_rotation(rig: Cameras, points):
 
 DEGENERATE = {
     "rotation": lambda: pairs([0, 1], change=pure_rotation),
-    "identical cameras": lambda: pairs([0, 1], change=lambda rig, points: (rig.index([2, 1, 2]), points)),
+    "identical cameras": lambda: pairs(
+        [0, 1], change=lambda rig, points: (rig.index([2, 1, 2]), points)
+    ),
     "a line": lambda: pairs(
-        [0, 1], change=lambda rig, p: (rig, p[..., :1] * torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64))
+        [0, 1],
+        change=lambda rig, p: (
+            rig,
+            p[..., :1] * torch.tensor([0.3, 0.6, 0.9], dtype=torch.float64),
+        ),
     ),
     "a plane": lambda: pairs(
         [0, 1], change=lambda rig, p: (rig, p * torch.tensor([1.0, 1.0, 0.0], dtype=torch.float64))
     ),
-    "one joint": lambda: replace(pairs([0, 1]), key_points=torch.full((2, 3, 20, 17, 2), 7.0, dtype=torch.float64)),
-    "all NaN": lambda: replace(pairs([0, 1]), key_points=torch.full((2, 3, 20, 17, 2), torch.nan).double()),
+    "one joint": lambda: replace(
+        pairs([0, 1]), key_points=torch.full((2, 3, 20, 17, 2), 7.0, dtype=torch.float64)
+    ),
+    "all NaN": lambda: replace(
+        pairs([0, 1]), key_points=torch.full((2, 3, 20, 17, 2), torch.nan).double()
+    ),
     "not seen": lambda: replace(pairs([0, 1]), seen=torch.zeros(2, 3, 20, 17, dtype=torch.bool)),
     "never together": lambda: replace(
-        pairs([0, 1]), seen=torch.tensor([True, True, False])[None, :, None, None].expand(2, 3, 20, 17)
+        pairs([0, 1]),
+        seen=torch.tensor([True, True, False])[None, :, None, None].expand(2, 3, 20, 17),
     ),
     "seven": lambda: replace(
         pairs([0, 1]), seen=(torch.arange(340) < 7).reshape(20, 17).expand(2, 3, 20, 17)
     ),
     "no frames": lambda: replace(
-        pairs([0, 1]), seen=torch.zeros(2, 3, 0, 17, dtype=torch.bool),
-        key_points=torch.zeros(2, 3, 0, 17, 2, dtype=torch.float64), confidence=torch.zeros(2, 3, 0, 17).double(),
+        pairs([0, 1]),
+        seen=torch.zeros(2, 3, 0, 17, dtype=torch.bool),
+        key_points=torch.zeros(2, 3, 0, 17, 2, dtype=torch.float64),
+        confidence=torch.zeros(2, 3, 0, 17).double(),
     ),
-}  # fmt: skip
+}
 
 
 @each
@@ -216,7 +259,9 @@ def test_a_batch_of_no_pairs_gives_no_poses(baseline):
 @each
 def test_key_points_in_float32_are_enough(baseline):
     batch = pairs(sigma=1)
-    single = replace(batch, key_points=batch.key_points.float(), confidence=batch.confidence.float())
+    single = replace(
+        batch, key_points=batch.key_points.float(), confidence=batch.confidence.float()
+    )
     assert all((error < 3).all() for error in degrees(baseline(single), batch))
 
 
@@ -251,8 +296,12 @@ def test_minimal_samples_are_distinct_and_fair():
         lambda: Ransac(samples=0, threshold=0.1, seed=0),
         lambda: Ransac(samples=10, threshold=float("nan"), seed=0),
         lambda: Usac(method="LMEDS", threshold=0.1, pixels=100.0, confidence=0.9, iterations=10),
-        lambda: Usac(method="USAC_MAGSAC", threshold=0.1, pixels=100.0, confidence=1.0, iterations=10),
-        lambda: Usac(method="USAC_MAGSAC", threshold=0.1, pixels=0.0, confidence=0.9, iterations=10),
+        lambda: Usac(
+            method="USAC_MAGSAC", threshold=0.1, pixels=100.0, confidence=1.0, iterations=10
+        ),
+        lambda: Usac(
+            method="USAC_MAGSAC", threshold=0.1, pixels=0.0, confidence=0.9, iterations=10
+        ),
         lambda: PoseLib(threshold=0.1, loss="L2", scale=1.0, iterations=10, seed=0),
         lambda: PoseLib(threshold=0.1, loss="CAUCHY", scale=-1.0, iterations=10, seed=0),
     ],

@@ -6,7 +6,13 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ghpt.models.pose.evaluation import write_metrics
-from ghpt.models.relative_pose.evaluation import ALONE, ERRORS, NAMES, errors_of_pair, evaluate_pairs
+from ghpt.models.relative_pose.evaluation import (
+    ALONE,
+    ERRORS,
+    NAMES,
+    errors_of_pair,
+    evaluate_pairs,
+)
 from ghpt.recording import RelativePoseEstimate
 from pair_report import content, moved, rig, written
 
@@ -15,7 +21,9 @@ PAIRS = ["1-2", "1-3", "1-4", "2-3", "2-4", "3-4"]
 
 
 def slow_errors(own, pair, R, t) -> dict[str, float]:
-    """Section 4.5 for one pair, by numpy and scipy: homogeneous projections, triangulation by an SVD for each point."""
+    """Section 4.5 for one pair, by numpy and scipy: homogeneous projections, triangulation by an
+    SVD for each point.
+    """
     a, b = pair
     K, Rw, tw = (getattr(own.cameras, name).numpy() for name in ("K", "R", "t"))
     true_R, true_t = Rw[b] @ Rw[a].T, tw[b] - Rw[b] @ Rw[a].T @ tw[a]
@@ -42,7 +50,9 @@ def slow_errors(own, pair, R, t) -> dict[str, float]:
         "E_t": np.linalg.norm(t - true_t),
         "E_2D": np.mean(pixel),
         "E_3D": np.mean(space),
-        "rotation_deg": np.rad2deg((Rotation.from_matrix(R) * Rotation.from_matrix(true_R).inv()).magnitude()),
+        "rotation_deg": np.rad2deg(
+            (Rotation.from_matrix(R) * Rotation.from_matrix(true_R).inv()).magnitude()
+        ),
         "translation_deg": np.rad2deg(np.arccos(np.clip(cosine, -1, 1))),
     }
 
@@ -55,14 +65,24 @@ def test_numbers_equal_a_slow_reference(tmp_path):
         for number, (pair, numbers) in enumerate(metrics["selections"][name]["pairs"].items()):
             rows = range(number, len(values["draw"]), 6)
             owns, views = [RIGS[g] for g in values["rig"].tolist()], values["pair"].tolist()
-            each = [slow_errors(owns[i], views[i], estimate.R[i].numpy(), estimate.t[i].numpy()) for i in rows]
+            each = [
+                slow_errors(owns[i], views[i], estimate.R[i].numpy(), estimate.t[i].numpy())
+                for i in rows
+            ]
             for error in ERRORS:
                 expected = [e[error] for e in each]
-                # The reference solves the triangulation's equations with other weights for the two rays.
+                # The reference solves the triangulation's equations with other weights for the two
+                # rays.
                 tolerance = 0.05 if error == "E_3D" else 1e-6
-                assert numbers[error] == pytest.approx(np.median(expected), rel=tolerance), (name, pair, error)
+                assert numbers[error] == pytest.approx(np.median(expected), rel=tolerance), (
+                    name,
+                    pair,
+                    error,
+                )
                 assert numbers["mean"][error] == pytest.approx(np.mean(expected), rel=tolerance)
-                assert numbers["deviation"][error] == pytest.approx(np.std(expected, ddof=1), rel=4 * tolerance)
+                assert numbers["deviation"][error] == pytest.approx(
+                    np.std(expected, ddof=1), rel=4 * tolerance
+                )
 
 
 def test_the_truth_has_no_error(tmp_path):
@@ -77,12 +97,28 @@ def test_the_truth_has_no_error(tmp_path):
 def test_form_is_the_documented_one(tmp_path):
     metrics = evaluate_pairs(written(tmp_path, RIGS, content(RIGS, draws=3)))
     assert list(metrics) == [
-        "format_version", "data", "source", "split", "problem", "frames", "draws", "cameras", "seed", "provenance",
+        "format_version",
+        "data",
+        "source",
+        "split",
+        "problem",
+        "frames",
+        "draws",
+        "cameras",
+        "seed",
+        "provenance",
         "selections",
-    ]  # fmt: skip
+    ]
     assert (metrics["problem"], metrics["frames"], metrics["draws"]) == ("camera", 80, 6)
     assert metrics["cameras"] == ["c0", "c1", "c2", "c3"]
-    assert list(metrics["selections"]) == ["weight", "average", "worst", "eight_point", "poselib", "rig"]
+    assert list(metrics["selections"]) == [
+        "weight",
+        "average",
+        "worst",
+        "eight_point",
+        "poselib",
+        "rig",
+    ]
     for numbers in metrics["selections"].values():
         assert list(numbers) == [*ERRORS, "coverage", "pairs"]
         assert list(numbers["pairs"]) == PAIRS
@@ -90,7 +126,9 @@ def test_form_is_the_documented_one(tmp_path):
             assert list(pair) == [*ERRORS, "coverage", "mean", "deviation", *ALONE]
             assert list(pair["mean"]) == list(pair["deviation"]) == list(ERRORS)
         for error in ERRORS:
-            assert numbers[error] == pytest.approx(np.mean([pair[error] for pair in numbers["pairs"].values()]))
+            assert numbers[error] == pytest.approx(
+                np.mean([pair[error] for pair in numbers["pairs"].values()])
+            )
     assert NAMES[-1] == "rig"
     write_metrics(tmp_path / "metrics.json", metrics)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
@@ -99,7 +137,9 @@ def test_form_is_the_documented_one(tmp_path):
 def without(values: dict, name: str, drop: torch.Tensor) -> None:
     e = values["estimates"][name]
     R = torch.where(drop[:, None, None], torch.eye(3, dtype=torch.float64), e.R)
-    values["estimates"][name] = RelativePoseEstimate(R, torch.where(drop[:, None], 0.0, e.t), e.estimated & ~drop)
+    values["estimates"][name] = RelativePoseEstimate(
+        R, torch.where(drop[:, None], 0.0, e.t), e.estimated & ~drop
+    )
 
 
 def test_nobody_wins_by_dropping_the_hard_draws(tmp_path):
@@ -107,13 +147,17 @@ def test_nobody_wins_by_dropping_the_hard_draws(tmp_path):
     values["estimates"]["average"] = values["estimates"]["weight"]
     before = evaluate_pairs(written(tmp_path, RIGS, values))["selections"]["weight"]["pairs"]["1-2"]
     rows = torch.arange(0, 60, 6)  # the ten draws of pair 1-2
-    errors = torch.linalg.vector_norm(values["estimates"]["weight"].t[rows] - values["truth"][1][rows], dim=-1)
+    errors = torch.linalg.vector_norm(
+        values["estimates"]["weight"].t[rows] - values["truth"][1][rows], dim=-1
+    )
     hard = rows[errors.argsort(descending=True)[:3]]
     without(values, "average", torch.isin(torch.arange(60), hard))
     after = evaluate_pairs(written(tmp_path, RIGS, values))["selections"]["average"]["pairs"]["1-2"]
     assert after["coverage"] == 0.7
     assert after["E_t"] == before["E_t"]  # the hard ones were above the median already
-    assert after["mean"]["E_t"] < before["mean"]["E_t"]  # a mean over what is left is what coverage is for
+    assert (
+        after["mean"]["E_t"] < before["mean"]["E_t"]
+    )  # a mean over what is left is what coverage is for
 
 
 def test_a_median_that_is_infinite_is_null_in_the_file(tmp_path):

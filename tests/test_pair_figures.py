@@ -27,11 +27,15 @@ def run(tmp_path, views: int = 4, draws: int = 3):
 
 def test_up_is_up_and_right_is_the_first_cameras():
     right, forward, up = pair_figures._axes_of(RIGS[0].cameras)
-    np.testing.assert_allclose(np.stack((right, forward, up)) @ np.stack((right, forward, up)).T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(
+        np.stack((right, forward, up)) @ np.stack((right, forward, up)).T, np.eye(3), atol=1e-12
+    )
     assert up[2] > 0.98  # the rig's z is up
     towards = RIGS[0].cameras.R[0, 2].numpy()
     assert forward @ towards > 0.95  # the first camera looks up the page
-    assert np.linalg.det(np.stack((right, forward, up))) == pytest.approx(1)  # seen from above, not mirrored
+    assert np.linalg.det(np.stack((right, forward, up))) == pytest.approx(
+        1
+    )  # seen from above, not mirrored
 
 
 def test_rig_figure_draws_each_target_where_the_estimate_has_it():
@@ -45,10 +49,14 @@ def test_rig_figure_draws_each_target_where_the_estimate_has_it():
     lines = [len(c.get_segments()) for c in above.collections]
     assert lines == [4 * 8, 6 * 8, 6]  # true pyramids, estimated pyramids, stalks
     assert [text.get_text() for text in above.texts] == ["1: c0", "2: c1", "3: c2", "4: c3"]
-    distance = (pair_figures._targets(own.cameras, ALL, estimate).centre - own.cameras.centre[ALL[:, 1]]).norm(dim=-1)
+    distance = (
+        pair_figures._targets(own.cameras, ALL, estimate).centre - own.cameras.centre[ALL[:, 1]]
+    ).norm(dim=-1)
     (legend,) = figure.legends
     said = [text.get_text() for text in legend.get_texts()]
-    assert said[1].startswith(f"weight: targets' centres {distance.min():.0f} to {distance.max():.0f} mm off")
+    assert said[1].startswith(
+        f"weight: targets' centres {distance.min():.0f} to {distance.max():.0f} mm off"
+    )
     assert above.get_aspect() == side.get_aspect() == 1
     assert image(figure).std() > 10
 
@@ -56,9 +64,13 @@ def test_rig_figure_draws_each_target_where_the_estimate_has_it():
 def test_rig_figure_without_estimates_or_with_wild_ones_is_drawn():
     own = RIGS[0]
     truth = true_poses([own], torch.zeros(6, dtype=torch.int64), ALL)
-    none = RelativePoseEstimate(torch.eye(3).double().expand(6, 3, 3), torch.zeros(6, 3).double(), torch.zeros(6) > 0)
+    none = RelativePoseEstimate(
+        torch.eye(3).double().expand(6, 3, 3), torch.zeros(6, 3).double(), torch.zeros(6) > 0
+    )
     wild = RelativePoseEstimate(truth[0], truth[1] * 1e6, torch.arange(6) > 0)
-    figure = rig_figure(own.cameras, own.names, own.points, ALL, {"weight": none, "rig": wild}, "heading")
+    figure = rig_figure(
+        own.cameras, own.names, own.points, ALL, {"weight": none, "rig": wild}, "heading"
+    )
     said = [text.get_text() for text in figure.legends[0].get_texts()]
     assert "no pair was estimated" in said[1]
     assert "1 of 6 pairs have none" in said[2]
@@ -69,8 +81,12 @@ def test_rig_figure_without_estimates_or_with_wild_ones_is_drawn():
 def test_the_figure_is_of_a_draw_that_is_median(tmp_path):
     values = content(RIGS, draws=3)
     truth = values["truth"]
-    factor = 1 + 0.01 * (values["draw"].double()[:, None] * 7 % 6)  # draws 0 to 5: 0 1 2 3 4 5 in another order
-    values["estimates"]["weight"] = RelativePoseEstimate(truth[0], truth[1] * factor, torch.ones(36) > 0)
+    factor = 1 + 0.01 * (
+        values["draw"].double()[:, None] * 7 % 6
+    )  # draws 0 to 5: 0 1 2 3 4 5 in another order
+    values["estimates"]["weight"] = RelativePoseEstimate(
+        truth[0], truth[1] * factor, torch.ones(36) > 0
+    )
     rows = _typical_draw(written(tmp_path, RIGS, values))
     assert len(rows) == 6
     assert factor[rows].unique().item() == pytest.approx(1.02)
@@ -85,7 +101,9 @@ def test_events_hold_the_numbers_of_metrics_json(tmp_path):
     tags = events.Tags()
     for name, numbers in metrics["selections"].items():
         for error in ERRORS:
-            assert events.Scalars(f"{error}/{name}")[0].value == pytest.approx(numbers[error], rel=1e-6)
+            assert events.Scalars(f"{error}/{name}")[0].value == pytest.approx(
+                numbers[error], rel=1e-6
+            )
             pair = events.Scalars(f"{error} 2-4/{name}")[0].value
             assert pair == pytest.approx(numbers["pairs"]["2-4"][error], rel=1e-6)
     assert set(tags["images"]) == {"rig"}

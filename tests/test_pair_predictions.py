@@ -30,7 +30,9 @@ def test_round_trip(tmp_path):
     assert opened.camera_name == (("c0", "c1", "c2", "c3"),) * 2
     assert {**META, "problem": "camera", "unit": "mm"}.items() <= opened.meta.items()
     for field in ("K", "R", "t"):
-        assert torch.equal(getattr(opened.cameras, field), torch.stack([getattr(r.cameras, field) for r in RIGS]))
+        assert torch.equal(
+            getattr(opened.cameras, field), torch.stack([getattr(r.cameras, field) for r in RIGS])
+        )
     assert torch.equal(opened.points, torch.stack([r.points for r in RIGS]))
     chunks = list(opened.chunks(16))
     assert [len(chunk.rig) for chunk in chunks] == [16, 16, 4]
@@ -41,7 +43,8 @@ def test_round_trip(tmp_path):
     for name, estimate in values["estimates"].items():
         for field in ("R", "t", "estimated"):
             assert torch.equal(
-                torch.cat([getattr(c.estimates[name], field) for c in chunks]), getattr(estimate, field)
+                torch.cat([getattr(c.estimates[name], field) for c in chunks]),
+                getattr(estimate, field),
             ), (name, field)
     for name, summary in values["weights"].items():
         assert torch.equal(torch.cat([c.weights[name] for c in chunks]), summary)
@@ -61,12 +64,17 @@ def test_numpy_alone_reads_it_and_missing_is_nan(path):
 def test_bytes_depend_on_the_content_alone_not_on_the_order_or_the_processes(tmp_path, path):
     values = content(RIGS, draws=2)
     count = len(values["draw"])
-    writers = [PairWriter(tmp_path / "shared", count, NAMES) for _ in range(2)]  # as two processes have them
+    writers = [
+        PairWriter(tmp_path / "shared", count, NAMES) for _ in range(2)
+    ]  # as two processes have them
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
     for turn, rows in enumerate(order.split(5)):
         writers[turn % 2].write(
             rows,
-            {n: RelativePoseEstimate(e.R[rows], e.t[rows], e.estimated[rows]) for n, e in values["estimates"].items()},
+            {
+                n: RelativePoseEstimate(e.R[rows], e.t[rows], e.estimated[rows])
+                for n, e in values["estimates"].items()
+            },
             tuple(x[rows] for x in values["truth"]),
             *(values[key][rows] for key in ("rig", "draw", "pair")),
             {key: value[rows] for key, value in values["weights"].items()},
@@ -138,7 +146,9 @@ def test_arrays_that_do_not_belong_together_are_refused(tmp_path, path, member, 
     ],
 )
 def test_rows_that_name_what_is_not_there_are_refused(tmp_path, path, member, value):
-    spoilt = changed(path, tmp_path, lambda members: members.update({f"{member}.npy": array(value)}))
+    spoilt = changed(
+        path, tmp_path, lambda members: members.update({f"{member}.npy": array(value)})
+    )
     with pytest.raises(GhptDataError, match=member):
         open_pairs(spoilt).read(0, 1)
 

@@ -19,12 +19,16 @@ def test_sweep_shows_means_bands_and_the_cut():
     assert (band[:, 1].min(), band[:, 1].max()) == pytest.approx((10, 14))
     assert axes.collections[1].get_paths()[0].vertices[:, 1].max() <= CLIP
     assert "synthetic" in axes.get_title()
-    assert len({(line.get_linestyle(), line.get_marker()) for line in axes.lines}) == 2  # told apart without colour
+    assert (
+        len({(line.get_linestyle(), line.get_marker()) for line in axes.lines}) == 2
+    )  # told apart without colour
     assert image(figure).std() > 10
 
 
 def test_sweep_table_has_mean_deviation_and_median():
-    lines = sweep_table({"weight": {10: [10.0, 12.0, 17.0]}, "eight_point": {10: [np.inf, 1.0, 3.0], 20: [2.0]}})
+    lines = sweep_table(
+        {"weight": {10: [10.0, 12.0, 17.0]}, "eight_point": {10: [np.inf, 1.0, 3.0], 20: [2.0]}}
+    )
     cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines.splitlines()]
     assert cells[0] == ["M", "weight", "8-point"]
     assert cells[2] == ["10", "13.0 ± 3.6 (12.0)", "– ± – (3.0)"]

@@ -11,24 +11,40 @@ from ghpt.paper import published as paper
 from ghpt.report.pair_tables import comparison, dissection, of_paper, pair_report, print_pair_tables
 
 
-def metrics(data="h36m", source="embedded", split="test", trained="h36m", views=4, frames=80) -> dict:
+def metrics(
+    data="h36m", source="embedded", split="test", trained="h36m", views=4, frames=80
+) -> dict:
     """A run whose errors are 1000 times the place of the pair; one pair has no median."""
     pairs = {}
     for place, (a, b) in enumerate(combinations(range(views), 2)):
         errors = dict.fromkeys(ERRORS, 1000.0 * place + 0.5) | {"E_R": 0.0123}
         pairs[f"{a + 1}-{b + 1}"] = {
-            **errors, "coverage": 0.987, "mean": errors, "deviation": dict.fromkeys(ERRORS),
+            **errors,
+            "coverage": 0.987,
+            "mean": errors,
+            "deviation": dict.fromkeys(ERRORS),
             **{part: {"E_2D": 0.4, "E_3D": None} for part in ALONE},
-        }  # fmt: skip
+        }
     pairs["1-2"] = {**pairs["1-2"], "E_3D": None}
     numbers = {**dict.fromkeys(ERRORS, 12.3), "E_3D": None, "coverage": 0.987, "pairs": pairs}
-    provenance = {"ghpt": "0.1.0", "commit": "abc", "checkpoint": "last.ckpt",
-                  "training": {"data": trained, "source": source}}  # fmt: skip
+    provenance = {
+        "ghpt": "0.1.0",
+        "commit": "abc",
+        "checkpoint": "last.ckpt",
+        "training": {"data": trained, "source": source},
+    }
     return {
-        "data": data, "source": source, "split": split, "problem": "camera", "frames": frames, "draws": 40, "seed": 0,
-        "cameras": [f"c{i}" for i in range(views)], "provenance": provenance,
+        "data": data,
+        "source": source,
+        "split": split,
+        "problem": "camera",
+        "frames": frames,
+        "draws": 40,
+        "seed": 0,
+        "cameras": [f"c{i}" for i in range(views)],
+        "provenance": provenance,
         "selections": dict.fromkeys(NAMES, numbers),
-    }  # fmt: skip
+    }
 
 
 def printed(values: dict) -> list[str]:
@@ -41,7 +57,10 @@ def test_the_pairs_that_the_paper_calls_diagonal_are_not():
     centre = human36m_rig("S9").cameras.centre[:, :2]
     direction = centre - centre.mean(dim=0)
     direction = direction / direction.norm(dim=-1, keepdim=True)
-    degrees = {(a, b): torch.rad2deg(torch.acos(direction[a - 1] @ direction[b - 1])) for a, b in paper.FUNDAMENTAL}
+    degrees = {
+        (a, b): torch.rad2deg(torch.acos(direction[a - 1] @ direction[b - 1]))
+        for a, b in paper.FUNDAMENTAL
+    }
     assert {pair for pair in degrees if degrees[pair] > 170} == {(1, 4), (2, 3)}
     assert {pair for pair in degrees if degrees[pair] < 50} == {(1, 3), (2, 4)}
     assert list(paper.FUNDAMENTAL) == list(paper.FUNDAMENTAL_DISSECTION)
@@ -73,7 +92,9 @@ def test_terminal_tables_fit_80_columns(views):
 
 
 def test_the_first_table_has_every_pair_with_the_papers_numbers_beside():
-    lines = [line.replace("│", " ").split() for line in printed(metrics()) if line.startswith("│")][:6]
+    lines = [line.replace("│", " ").split() for line in printed(metrics()) if line.startswith("│")][
+        :6
+    ]
     assert [line[0] for line in lines] == ["1-3", "2-4", "1-4", "2-3", "3-4", "1-2"]
     assert lines[0][1:7] == ["12.3", "(17)", "1000", "(23)", "1000", "(3.7)"]
     assert lines[5][7:9] == ["–", "(4.9)"]  # no median
@@ -89,11 +110,15 @@ def test_many_pairs_are_summed_up():
 
 def test_report_has_every_number_of_every_name():
     text = pair_report(metrics())
-    assert text.startswith("# Relative camera poses on embedded (synthetic) Human3.6M, test split, trained on embedded")
+    assert text.startswith(
+        "# Relative camera poses on embedded (synthetic) Human3.6M, test split, trained on embedded"
+    )
     blocks = [block for block in text.split("\n\n") if block.startswith("|")]
     for block in blocks:
         assert len({line.count("|") for line in block.splitlines()}) == 1
-    assert sum(line.startswith("| usac_magsac".upper()[:13]) for line in text.splitlines()) == 1 + 2 * len(ERRORS)
+    assert sum(
+        line.startswith("| usac_magsac".upper()[:13]) for line in text.splitlines()
+    ) == 1 + 2 * len(ERRORS)
     assert "nan" not in text.lower().replace("finan", "")
     assert "None" not in text
     real = pair_report(metrics(source="/data/h36m"))

@@ -19,14 +19,21 @@ from ghpt.models.relative_pose.predictions import open_pairs
 from ghpt.models.selection import SELECTIONS
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-SMALL = ["model.hypotheses=6", "model.scorer.layers=[4]", "model.problem.frames=8", "model.problem.draws=2",
-         "model.problem.points=20"]  # fmt: skip
+SMALL = [
+    "model.hypotheses=6",
+    "model.scorer.layers=[4]",
+    "model.problem.frames=8",
+    "model.problem.draws=2",
+    "model.problem.points=20",
+]
 BASELINES = {"eight_point": {"_target_": "ghpt.models.relative_pose.baselines.EightPoint"}}
 
 
 def model() -> dict[str, Any]:
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return plain(hydra.compose("train", overrides=["output=none", "model=camera", *SMALL]))["model"]
+        return plain(hydra.compose("train", overrides=["output=none", "model=camera", *SMALL]))[
+            "model"
+        ]
 
 
 @pytest.fixture(scope="module")
@@ -37,8 +44,17 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def settings(checkpoint: Path, **changes: Any) -> dict[str, Any]:
-    return toys.TRAIN | {"ckpt": str(checkpoint), "hypotheses": None, "frames": None, "camera_baselines": BASELINES,
-                         "baselines": {}} | changes  # fmt: skip
+    return (
+        toys.TRAIN
+        | {
+            "ckpt": str(checkpoint),
+            "hypotheses": None,
+            "frames": None,
+            "camera_baselines": BASELINES,
+            "baselines": {},
+        }
+        | changes
+    )
 
 
 def test_files_table_and_events(checkpoint, tmp_path, capsys):
@@ -47,7 +63,14 @@ def test_files_table_and_events(checkpoint, tmp_path, capsys):
     assert (metrics["problem"], metrics["frames"], metrics["draws"]) == ("camera", 8, 2)
     assert list(metrics["selections"]) == [*SELECTIONS, "eight_point"]
     assert metrics["provenance"]["training"]["data"] == "toy"
-    assert set(metrics["selections"]["weight"]["pairs"]) == {"1-2", "1-3", "1-4", "2-3", "2-4", "3-4"}
+    assert set(metrics["selections"]["weight"]["pairs"]) == {
+        "1-2",
+        "1-3",
+        "1-4",
+        "2-3",
+        "2-4",
+        "3-4",
+    }
     shown = capsys.readouterr().out
     assert max(map(len, shown.splitlines())) <= 80
     assert "8-point" in shown
@@ -55,7 +78,9 @@ def test_files_table_and_events(checkpoint, tmp_path, capsys):
     assert f"{metrics['selections']['weight']['E_3D']:.1f} mm" in summary(metrics)
     tags = EventAccumulator(str(tmp_path), size_guidance={"images": 0}).Reload().Tags()
     assert "rig" in tags["images"]
-    assert {"E_3D/weight", "E_3D 1-2/eight_point", "weights/entropy", "final/weight"} <= set(tags["scalars"])
+    assert {"E_3D/weight", "E_3D 1-2/eight_point", "weights/entropy", "final/weight"} <= set(
+        tags["scalars"]
+    )
     assert not list(tmp_path.glob(".predictions*"))
 
 
@@ -68,7 +93,9 @@ def test_every_estimate_has_the_length_that_the_problem_s_scale_gives(checkpoint
     for name in ("most", "best", "eight_point"):
         estimate = chunk.estimates[name]
         assert estimate.estimated.all(), name
-        torch.testing.assert_close(estimate.t.norm(dim=-1), (a - b).norm(dim=-1), rtol=1e-5, atol=0.01)
+        torch.testing.assert_close(
+            estimate.t.norm(dim=-1), (a - b).norm(dim=-1), rtol=1e-5, atol=0.01
+        )
 
 
 def test_another_number_of_frames_can_be_tested(checkpoint, tmp_path):
@@ -88,7 +115,9 @@ def test_the_same_bytes_twice(checkpoint, tmp_path):
 
 
 def test_baselines_of_the_other_problem_are_not_built(checkpoint, tmp_path):
-    metrics = test(settings(checkpoint, baselines={"linear": {"_target_": "no.such.Class"}}), tmp_path)
+    metrics = test(
+        settings(checkpoint, baselines={"linear": {"_target_": "no.such.Class"}}), tmp_path
+    )
     assert "linear" not in metrics["selections"]
     with pytest.raises(GhptConfigError, match="camera_baselines: is 3, not a group"):
         test(settings(checkpoint, camera_baselines=3), tmp_path)

@@ -32,7 +32,9 @@ def test_every_pair_of_every_draw_of_every_rig_and_those_of_a_draw_together():
     pairs = Pairs(recordings(), SETTINGS, seed=0)
     places = [pairs.locate(i) for i in range(len(pairs))]
     assert len(pairs) == 2 * 3 * 3
-    assert places == [(draw // 3, draw, pair) for draw in range(6) for pair in combinations(range(3), 2)]
+    assert places == [
+        (draw // 3, draw, pair) for draw in range(6) for pair in combinations(range(3), 2)
+    ]
     batch = pairs[range(len(pairs))]
     assert torch.equal(batch.draw, torch.arange(6).repeat_interleave(3))
     assert torch.equal(batch.key_points[0], batch.key_points[2])
@@ -52,7 +54,9 @@ def test_a_batch_holds_the_recordings_values_of_its_frames(samples):
         expected = np.concatenate([data[r].key_points[positions] for r, positions in frames])
         np.testing.assert_array_equal(batch.key_points[0].transpose(0, 1).numpy(), expected)
         seen = np.concatenate([data[r].seen[positions] for r, positions in frames])
-        np.testing.assert_array_equal(batch.of_pair(batch.seen)[0].numpy(), seen[:, list(pair)].swapaxes(0, 1))
+        np.testing.assert_array_equal(
+            batch.of_pair(batch.seen)[0].numpy(), seen[:, list(pair)].swapaxes(0, 1)
+        )
         assert torch.equal(batch.pair_cameras().t[0], data[frames[0][0]].cameras.t[list(pair)])
 
 
@@ -77,7 +81,9 @@ def test_frames_are_drawn_evenly():
     drawn = np.concatenate([pairs.frames_of(0, draw)[0][1] for draw in range(3000)])
     count = np.bincount(drawn, minlength=30)
     assert count.sum() == 30_000
-    assert (abs(count - 1000) < 5 * np.sqrt(1000 * 2 / 3)).all()  # five deviations of a hypergeometric count
+    assert (
+        abs(count - 1000) < 5 * np.sqrt(1000 * 2 / 3)
+    ).all()  # five deviations of a hypergeometric count
 
 
 def test_a_rig_with_few_frames_fills_up_with_unseen_ones():

@@ -1,4 +1,6 @@
-"""Panoptic in its own layout: what was projected through the real lenses comes back, by name and by number."""
+"""Panoptic in its own layout: what was projected through the real lenses comes back, by name and by
+number.
+"""
 
 import json
 from collections.abc import Callable
@@ -22,7 +24,9 @@ FRAMES = list(range(100, 120))
 
 @pytest.fixture
 def poses() -> np.ndarray:
-    return layout.person(np.random.default_rng(0), len(FRAMES), (0, -1000, 0), joints=19).round(2) / 10
+    return (
+        layout.person(np.random.default_rng(0), len(FRAMES), (0, -1000, 0), joints=19).round(2) / 10
+    )
 
 
 @pytest.fixture
@@ -46,7 +50,8 @@ def expected(poses: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("split", "part"), [("train", slice(0, 12)), ("validation", slice(12, 16)), ("test", slice(16, 20))]
+    ("split", "part"),
+    [("train", slice(0, 12)), ("validation", slice(12, 16)), ("test", slice(16, 20))],
 )
 def test_round_trip(root: Path, poses: np.ndarray, split: str, part: slice) -> None:
     recording, rig = read(root, split), panoptic_rig((10, 3))
@@ -66,7 +71,9 @@ def test_left_and_right_by_name() -> None:
     person, seen = joints17(layout.upright19()[None], np.ones((1, 19), bool))
     assert seen.all()
     for name, point in zip(JOINTS, person[0], strict=True):
-        assert point[0] == {"l": 20, "r": -20}.get(name[0] if "_" in name and name != "head_top" else "", 0), name
+        assert point[0] == {"l": 20, "r": -20}.get(
+            name[0] if "_" in name and name != "head_top" else "", 0
+        ), name
     height = dict(zip(JOINTS, -person[0, :, 1], strict=True))
     assert height["left_ankle"] == height["right_ankle"] == 10
     assert height["left_knee"] == 50
@@ -92,7 +99,9 @@ def test_left_and_right_in_real_images(shared_data: Path) -> None:
     to_camera = unit(rig.cameras.centre.numpy() - nose[:, None])
     facing = np.einsum("tvc,tc->tv", to_camera, unit(nose - ears))
     pixels = layout.ideal(rig, points.astype(float))
-    right_of_left = pixels[:, :, JOINT["left_shoulder"], 0] - pixels[:, :, JOINT["right_shoulder"], 0]
+    right_of_left = (
+        pixels[:, :, JOINT["left_shoulder"], 0] - pixels[:, :, JOINT["right_shoulder"], 0]
+    )
     assert (facing > 0.9).sum() > 20
     assert (right_of_left[facing > 0.9] > 0).all()
 
@@ -106,14 +115,23 @@ def test_reads_the_real_calibration_and_bodies(shared_data: Path, tmp_path: Path
     (folder / "keypoints").mkdir()
     for view in ALL:
         count = (len(frames), 17)
-        np.savez(folder / f"keypoints/00_{view:02d}.npz", frame=frames, key_points=np.full((*count, 2), 500.0),
-                 confidence=np.ones(count), seen=np.ones(count, bool))  # fmt: skip
+        np.savez(
+            folder / f"keypoints/00_{view:02d}.npz",
+            frame=frames,
+            key_points=np.full((*count, 2), 500.0),
+            confidence=np.ones(count),
+            seen=np.ones(count, bool),
+        )
     recording, rig = read(tmp_path, "train", ALL), panoptic_rig(ALL)
     for name in ("K", "R", "t"):
-        assert np.allclose(getattr(recording.cameras, name), getattr(rig.cameras, name), rtol=1e-9, atol=1e-9)
+        assert np.allclose(
+            getattr(recording.cameras, name), getattr(rig.cameras, name), rtol=1e-9, atol=1e-9
+        )
     assert recording.truth_seen.any(1).all()
     assert 0 < recording.truth_seen.mean() < 1
-    neck_to_pelvis = np.linalg.norm(recording.truth[:, JOINT["thorax"]] - recording.truth[:, JOINT["pelvis"]], axis=-1)
+    neck_to_pelvis = np.linalg.norm(
+        recording.truth[:, JOINT["thorax"]] - recording.truth[:, JOINT["pelvis"]], axis=-1
+    )
     assert ((neck_to_pelvis > 350) & (neck_to_pelvis < 650)).all()  # mm of a real trunk
 
 
@@ -122,7 +140,9 @@ def test_missing_joints_and_what_is_made_of_them(tmp_path: Path, poses: np.ndarr
     poses[1, COCO19.index("left_ear")] = np.nan
     poses[2, COCO19.index("neck")] = np.nan
     rig = panoptic_rig((3, 6))
-    layout.write_panoptic_layout(tmp_path, NAME, layout.panoptic_calibration(rig), rig, range(5), poses, layout.perfect)
+    layout.write_panoptic_layout(
+        tmp_path, NAME, layout.panoptic_calibration(rig), rig, range(5), poses, layout.perfect
+    )
     truth_seen = read(tmp_path, "train", (3, 6)).truth_seen
     missing = [{JOINTS[j] for j in np.flatnonzero(~frame)} for frame in truth_seen]
     assert missing == [set(), {"head_top"}, {"thorax", "spine"}]
@@ -169,7 +189,9 @@ def test_the_body_that_persists(root: Path) -> None:
         scene = json.loads(path.read_text())
         scene["bodies"][0]["id"] = 4
         passer_by = {"id": 1, "joints19": [1.0] * 76}
-        scene["bodies"] = [passer_by, *scene["bodies"]] if count < 3 else scene["bodies"] if count != 7 else []
+        scene["bodies"] = (
+            [passer_by, *scene["bodies"]] if count < 3 else scene["bodies"] if count != 7 else []
+        )
         path.write_text(json.dumps(scene))
     recording = read(root, "train")
     assert not (recording.truth == 10).all(-1).any()
@@ -185,7 +207,10 @@ def test_the_authors_array_gives_the_same(root: Path, poses: np.ndarray) -> None
     shown = layout.through_lens(rig, layout.ideal(rig, truth))
     corner = np.floor(shown.min(2))
     size = np.ceil((shown.max(2) - corner).max(-1, keepdims=True))
-    np.save(folder / "all_2d_preds.npy", ((shown - corner[:, :, None]) * (384 / size[:, :, None])).astype("f4"))
+    np.save(
+        folder / "all_2d_preds.npy",
+        ((shown - corner[:, :, None]) * (384 / size[:, :, None])).astype("f4"),
+    )
     np.save(folder / "all_bboxes.npy", np.stack([corner, corner + size], axis=2))
     (folder / "all_cameras.json").write_text('["00_06", "00_12", "00_03"]')
     recording = read(root, "test", (12, 6))
@@ -240,39 +265,84 @@ def cut(pattern: str, share: float) -> Callable[[Path], None]:
 
 
 BAD = {
-    "no sequence": (lambda root: (root / NAME).rename(root / "other"), "calibration_<seq>.json below"),
-    "no scenes": (lambda root: (root / NAME / "hdPose3d_stage1_coco19").rename(root / "gone"), "no body3DScene"),
-    "no detections": (lambda root: (root / NAME / "keypoints").rename(root / "gone"), "neither keypoints"),
-    "no camera file": (lambda root: (root / NAME / "keypoints/00_03.npz").unlink(), "00_03.npz: there is no such file"),
-    "camera not calibrated": (calibration(lambda c: c.update(type="vga")), "there is no camera 00_03"),
+    "no sequence": (
+        lambda root: (root / NAME).rename(root / "other"),
+        "calibration_<seq>.json below",
+    ),
+    "no scenes": (
+        lambda root: (root / NAME / "hdPose3d_stage1_coco19").rename(root / "gone"),
+        "no body3DScene",
+    ),
+    "no detections": (
+        lambda root: (root / NAME / "keypoints").rename(root / "gone"),
+        "neither keypoints",
+    ),
+    "no camera file": (
+        lambda root: (root / NAME / "keypoints/00_03.npz").unlink(),
+        "00_03.npz: there is no such file",
+    ),
+    "camera not calibrated": (
+        calibration(lambda c: c.update(type="vga")),
+        "there is no camera 00_03",
+    ),
     "camera twice": (calibration(lambda c: c.update(name="00_04")), "camera 00_04 is listed twice"),
     "K missing": (calibration(lambda c: c.pop("K")), "00_03, K: is missing"),
-    "NaN in K": (calibration(lambda c: c.update(K=[[float("nan")] * 3] * 3)), "NaN is no JSON number"),
+    "NaN in K": (
+        calibration(lambda c: c.update(K=[[float("nan")] * 3] * 3)),
+        "NaN is no JSON number",
+    ),
     "infinite t": (calibration(lambda c: c.update(t=[[1e999]] * 3)), "not valid JSON|not finite"),
     "R not a rotation": (
         calibration(lambda c: c.update(R=[[1, 0, 0], [0, 2, 0], [0, 0, 1]])),
         "camera 00_03, R: R is not",
     ),
-    "R as vector": (calibration(lambda c: c.update(R=[0.1, 0.2, 0.3])), "00_03, R: has shape 3 instead of 3 x 3"),
-    "R ragged": (calibration(lambda c: c.update(R=[[1, 2], [3]])), "00_03, R: is not an array of numbers"),
+    "R as vector": (
+        calibration(lambda c: c.update(R=[0.1, 0.2, 0.3])),
+        "00_03, R: has shape 3 instead of 3 x 3",
+    ),
+    "R ragged": (
+        calibration(lambda c: c.update(R=[[1, 2], [3]])),
+        "00_03, R: is not an array of numbers",
+    ),
     "R as text": (calibration(lambda c: c.update(R=[["1"] * 3] * 3)), "00_03, R: holds <U1"),
-    "t flat": (calibration(lambda c: c.update(t=[1, 2, 3])), "00_03, t: has shape 3 instead of 3 x 1"),
+    "t flat": (
+        calibration(lambda c: c.update(t=[1, 2, 3])),
+        "00_03, t: has shape 3 instead of 3 x 1",
+    ),
     "huge integer": (calibration(lambda c: c.update(t=[[10**400]] * 3)), "00_03, t"),
     "calibration cut": (cut("calibration_*", 0.7), "is not valid JSON"),
     "scene cut": (cut("*/*104.json", 0.7), "body3DScene_00000104.json: is not valid JSON"),
     "npz cut": (cut("keypoints/00_03.npz", 0.7), "00_03.npz: is not a whole npz"),
     "no bodies": (scene(lambda s: s.pop("bodies")), "00000104.json: bodies"),
-    "18 joints": (scene(lambda s: s["bodies"][0].update(joints19=[0.0] * 72)), "joints19: has shape 72 instead of 76"),
+    "18 joints": (
+        scene(lambda s: s["bodies"][0].update(joints19=[0.0] * 72)),
+        "joints19: has shape 72 instead of 76",
+    ),
     "body twice": (scene(lambda s: s["bodies"].append(s["bodies"][0])), "id: is 0.*twice"),
     "id as text": (scene(lambda s: s["bodies"][0].update(id="0")), "id: is '0'"),
     "1e30 cm": (scene(lambda s: s["bodies"][0].update(joints19=[1e30] * 76)), "beyond 10 km"),
-    "19 joints in 2D": (detections(key_points=np.ones((20, 19, 2))), "key_points: has shape 20 x 19 x 2"),
-    "fewer frames": (detections(frame=np.arange(19)), "key_points: has shape 20 x 17 x 2 instead of 19"),
-    "frame twice": (detections(frame=np.array([*FRAMES[:-1], 100])), "frame: holds a frame number twice"),
+    "19 joints in 2D": (
+        detections(key_points=np.ones((20, 19, 2))),
+        "key_points: has shape 20 x 19 x 2",
+    ),
+    "fewer frames": (
+        detections(frame=np.arange(19)),
+        "key_points: has shape 20 x 17 x 2 instead of 19",
+    ),
+    "frame twice": (
+        detections(frame=np.array([*FRAMES[:-1], 100])),
+        "frame: holds a frame number twice",
+    ),
     "other frames": (detections(frame=np.arange(20)), "holds none of the frames 100 to 119"),
     "frame as float": (detections(frame=np.arange(20.0)), "frame: holds float64, not integers"),
-    "confidence 90": (detections(confidence=np.full((20, 17), 90.0)), "confidence: is not between 0 and 1"),
-    "confidence NaN": (detections(confidence=np.full((20, 17), np.nan)), "confidence: is not between 0 and 1"),
+    "confidence 90": (
+        detections(confidence=np.full((20, 17), 90.0)),
+        "confidence: is not between 0 and 1",
+    ),
+    "confidence NaN": (
+        detections(confidence=np.full((20, 17), np.nan)),
+        "confidence: is not between 0 and 1",
+    ),
     "seen as number": (detections(seen=np.ones((20, 17))), "seen: holds float64, not booleans"),
 }
 
@@ -287,7 +357,12 @@ def test_bad_files_are_named(root: Path, case: str) -> None:
 
 @pytest.mark.parametrize(
     ("numbers", "message"),
-    [((3, 31), "no camera (00_)?31"), ((3, 3), "listed twice"), ((3,), "at least two"), ((), "at least two")],
+    [
+        ((3, 31), "no camera (00_)?31"),
+        ((3, 3), "listed twice"),
+        ((3,), "at least two"),
+        ((), "at least two"),
+    ],
 )
 def test_bad_cameras_are_named(root: Path, numbers: tuple[int, ...], message: str) -> None:
     with pytest.raises(GhptDataError, match=message):
@@ -298,7 +373,9 @@ def test_bad_cameras_are_named(root: Path, numbers: tuple[int, ...], message: st
 
 def test_empty_split_is_named(tmp_path: Path, poses: np.ndarray) -> None:
     rig = panoptic_rig((3, 6))
-    layout.write_panoptic_layout(tmp_path, NAME, layout.panoptic_calibration(rig), rig, [0], poses[:1], layout.perfect)
+    layout.write_panoptic_layout(
+        tmp_path, NAME, layout.panoptic_calibration(rig), rig, [0], poses[:1], layout.perfect
+    )
     with pytest.raises(GhptDataError, match="here: train: there are no frames"):
         recordings = panoptic_recordings(tmp_path, (3, 6), "train")
         write_store(tmp_path / "store", recordings, {"source": "here", "split": "train"})

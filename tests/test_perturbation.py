@@ -23,14 +23,22 @@ from scenes import random_scene
 
 SEED = 3
 NOTHING = {
-    "outliers": Outliers(0.0, 0.1, 0.5), "noise": Noise(0.0), "detections": MissingDetections(0.0),
-    "views": MissingViews(0), "rotation": RotatedCameras(0.0), "shift": ShiftedCameras(0.0),
-}  # fmt: skip
+    "outliers": Outliers(0.0, 0.1, 0.5),
+    "noise": Noise(0.0),
+    "detections": MissingDetections(0.0),
+    "views": MissingViews(0),
+    "rotation": RotatedCameras(0.0),
+    "shift": ShiftedCameras(0.0),
+}
 SOMETHING = {
-    "outliers": Outliers(0.3, 0.1, 0.5), "noise": Noise(0.02), "detections": MissingDetections(0.3),
-    "views": MissingViews(2), "cameras": FewerCameras(3), "rotation": RotatedCameras(1.0),
+    "outliers": Outliers(0.3, 0.1, 0.5),
+    "noise": Noise(0.02),
+    "detections": MissingDetections(0.3),
+    "views": MissingViews(2),
+    "cameras": FewerCameras(3),
+    "rotation": RotatedCameras(1.0),
     "shift": ShiftedCameras(20.0),
-}  # fmt: skip
+}
 
 
 def a_batch(frames: int = 40, views: int = 5) -> KeyPointBatch:
@@ -60,7 +68,9 @@ def test_level_zero_changes_nothing(perturbation: Perturbation) -> None:
 
 
 @pytest.mark.parametrize("perturbation", SOMETHING.values(), ids=SOMETHING)
-def test_a_frame_is_the_same_in_any_batch_and_differs_from_others(perturbation: Perturbation) -> None:
+def test_a_frame_is_the_same_in_any_batch_and_differs_from_others(
+    perturbation: Perturbation,
+) -> None:
     batch = a_batch()
     rows = torch.tensor([31, 4, 17])
     few = KeyPointBatch(
@@ -99,7 +109,10 @@ def test_outliers_are_as_many_and_as_far_as_asked_and_nested() -> None:
 def test_noise_has_the_deviation_asked_in_each_coordinate_and_only_grows() -> None:
     batch = a_batch(frames=200)
     size = person_size(batch.key_points, batch.seen)[..., None, None]
-    small, large = (((Noise(s)(batch, SEED).key_points - batch.key_points) / size)[batch.seen] for s in (0.01, 0.03))
+    small, large = (
+        ((Noise(s)(batch, SEED).key_points - batch.key_points) / size)[batch.seen]
+        for s in (0.01, 0.03)
+    )
     assert small.std(dim=0).tolist() == pytest.approx([0.01, 0.01], rel=0.03)
     assert small.mean(dim=0).tolist() == pytest.approx([0, 0], abs=3e-4)
     assert torch.corrcoef(small.mT)[0, 1].abs() < 0.03
@@ -134,7 +147,9 @@ def test_fewer_cameras_come_with_their_own_key_points_and_are_nested() -> None:
     for name, value in tensors(two).items():
         if name in ("key_points", "confidence", "seen", "K", "R", "t"):
             assert torch.equal(value, tensors(three)[name][:, :2])
-    place = (batch.cameras.t[:, None] == all_of_them.cameras.t[:, :, None]).all(-1).long().argmax(-1)
+    place = (
+        (batch.cameras.t[:, None] == all_of_them.cameras.t[:, :, None]).all(-1).long().argmax(-1)
+    )
     assert (place.sort(-1).values == torch.arange(5)).all()
     rows = torch.arange(40)[:, None]
     assert torch.equal(batch.key_points[rows, place], all_of_them.key_points)
@@ -150,7 +165,9 @@ def test_cameras_turn_by_the_angle_asked_about_their_own_centre() -> None:
         torch.testing.assert_close(cameras.centre, batch.cameras.centre, atol=1e-8, rtol=0)
         turns[degrees] = matrix_to_vector(cameras.R @ batch.cameras.R.mT)
         angle = turns[degrees].norm(dim=-1)
-        torch.testing.assert_close(angle, torch.deg2rad(torch.full_like(angle, degrees)), atol=1e-10, rtol=0)
+        torch.testing.assert_close(
+            angle, torch.deg2rad(torch.full_like(angle, degrees)), atol=1e-10, rtol=0
+        )
     torch.testing.assert_close(turns[2.0], 4 * turns[0.5], atol=1e-10, rtol=0)
     assert (turns[2.0] / turns[2.0].norm(dim=-1, keepdim=True)).mean(dim=(0, 1)).abs().max() < 0.15
 

@@ -11,7 +11,9 @@ KINDS = ("absolute", "relative", "aligned")
 
 
 def frames(count: int, seed: int = 0, missing: float = 0.2):
-    """Noisy estimates of random truths, with joints missing on both sides; group 1 of 3 has no frame."""
+    """Noisy estimates of random truths, with joints missing on both sides; group 1 of 3 has no
+    frame.
+    """
     g = torch.Generator().manual_seed(seed)
     truth = 300 * torch.randn(count, 17, 3, generator=g) + torch.tensor([1000.0, -2000.0, 900.0])
     points = truth + 20 * torch.randn(count, 17, 3, generator=g)
@@ -38,7 +40,9 @@ def slow_errors(estimate: PoseEstimate, truth, truth_seen, kind: str) -> list[di
         joints = [j for j in range(17) if e[j] and s[j]]
         if kind == "relative":
             joints = joints if PELVIS in joints else []
-            result.append({j: np.linalg.norm((p[j] - p[PELVIS]) - (t[j] - t[PELVIS])) for j in joints})
+            result.append(
+                {j: np.linalg.norm((p[j] - p[PELVIS]) - (t[j] - t[PELVIS])) for j in joints}
+            )
         elif kind == "aligned":
             joints = joints if len(joints) >= 3 else []
             distances = similarity_residual(p[joints], t[joints]) if joints else []
@@ -63,7 +67,9 @@ def test_equals_a_slow_reference(kind):
         expected = np.mean([frame[joint] for frame in slow if joint in frame])
         assert result.per_joint[joint].item() == pytest.approx(expected, rel=1e-9)
     for g in (0, 2):
-        expected = np.mean([e for frame, k in zip(slow, group, strict=True) if k == g for e in frame.values()])
+        expected = np.mean(
+            [e for frame, k in zip(slow, group, strict=True) if k == g for e in frame.values()]
+        )
         assert result.per_group[g].item() == pytest.approx(expected, rel=1e-9)
     assert result.per_group[1].isnan()
 
@@ -75,7 +81,9 @@ def test_zero_where_it_should_be():
     moved = PoseEstimate(truth + torch.tensor([5.0, 7.0, -9.0]), everywhere)
     similar = PoseEstimate(0.5 * truth.double() @ turn.mT + 77, everywhere)
     assert joint_errors(moved, truth, everywhere, "absolute")[0].min() > 12
-    assert joint_errors(moved, truth, everywhere, "relative")[0].max() < 1e-3  # the float32 of the input
+    assert (
+        joint_errors(moved, truth, everywhere, "relative")[0].max() < 1e-3
+    )  # the float32 of the input
     assert joint_errors(similar, truth, everywhere, "relative")[0][:, SIX_JOINTS].mean() > 100
     assert joint_errors(similar, truth, everywhere, "aligned")[0].max() < 1e-6
 
@@ -86,7 +94,9 @@ def test_what_does_not_count_changes_nothing(kind):
     counts = (estimate.estimated & truth_seen)[..., None]
     spoilt = PoseEstimate(torch.where(counts, estimate.points, 1e6), estimate.estimated)
     errors, counted = joint_errors(estimate, truth, truth_seen, kind)
-    spoilt_errors, spoilt_counted = joint_errors(spoilt, torch.where(counts, truth, -1e6), truth_seen, kind)
+    spoilt_errors, spoilt_counted = joint_errors(
+        spoilt, torch.where(counts, truth, -1e6), truth_seen, kind
+    )
     assert torch.equal(counted, spoilt_counted)
     torch.testing.assert_close(spoilt_errors, errors, rtol=1e-12, atol=1e-9)
 
@@ -95,7 +105,9 @@ def test_frames_that_fix_no_frame_do_not_count():
     estimate, truth, truth_seen, _ = frames(4, missing=0.0)
     no_pelvis = estimate.estimated.clone()
     no_pelvis[:, PELVIS] = False
-    assert not joint_errors(PoseEstimate(estimate.points, no_pelvis), truth, truth_seen, "relative")[1].any()
+    assert not joint_errors(
+        PoseEstimate(estimate.points, no_pelvis), truth, truth_seen, "relative"
+    )[1].any()
     two = torch.zeros_like(truth_seen)
     two[:, :2] = True
     errors, counted = joint_errors(PoseEstimate(estimate.points, two), truth, truth_seen, "aligned")
@@ -107,7 +119,9 @@ def test_three_joints_are_enough_to_align():
     estimate, truth, truth_seen, _ = frames(1, missing=0.0)
     three = torch.zeros_like(truth_seen)
     three[:, [2, 9, 16]] = True
-    errors, counted = joint_errors(PoseEstimate(estimate.points, three), truth, truth_seen, "aligned")
+    errors, counted = joint_errors(
+        PoseEstimate(estimate.points, three), truth, truth_seen, "aligned"
+    )
     assert torch.equal(counted, three)
     assert errors[three].max() > 1  # the noise has changed the triangle's shape
 
@@ -124,14 +138,19 @@ def test_uneven_processes_give_the_number_of_one(kind):
     shares[0].merge_state(shares[2])
     assert torch.equal(shares[0].counted, whole.counted)
     assert torch.equal(shares[0].with_truth, whole.with_truth)
-    torch.testing.assert_close(shares[0].compute(), whole.compute(), rtol=1e-12, atol=0, equal_nan=True)
+    torch.testing.assert_close(
+        shares[0].compute(), whole.compute(), rtol=1e-12, atol=0, equal_nan=True
+    )
     assert all(
-        reduction is torch.sum or reduction.__name__ == "dim_zero_sum" for reduction in whole._reductions.values()
+        reduction is torch.sum or reduction.__name__ == "dim_zero_sum"
+        for reduction in whole._reductions.values()
     )
 
 
 def test_nothing_to_average_is_nan():
     metric = MPJPE("absolute", 1, 17)
     nowhere, no_points = torch.zeros(0, 17, dtype=torch.bool), torch.zeros(0, 17, 3)
-    metric.update(PoseEstimate(no_points, nowhere), no_points, nowhere, torch.zeros(0, dtype=torch.int64))
+    metric.update(
+        PoseEstimate(no_points, nowhere), no_points, nowhere, torch.zeros(0, dtype=torch.int64)
+    )
     assert metric.compute().mean.isnan()

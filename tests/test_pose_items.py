@@ -1,4 +1,6 @@
-"""The pose items on metrics that hold the paper's own numbers: no difference, no miss, every claim of its text true."""
+"""The pose items on metrics that hold the paper's own numbers: no difference, no miss, every claim
+of its text true.
+"""
 
 from copy import deepcopy
 from pathlib import Path
@@ -21,9 +23,13 @@ from ghpt.paper.published import (
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SETUP = Setup(CONF, {"human36m": None, "panoptic": None}, {"train": (), "test": ()}, {}, 0)
-REAL = Setup(CONF, {"human36m": "/data/human36m", "panoptic": "/data/panoptic"}, SETUP.overrides, {}, 0)
+REAL = Setup(
+    CONF, {"human36m": "/data/human36m", "panoptic": "/data/panoptic"}, SETUP.overrides, {}, 0
+)
 ITEMS = {
-    i.label: i for part in (generalization, other_systems, base_dataset, pose_figures, view_weights) for i in part.ITEMS
+    i.label: i
+    for part in (generalization, other_systems, base_dataset, pose_figures, view_weights)
+    for i in part.ITEMS
 }
 ESTIMATORS = (*SELECTIONS, "view_weights", *base_dataset.BASELINES)
 PRIOR = {"weight": 1e-3, "best": 1.1e-3, "average": 2e-3}
@@ -38,24 +44,33 @@ def papers(name):
         errors = dict.fromkeys(ESTIMATORS, 40.0)
         errors |= QUANTITATIVE_HYPOTHESES["h36m" if test == "h36m" else "panoptic"]
         errors |= {"weight": GENERALIZATION[train, test]}
-        if name == "cmu3 on cmu3":  # tab:quantitative-hypotheses has another arrangement's number, so nearly this one
+        if (
+            name == "cmu3 on cmu3"
+        ):  # tab:quantitative-hypotheses has another arrangement's number, so nearly this one
             errors["weight"] = QUANTITATIVE_HYPOTHESES["panoptic"]["weight"]
     return {
-        "data": "h36m", "source": "embedded", "split": "test", "provenance": {},
+        "data": "h36m",
+        "source": "embedded",
+        "split": "test",
+        "provenance": {},
         "selections": {
             name: {
                 "mpjpe_relative": error,
                 "mpjpe_6_joints": error,
                 "per_action": QUANTITATIVE,
-                "pose_prior": {"S9": {p: PRIOR.get(name, 4e-3 if name == "most" else 9e-3) for p in PARTS}},
+                "pose_prior": {
+                    "S9": {p: PRIOR.get(name, 4e-3 if name == "most" else 9e-3) for p in PARTS}
+                },
             }
             for name, error in errors.items()
         },
-    }  # fmt: skip
+    }
 
 
 class Fake(Results):
-    """Results that read from a function instead of from folders; ``change(name, metrics)`` for each seed."""
+    """Results that read from a function instead of from folders; ``change(name, metrics)`` for each
+    seed.
+    """
 
     def __init__(self, *changes, setup=SETUP):
         super().__init__([setup] * len(changes), [{}] * len(changes), Path())
@@ -74,8 +89,15 @@ def same(name, metrics):
     """The paper's numbers."""
 
 
-TABLES = ("generalization-evaluation", "iskakov-comparison", "remelli-comparison", "sota-comparison", "quantitative",
-          "quantitative-hypotheses", "limitation-table")  # fmt: skip
+TABLES = (
+    "generalization-evaluation",
+    "iskakov-comparison",
+    "remelli-comparison",
+    "sota-comparison",
+    "quantitative",
+    "quantitative-hypotheses",
+    "limitation-table",
+)
 
 
 @pytest.mark.parametrize("label", TABLES)
@@ -83,7 +105,11 @@ def test_the_papers_own_numbers_have_no_miss_and_all_of_its_claims(label):
     section = ITEMS[label].section(Fake(same, setup=REAL))
     assert all(claim.holds for claim in section.claims), [c for c in section.claims if not c.holds]
     assert section.claims
-    rounding = {"generalization-evaluation": 0.005, "remelli-comparison": 0.005, "sota-comparison": 0.005}
+    rounding = {
+        "generalization-evaluation": 0.005,
+        "remelli-comparison": 0.005,
+        "sota-comparison": 0.005,
+    }
     for number in section.compared:
         assert abs(number.difference) <= rounding.get(label, 1e-9), number
     assert "miss" not in section.body
@@ -99,7 +125,9 @@ def worse(name, metrics):
         metrics["selections"][selection]["mpjpe_relative"] *= 1.5 if name != "h36m on h36m" else 3
 
 
-@pytest.mark.parametrize("label", [label for label in TABLES if label not in ("quantitative", "limitation-table")])
+@pytest.mark.parametrize(
+    "label", [label for label in TABLES if label not in ("quantitative", "limitation-table")]
+)
 def test_a_worse_model_misses_and_its_claims_fall(label):
     section = ITEMS[label].section(Fake(worse, setup=REAL))
     assert any(number.miss for number in section.compared)
@@ -119,9 +147,15 @@ def test_numbers_over_seeds_have_their_deviation():
 
 @pytest.mark.parametrize(
     ("paper", "ours", "better", "miss"),
-    [(10.0, 10.4, "lower", False), (10.0, 10.6, "lower", True), (10.0, 5.0, "lower", False), (10.0, 5.0, "same", True),
-     (10.0, 10.4, "same", False), (None, 3.0, "lower", False)],
-)  # fmt: skip
+    [
+        (10.0, 10.4, "lower", False),
+        (10.0, 10.6, "lower", True),
+        (10.0, 5.0, "lower", False),
+        (10.0, 5.0, "same", True),
+        (10.0, 10.4, "same", False),
+        (None, 3.0, "lower", False),
+    ],
+)
 def test_what_is_a_miss(paper, ours, better, miss):
     number = Compared("x", paper, Spread((ours,)), better)
     assert number.miss == miss
@@ -133,7 +167,11 @@ def test_a_drop_to_novel_arrangements_is_of_the_trained_one():
         train, test = name.split(" on ")
         metrics["selections"]["weight"]["mpjpe_relative"] = 20.0 if train == test else 22.0
 
-    rows = [row for row in ITEMS["remelli-comparison"].section(Fake(drop)).body.splitlines() if "ours (CMU" in row]
+    rows = [
+        row
+        for row in ITEMS["remelli-comparison"].section(Fake(drop)).body.splitlines()
+        if "ours (CMU" in row
+    ]
     assert len(rows) == 4
     assert all(row.split("|")[-2].strip() == "+10.0 %" for row in rows)
 
@@ -174,21 +212,37 @@ def test_other_systems_have_view_weights_of_the_novel_arrangements_beside_them()
     ("cell", "error", "holds"),
     [
         ("", 0.0, [True, True, True]),
-        ("cmu2 on h36m", 28.0, [True, False, True]),  # better than the paper's 33.4 mm, worse than RANSAC's 27.4
+        (
+            "cmu2 on h36m",
+            28.0,
+            [True, False, True],
+        ),  # better than the paper's 33.4 mm, worse than RANSAC's 27.4
         ("cmu1 on cmu3", 26.0, [False, True, True]),  # worse than the paper's 24.9 mm
         ("cmu4 on cmu1", 41.0, [False, True, False]),
     ],
 )
-def test_view_weights_are_set_beside_the_papers_selection_and_the_best_classical_estimator(cell, error, holds):
+def test_view_weights_are_set_beside_the_papers_selection_and_the_best_classical_estimator(
+    cell, error, holds
+):
     def change(name, metrics):
         metrics["selections"]["view_weights"]["mpjpe_relative"] = error if name == cell else 20.0
 
     section = ITEMS["view-weights"].section(Fake(change))
     assert [claim.holds for claim in section.claims] == holds
     assert {claim.where for claim in section.claims} == {"not in the paper"}
-    rows = [[text.strip() for text in line.split("|")[1:-1]] for line in section.body.splitlines()[2:]]
+    rows = [
+        [text.strip() for text in line.split("|")[1:-1]] for line in section.body.splitlines()[2:]
+    ]
     assert len(rows) == 2 + 2 * 5
-    assert rows[-1] == ["H36M, the paper's selection", "33.50", "33.40", "31.00", "32.50", "29.10", "RANSAC 27.40"]
+    assert rows[-1] == [
+        "H36M, the paper's selection",
+        "33.50",
+        "33.40",
+        "31.00",
+        "32.50",
+        "29.10",
+        "RANSAC 27.40",
+    ]
     assert rows[-2][:2] == ["H36M, view weights", "20.00"]
     assert not section.compared
 
@@ -208,8 +262,11 @@ def test_hyperparameters_are_those_of_the_configuration():
     body = ITEMS["hyperparameters"].section(Results([SETUP], [{}], Path())).body
     row = next(line for line in body.splitlines() if "alpha" in line)
     assert [cell.strip() for cell in row.split("|")[2:6]] == [
-        "1.0, 0.01, 0.02", "1.0, 0.01, 0.02", "1.0, 0.01, 0.0", "1.0, 0.01, 0.0"
-    ]  # fmt: skip
+        "1.0, 0.01, 0.02",
+        "1.0, 0.01, 0.02",
+        "1.0, 0.01, 0.0",
+        "1.0, 0.01, 0.0",
+    ]
     changed = Setup(CONF, SETUP.roots, {"train": ("model.hypotheses=77",), "test": ()}, {}, 0)
     assert "77" in ITEMS["hyperparameters"].section(Results([changed], [{}], Path())).body
 

@@ -10,7 +10,9 @@ def frames(count: int, seed: int = 0):
     g = torch.Generator().manual_seed(seed)
     body = 300 * torch.randn(17, 3, generator=g)
     points = body + 20 * torch.randn(count, 17, 3, generator=g)
-    return PoseEstimate(points, torch.rand(count, 17, generator=g) > 0.1), torch.randint(0, 2, (count,), generator=g)
+    return PoseEstimate(points, torch.rand(count, 17, generator=g) > 0.1), torch.randint(
+        0, 2, (count,), generator=g
+    )
 
 
 def test_equals_numpy_variance():
@@ -35,14 +37,18 @@ def test_left_is_the_numerator():
     pose = torch.zeros(1, 17, 3)
     pose[0, JOINT["left_wrist"], 0], pose[0, JOINT["right_wrist"], 0] = 300.0, 200.0
     ratios, defined = length_ratios(PoseEstimate(pose, torch.ones(1, 17, dtype=torch.bool)))
-    assert defined[0].tolist() == [part == "lower_arm" for part in PARTS]  # other right parts have no length
+    assert defined[0].tolist() == [
+        part == "lower_arm" for part in PARTS
+    ]  # other right parts have no length
     assert ratios[0, PARTS.index("lower_arm")] == 1.5
 
 
 def test_mirroring_inverts_the_ratio():
     estimate, _ = frames(50)
     ratios, defined = length_ratios(estimate)
-    mirrored, mirrored_defined = length_ratios(PoseEstimate(estimate.points[:, MIRROR], estimate.estimated[:, MIRROR]))
+    mirrored, mirrored_defined = length_ratios(
+        PoseEstimate(estimate.points[:, MIRROR], estimate.estimated[:, MIRROR])
+    )
     assert torch.equal(defined, mirrored_defined)
     torch.testing.assert_close(mirrored, 1 / ratios)
 
@@ -52,7 +58,8 @@ def test_a_constant_asymmetry_costs_nothing():
     scale = torch.linspace(0.5, 2, 100)[:, None, None]
     metric = PosePrior(subjects=1)
     metric.update(
-        PoseEstimate(pose * scale, torch.ones(100, 17, dtype=torch.bool)), torch.zeros(100, dtype=torch.int64)
+        PoseEstimate(pose * scale, torch.ones(100, 17, dtype=torch.bool)),
+        torch.zeros(100, dtype=torch.int64),
     )
     assert metric.compute().max() < 1e-10
 

@@ -22,7 +22,16 @@ from ghpt.geometry.cameras import Cameras, project
 from ghpt.models.checkpoint import FORMAT_VERSION, AtomicCheckpointIO
 from ghpt.reconstruction import State
 from ghpt.skeleton import JOINTS
-from predicting import CONF, QUICK, cameras_file, config, frames_of, openpose_folders, walk, write_people
+from predicting import (
+    CONF,
+    QUICK,
+    cameras_file,
+    config,
+    frames_of,
+    openpose_folders,
+    walk,
+    write_people,
+)
 
 ROOT = Path(__file__).resolve().parents[1]
 RIG = human36m_rig("S9")
@@ -40,9 +49,17 @@ def points_file(folder: Path, values=None, name="points.npz", frames=40, **chang
     """The walk in Human3.6M's cameras as an npz file of ours."""
     values = PIXELS[:frames].astype(np.float64) if values is None else values
     seen = np.isfinite(values).all(-1)
-    points = KeyPoints("", tuple(f"cam{i}_json" for i in range(values.shape[1])), JOINTS, np.arange(len(values)),
-                       np.where(seen[..., None], values, 0), seen.astype(float), seen, 50.0,
-                       (0,) * values.shape[1])  # fmt: skip
+    points = KeyPoints(
+        "",
+        tuple(f"cam{i}_json" for i in range(values.shape[1])),
+        JOINTS,
+        np.arange(len(values)),
+        np.where(seen[..., None], values, 0),
+        seen.astype(float),
+        seen,
+        50.0,
+        (0,) * values.shape[1],
+    )
     write_key_points(folder / name, KeyPoints(**{**vars(points), **changed}))
     return folder / name
 
@@ -63,7 +80,11 @@ def checkpoint(folder: Path, model: str) -> Path:
         settings = plain(hydra.compose("train", overrides=small))["model"]
     built = build(settings, "model")
     built.scorer.standardise.fit(torch.randn(100, built.problem.feature_size))
-    ours = {"format_version": FORMAT_VERSION, "config": {"model": settings}, "provenance": {"data": "toys"}}
+    ours = {
+        "format_version": FORMAT_VERSION,
+        "config": {"model": settings},
+        "provenance": {"data": "toys"},
+    }
     content = {"ghpt": ours, "state_dict": built.state_dict()}
     AtomicCheckpointIO().save_checkpoint(content, folder / f"{model}.ckpt")
     return folder / f"{model}.ckpt"
@@ -71,17 +92,32 @@ def checkpoint(folder: Path, model: str) -> Path:
 
 def test_a_folder_and_cameras_give_poses_in_every_format(command, tmp_path):
     openpose_folders(tmp_path / "pose", list(range(20)))
-    status, said, errors = command(*words(tmp_path, tmp_path / "pose"), "skeleton=human36m", "rate_hz=50")
+    status, said, errors = command(
+        *words(tmp_path, tmp_path / "pose"), "skeleton=human36m", "rate_hz=50"
+    )
     assert status == 0, errors
     there = {path.name for path in (tmp_path / "out").iterdir()}
-    assert there >= {"poses.npz", "poses.csv", "poses.trc", "poses.c3d", "poses.html", "report.md", "prediction.json"}
+    assert there >= {
+        "poses.npz",
+        "poses.csv",
+        "poses.trc",
+        "poses.c3d",
+        "poses.html",
+        "report.md",
+        "prediction.json",
+    }
     about, found = result(tmp_path)
     assert about.camera_names == tuple(f"cam_{i:02d}" for i in range(4))
     assert about.rate_hz == 50
     assert not about.smoothed
     assert float((found.points.double() - walk()[:20]).norm(dim=-1).max()) < 1
     # without a checkpoint it says what it is: in the terminal, the report and the files
-    for text in (said, errors, (tmp_path / "out" / "report.md").read_text(), json.dumps(about.provenance)):
+    for text in (
+        said,
+        errors,
+        (tmp_path / "out" / "report.md").read_text(),
+        json.dumps(about.provenance),
+    ):
         assert "classical" in text
 
 
@@ -91,7 +127,9 @@ def test_without_a_rate_the_formats_that_need_one_are_left_out_or_refused(comman
     assert status == 0, said
     assert "no trc and c3d. Give rate_hz=60" in said
     assert not (tmp_path / "out" / "poses.trc").exists()
-    status, _, said = command(*words(tmp_path, tmp_path / "pose"), "skeleton=human36m", "formats=[c3d]")
+    status, _, said = command(
+        *words(tmp_path, tmp_path / "pose"), "skeleton=human36m", "formats=[c3d]"
+    )
     assert status == 1
     assert "error: rate_hz: is unknown, and c3d needs it" in said
 
@@ -195,8 +233,13 @@ def test_stored_and_compressed_key_points_give_the_same(tmp_path):
 
 def test_a_trained_model_predicts_and_says_so(command, tmp_path):
     ckpt = checkpoint(tmp_path, "pose")
-    status, said, errors = command(*words(tmp_path, points_file(tmp_path)), f"ckpt={ckpt}", "hypotheses=6",
-                                   "view_weights.power=2.5", "compare=[linear]")  # fmt: skip
+    status, said, errors = command(
+        *words(tmp_path, points_file(tmp_path)),
+        f"ckpt={ckpt}",
+        "hypotheses=6",
+        "view_weights.power=2.5",
+        "compare=[linear]",
+    )
     assert status == 0, errors
     assert "pose.ckpt, trained on toys" in said
     about, found = result(tmp_path)
@@ -210,8 +253,14 @@ def test_a_trained_model_predicts_and_says_so(command, tmp_path):
 def test_a_sweep_takes_many_recordings_and_names_the_bad_one(command, tmp_path):
     good, cameras, out = points_file(tmp_path), cameras_file(tmp_path), tmp_path / "out"
     (tmp_path / "bad.npz").write_bytes(good.read_bytes()[:-40])
-    status, said, _ = command("-m", f"keypoints={tmp_path / 'bad.npz'},{good}", f"cameras={cameras}", f"output={out}",
-                              "formats=[npz]", "hydra.sweep.subdir=${hydra.job.num}")  # fmt: skip
+    status, said, _ = command(
+        "-m",
+        f"keypoints={tmp_path / 'bad.npz'},{good}",
+        f"cameras={cameras}",
+        f"output={out}",
+        "formats=[npz]",
+        "hydra.sweep.subdir=${hydra.job.num}",
+    )
     assert status == 1
     assert "1: points.npz with cameras.toml: 40 frames, 100.0 % observed" in said
     assert "0: error:" in said
@@ -243,11 +292,20 @@ def spoilt(folder: Path, kind: str) -> list[str]:
     elif kind == "another image size":
         points = points_file(folder, 3 * values)
     elif kind == "all NaN":
-        np.savez(points, key_points=values * np.nan, views=np.array([f"cam{i}" for i in range(4)]), joints=JOINTS)
+        np.savez(
+            points,
+            key_points=values * np.nan,
+            views=np.array([f"cam{i}" for i in range(4)]),
+            joints=JOINTS,
+        )
     elif kind == "unknown skeleton":
-        np.savez(points, key_points=values[:, :, :11], views=np.array([f"cam{i}" for i in range(4)]))
+        np.savez(
+            points, key_points=values[:, :, :11], views=np.array([f"cam{i}" for i in range(4)])
+        )
     elif kind == "no extrinsics":
-        same = Cameras(RIG.cameras.K, RIG.cameras.R[:1].expand(4, 3, 3), RIG.cameras.t[:1].expand(4, 3))
+        same = Cameras(
+            RIG.cameras.K, RIG.cameras.R[:1].expand(4, 3, 3), RIG.cameras.t[:1].expand(4, 3)
+        )
         names = tuple(f"cam_{i:02d}" for i in range(4))
         write_pose2sim(cameras, Rig(names, same, 0 * RIG.distortion, RIG.size), {})
     elif kind == "no cameras":
@@ -299,7 +357,9 @@ def test_absurd_numbers_spoil_their_own_joint_only(tmp_path):
     values[4, 2, 6] = 1e6
     values[5, 1, 7] = np.nan
     values[6, 0] = -999999.0
-    predict(config(*words(tmp_path, points_file(tmp_path, values)), "formats=[npz]"), tmp_path / "out")
+    predict(
+        config(*words(tmp_path, points_file(tmp_path, values)), "formats=[npz]"), tmp_path / "out"
+    )
     _, found = result(tmp_path)
     assert (found.state == State.OBSERVED).all()
     assert float((found.points.double() - walk()[:20]).norm(dim=-1).max()) < 1
@@ -309,7 +369,10 @@ def test_absurd_numbers_spoil_their_own_joint_only(tmp_path):
 def test_a_person_who_leaves_is_missing_then(tmp_path):
     values = PIXELS[:20].astype(np.float64)
     values[12:] = np.nan
-    predict(config(*words(tmp_path, points_file(tmp_path, values)), "formats=[npz]", "fill=100"), tmp_path / "out")
+    predict(
+        config(*words(tmp_path, points_file(tmp_path, values)), "formats=[npz]", "fill=100"),
+        tmp_path / "out",
+    )
     _, found = result(tmp_path)
     assert (found.state[:12] == State.OBSERVED).all()
     assert (found.state[12:] == State.FEW_VIEWS).all()
@@ -337,11 +400,19 @@ run(Path({conf!r}), ghpt.commands.predict.COMMAND)
 @pytest.mark.posix
 @pytest.mark.parametrize(("limit", "file"), [(9_000, "000000.npz"), (25_000, "poses.npz")])
 def test_a_full_disk_is_named_and_the_next_run_goes_on(tmp_path, limit, file):
-    given = [*QUICK, *words(tmp_path, points_file(tmp_path)), "shard_frames=20", "formats=[npz]", "overwrite=true"]
+    given = [
+        *QUICK,
+        *words(tmp_path, points_file(tmp_path)),
+        "shard_frames=20",
+        "formats=[npz]",
+        "overwrite=true",
+    ]
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "poses.npz").write_bytes(b"of an earlier run")
     script = DISK.format(words=given, limit=limit, conf=str(CONF))
-    run_ = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=300)
+    run_ = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=300
+    )
     assert run_.returncode == 1, run_.stderr
     last = run_.stderr.strip().splitlines()[-1]
     assert "File too large" in last
@@ -360,20 +431,30 @@ def test_a_recording_of_a_data_set_is_a_demonstration(tmp_path, monkeypatch):
     for found in numbers["evaluation"]["estimators"].values():
         assert 0 < found["held_out"]["median"] < 5
         assert (
-            found["held_out"]["count"] == next(iter(numbers["evaluation"]["estimators"].values()))["held_out"]["count"]
+            found["held_out"]["count"]
+            == next(iter(numbers["evaluation"]["estimators"].values()))["held_out"]["count"]
         )
 
 
 def test_real_recordings_are_predicted(shared_data, tmp_path):
     """Pose2Sim's demo and caliscope's: figures of docs/recordings.md."""
     one = shared_data / "pose2sim_single"
-    numbers = predict(config(f"keypoints={one / 'pose'}", f"cameras={one / 'Calib_qualisys.toml'}", "rate_hz=60",
-                             "evaluated_frames=20"), tmp_path / "out")  # fmt: skip
+    numbers = predict(
+        config(
+            f"keypoints={one / 'pose'}",
+            f"cameras={one / 'Calib_qualisys.toml'}",
+            "rate_hz=60",
+            "evaluated_frames=20",
+        ),
+        tmp_path / "out",
+    )
     assert numbers["frames"] == 100
     assert numbers["share"]["observed"] > 0.95
     assert next(iter(numbers["evaluation"]["estimators"].values()))["held_out"]["median"] < 40
     two = shared_data / "caliscope"
-    numbers = predict(config(f"keypoints={two / 'xy_HOLISTIC.csv'}", f"cameras={two / 'camera_array.toml'}"),
-                      tmp_path / "two")  # fmt: skip
+    numbers = predict(
+        config(f"keypoints={two / 'xy_HOLISTIC.csv'}", f"cameras={two / 'camera_array.toml'}"),
+        tmp_path / "two",
+    )
     assert numbers["frames"] == 267
     assert 0.8 < numbers["share"]["observed"] < 1

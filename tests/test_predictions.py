@@ -13,19 +13,38 @@ from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predict
 from ghpt.recording import PoseEstimate, Recording
 
 NAMES = ("weight", "average", "linear")
-META = {"data": "h36m", "source": "embedded", "split": "test", "seed": 0, "provenance": {"commit": "abc"}}
+META = {
+    "data": "h36m",
+    "source": "embedded",
+    "split": "test",
+    "seed": 0,
+    "provenance": {"commit": "abc"},
+}
 
 
 def recording(subject: str, action: str) -> Recording:
     """A recording of no frames."""
     cameras = Cameras(torch.zeros(2, 3, 3), torch.zeros(2, 3, 3), torch.zeros(2, 3))
     views, mask = np.zeros((0, 2, 17, 2), np.float32), np.zeros((0, 2, 17), bool)
-    return Recording(f"{subject}/{action}", subject, action, 50.0, ("a", "b"), cameras, views, views[..., 0], mask,
-                     np.zeros((0, 17, 3), np.float32), mask[:, 0], np.zeros(0, np.int64))  # fmt: skip
+    return Recording(
+        f"{subject}/{action}",
+        subject,
+        action,
+        50.0,
+        ("a", "b"),
+        cameras,
+        views,
+        views[..., 0],
+        mask,
+        np.zeros((0, 17, 3), np.float32),
+        mask[:, 0],
+        np.zeros(0, np.int64),
+    )
 
 
 RECORDINGS = [
-    recording(subject, action) for subject, action in (("S9", "Eating"), ("S9", "Walking"), ("S11", "Eating"))
+    recording(subject, action)
+    for subject, action in (("S9", "Eating"), ("S9", "Walking"), ("S11", "Eating"))
 ]
 
 
@@ -67,7 +86,9 @@ def test_round_trip(tmp_path):
     assert torch.equal(torch.cat([c.frame for c in chunks]), expected["frame"])
     assert torch.equal(torch.cat([c.recording for c in chunks]), expected["recording"])
     for name, estimate in expected["estimates"].items():
-        assert torch.equal(torch.cat([c.estimates[name].estimated for c in chunks]), estimate.estimated)
+        assert torch.equal(
+            torch.cat([c.estimates[name].estimated for c in chunks]), estimate.estimated
+        )
         points = torch.cat([c.estimates[name].points for c in chunks])
         assert torch.equal(points, estimate.points * estimate.estimated[..., None])
     for name, values in expected["weights"].items():
@@ -77,8 +98,12 @@ def test_round_trip(tmp_path):
 def test_numpy_alone_reads_it_and_missing_is_nan(tmp_path):
     with np.load(write_all(tmp_path), allow_pickle=False) as arrays:
         expected = rows(torch.arange(20))["estimates"]["average"]
-        np.testing.assert_array_equal(~np.isnan(arrays["points_average"]).any(-1), expected.estimated)
-        np.testing.assert_array_equal(arrays["points_average"][expected.estimated], expected.points[expected.estimated])
+        np.testing.assert_array_equal(
+            ~np.isnan(arrays["points_average"]).any(-1), expected.estimated
+        )
+        np.testing.assert_array_equal(
+            arrays["points_average"][expected.estimated], expected.points[expected.estimated]
+        )
         np.testing.assert_array_equal(np.isnan(arrays["truth"]).any(-1), ~arrays["truth_seen"])
         assert arrays["joint_name"][6] == "pelvis"
         assert json.loads(str(arrays["meta"]))["source"] == "embedded"
@@ -92,7 +117,9 @@ def test_bytes_depend_on_the_content_alone(tmp_path):
 
 
 def test_two_writers_make_the_file_of_one(tmp_path):
-    writers = [PredictionWriter(tmp_path / "shared", 20, NAMES) for _ in range(2)]  # as two processes have them
+    writers = [
+        PredictionWriter(tmp_path / "shared", 20, NAMES) for _ in range(2)
+    ]  # as two processes have them
     for start in range(0, 20, 4):
         for rank, writer in enumerate(writers):
             index = torch.arange(start + rank, start + 4, 2)

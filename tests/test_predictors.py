@@ -43,7 +43,16 @@ def learned(reject=None):
     scorer = partial(Scorer, **{k: v for k, v in config["scorer"].items() if not k.startswith("_")})
     loss = StochasticLoss(alpha=1.0, beta=0.0, gamma=0.0, relative_errors=True)
     model = StochasticEstimator(
-        PoseTriangulation(True, True), scorer, loss, torch.optim.Adam, 50, 1.5, False, 1.5, "weight", 0
+        PoseTriangulation(True, True),
+        scorer,
+        loss,
+        torch.optim.Adam,
+        50,
+        1.5,
+        False,
+        1.5,
+        "weight",
+        0,
     )
     model.fit_statistics(iter([random_scene(0, frames=20).batch()]))
     consensus = AdaptiveRansac(threshold=0.02, pairs=64, seed=0, adapt=5.0, quantile=0.55, rounds=4)
@@ -96,7 +105,9 @@ def test_the_learned_prediction_is_that_of_the_view_weights():
     weighed, result = predictor.view_weights.weigh(batch), predictor(batch)
     assert torch.equal(result.points, weighed.triangulation.points)
     assert torch.equal(result.views, weighed.views)
-    torch.testing.assert_close(result.score, (weighed.weights * weighed.logits).sum(-1), rtol=0, atol=1e-6)
+    torch.testing.assert_close(
+        result.score, (weighed.weights * weighed.logits).sum(-1), rtol=0, atol=1e-6
+    )
     found = QUALITY(batch, weighed.triangulation.points, weighed.views)
     torch.testing.assert_close(result.covariance, found.covariance.float())
 
@@ -108,7 +119,10 @@ def test_displaced_key_points_spoil_the_average_of_the_hypotheses_and_not_the_le
     model = predictor.view_weights.model
     pool = model.problem.generate(batch, model.hypotheses, model.keys("average", batch))
     result = sound(predictor(batch), batch)
-    ours, average = ((points - scene.points).norm(dim=-1).mean() for points in (result.points, pool.points.mean(1)))
+    ours, average = (
+        (points - scene.points).norm(dim=-1).mean()
+        for points in (result.points, pool.points.mean(1))
+    )
     assert result.placed.all()
     assert ours < 0.3 * average
     moved = (batch.key_points - scene.key_points).norm(dim=-1) > 0
@@ -242,12 +256,16 @@ def test_a_frame_is_the_same_in_any_batch(make):
     batch = random_scene(7, frames=4, views=4).noisy(3, 0).batch()
     whole, one = make()(batch), make()(part(batch, slice(2, 3)))
     for field in ("points", "covariance", "error"):
-        torch.testing.assert_close(getattr(one, field)[0], getattr(whole, field)[2], rtol=1e-5, atol=1e-4)
+        torch.testing.assert_close(
+            getattr(one, field)[0], getattr(whole, field)[2], rtol=1e-5, atol=1e-4
+        )
     assert torch.equal(one.views[0], whole.views[2])
 
 
 def part(batch, rows):
-    return type(batch)(**{k: v.index(rows) if isinstance(v, Cameras) else v[rows] for k, v in vars(batch).items()})
+    return type(batch)(
+        **{k: v.index(rows) if isinstance(v, Cameras) else v[rows] for k, v in vars(batch).items()}
+    )
 
 
 @pytest.mark.parametrize("make", [classical, learned])
@@ -262,7 +280,8 @@ def test_no_frames_and_no_seen_joints_are_no_error(make):
 def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
     conf = Path(__file__).parents[1] / "conf"
     config, baselines = (
-        yaml.safe_load((conf / name / "default.yaml").read_text()) for name in ("estimator", "baselines")
+        yaml.safe_load((conf / name / "default.yaml").read_text())
+        for name in ("estimator", "baselines")
     )
     estimator = build(baselines["adaptive_ransac"], "baselines.adaptive_ransac")
     scene = random_scene(9, frames=30, views=5).noisy(2, 0)

@@ -28,7 +28,9 @@ BANNED = {
 """Versions that must never be installed."""
 
 
-@pytest.mark.parametrize(("name", "version"), [(name, v) for name, versions in BANNED.items() for v in versions])
+@pytest.mark.parametrize(
+    ("name", "version"), [(name, v) for name, versions in BANNED.items() for v in versions]
+)
 def test_a_banned_version_is_refused(name: str, version: str) -> None:
     (requirement,) = [r for r in REQUIREMENTS if r.name == name]
     assert not requirement.specifier.contains(version)

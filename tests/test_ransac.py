@@ -25,7 +25,10 @@ def test_little_noise_leaves_the_threshold_alone():
 
 
 def test_much_noise_widens_it_in_the_frames_that_have_it():
-    quiet, loud = random_scene(0, frames=6, views=5).noisy(0.2, 0), random_scene(0, frames=6, views=5).noisy(15, 0)
+    quiet, loud = (
+        random_scene(0, frames=6, views=5).noisy(0.2, 0),
+        random_scene(0, frames=6, views=5).noisy(15, 0),
+    )
     mixed = replace(loud, key_points=torch.cat([loud.key_points[:3], quiet.key_points[3:]]))
     batch = mixed.batch()
     found = ADAPTIVE.triangulate(batch)
@@ -41,13 +44,17 @@ def test_cameras_that_are_off_widen_it_though_two_of_four_views_agree_by_chance(
     scene = random_scene(0, frames=40, views=4).noisy(1, 0)
     batch = RotatedCameras(2.0)(scene.batch(), 0)
     above, median = (replace(ADAPTIVE, adapt=2.0, quantile=quantile) for quantile in (0.6, 0.5))
-    linear, fixed, above, median = (error(estimator, scene, batch) for estimator in (Linear(), FIXED, above, median))
+    linear, fixed, above, median = (
+        error(estimator, scene, batch) for estimator in (Linear(), FIXED, above, median)
+    )
     assert above < 1.05 * linear < median < fixed
 
 
 def test_outliers_do_not_widen_it():
     scene = random_scene(1, frames=5, views=6).noisy(0.2, 1)
-    wrong = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.2
+    wrong = (
+        torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.2
+    )
     size = person_size(scene.key_points, torch.ones_like(wrong))[..., None, None]
     far = replace(scene, key_points=scene.key_points + 0.3 * size * wrong[..., None])
     batch = far.batch()
@@ -67,9 +74,12 @@ def test_a_frame_in_which_nothing_is_seen_keeps_the_threshold():
     assert ADAPTIVE.reach(batch, found.points)[1] == 0.005
 
 
-@pytest.mark.parametrize("settings", [{"adapt": 0.0}, {"rounds": 0}, {"threshold": -1.0}, {"quantile": 1.0}])
+@pytest.mark.parametrize(
+    "settings", [{"adapt": 0.0}, {"rounds": 0}, {"threshold": -1.0}, {"quantile": 1.0}]
+)
 def test_impossible_settings_are_refused(settings):
     with pytest.raises(GhptConfigError):
         AdaptiveRansac(
-            **{"threshold": 0.1, "pairs": 4, "seed": 0, "adapt": 5.0, "quantile": 0.55, "rounds": 4} | settings
+            **{"threshold": 0.1, "pairs": 4, "seed": 0, "adapt": 5.0, "quantile": 0.55, "rounds": 4}
+            | settings
         )

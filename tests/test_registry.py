@@ -1,4 +1,6 @@
-"""What a checkpoint may build: what the project's own configurations name, and classes of trusted packages."""
+"""What a checkpoint may build: what the project's own configurations name, and classes of trusted
+packages.
+"""
 
 import copy
 import importlib
@@ -26,9 +28,14 @@ from signing import save_signed
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 ABLATED = {
-    "stride": {"validation": 512, "test": 512}, "also_trained_on": [], "temperature": [0.5], "hypotheses": [10],
-    "hypotheses_trained": [20], "samples": [50], "samples_hypotheses": 20,
-}  # fmt: skip
+    "stride": {"validation": 512, "test": 512},
+    "also_trained_on": [],
+    "temperature": [0.5],
+    "hypotheses": [10],
+    "hypotheses_trained": [20],
+    "samples": [50],
+    "samples_hypotheses": 20,
+}
 SCORERS = '''
 """A scorer and a loss of the user's own."""
 
@@ -109,9 +116,19 @@ def of_conf() -> dict[str, dict[str, Any]]:
 
 def of_the_ablations() -> dict[str, dict[str, Any]]:
     """The model of every training that reproduce.py changes something in."""
-    setup = Setup(CONF, {"human36m": None, "panoptic": None}, {"train": (), "test": ()}, {"ablation": ABLATED}, 0)
+    setup = Setup(
+        CONF,
+        {"human36m": None, "panoptic": None},
+        {"train": (), "test": ()},
+        {"ablation": ABLATED},
+        0,
+    )
     cells = with_needs(itertools.chain.from_iterable(item.cells(setup).values() for item in ITEMS))
-    return {cell.name: cell.config["model"] for cell in cells.values() if cell.work.endswith(".train_model")}
+    return {
+        cell.name: cell.config["model"]
+        for cell in cells.values()
+        if cell.work.endswith(".train_model")
+    }
 
 
 @pytest.mark.parametrize("models", [of_conf, of_the_ablations])
@@ -129,7 +146,9 @@ def test_optimizers_are_registered_by_name(name: str) -> None:
     optimizer = {"_target_": f"torch.optim.{name}", "_partial_": True, "lr": 0.1}
     built = build_registered(toys.MODEL | {"optimizer": optimizer}).configure_optimizers()
     assert type(built).__name__ == name.rpartition(".")[2]
-    assert all(issubclass(c, torch.optim.Optimizer) for c in PARTS["model.optimizer"].classes.values())
+    assert all(
+        issubclass(c, torch.optim.Optimizer) for c in PARTS["model.optimizer"].classes.values()
+    )
 
 
 @pytest.fixture
@@ -160,8 +179,12 @@ INNER = toys.MODEL["scorer"]
 OWN = {
     "scorer": {"scorer": SCORER},
     "loss": {"loss": {"_target_": "mine.scorers.Expected"}},
-    "problem": {"problem": toys.MODEL["problem"] | {"_target_": "mine.scorers.Wide", "factor": 2.0}},
-    "ours within one's own": {"scorer": {"_target_": "mine.scorers.Wrapped", "_partial_": True, "inner": INNER}},
+    "problem": {
+        "problem": toys.MODEL["problem"] | {"_target_": "mine.scorers.Wide", "factor": 2.0}
+    },
+    "ours within one's own": {
+        "scorer": {"_target_": "mine.scorers.Wrapped", "_partial_": True, "inner": INNER}
+    },
 }
 
 
@@ -178,21 +201,32 @@ def test_a_model_of_one_s_own_trains_and_tests(tmp_path: Path, own: Path, name: 
     train(config, tmp_path)
     forget()
     baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
-    again = config | {"ckpt": str(tmp_path / "last.ckpt"), "hypotheses": None, "baselines": baselines}
+    again = config | {
+        "ckpt": str(tmp_path / "last.ckpt"),
+        "hypotheses": None,
+        "baselines": baselines,
+    }
     metrics = test(again | {"trust": ["mine.scorers"]}, tmp_path / "tested")
     assert metrics["selections"]["weight"]["mpjpe_relative"] > 0
     forget()
-    with pytest.raises(GhptCheckpointError, match=r"needs classes of mine\.scorers.*'trust=\[mine\.scorers\]'"):
+    with pytest.raises(
+        GhptCheckpointError, match=r"needs classes of mine\.scorers.*'trust=\[mine\.scorers\]'"
+    ):
         test(again, tmp_path / "tested")
     assert not [name for name in sys.modules if name.split(".")[0] == "mine"]
 
 
-def test_training_goes_on_and_says_what_to_trust(tmp_path: Path, own: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_training_goes_on_and_says_what_to_trust(
+    tmp_path: Path, own: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Its configuration is what the user typed: it needs no trust."""
     config = settings(scorer=SCORER)
     with caplog.at_level(logging.INFO, "ghpt.commands.train"):
         train(config, tmp_path)
-    assert any("python test.py ckpt=" in said and said.endswith(" 'trust=[mine.scorers]'") for said in caplog.messages)
+    assert any(
+        "python test.py ckpt=" in said and said.endswith(" 'trust=[mine.scorers]'")
+        for said in caplog.messages
+    )
     config["trainer"]["max_epochs"] = 2
     train(config | {"resume": True}, tmp_path)
     assert read_checkpoint(tmp_path / "last.ckpt")["epoch"] == 1
@@ -228,7 +262,9 @@ def test_all_packages_are_named_at_once(own: Path, checkpoint_of: Callable[..., 
     assert "mine" not in sys.modules
 
 
-def test_a_package_has_all_its_modules_trusted(own: Path, checkpoint_of: Callable[..., Path]) -> None:
+def test_a_package_has_all_its_modules_trusted(
+    own: Path, checkpoint_of: Callable[..., Path]
+) -> None:
     path = checkpoint_of(loss={"_target_": "mine.losses.Expected"})
     model, _ = load_model(path, ["mine"])
     assert type(model.loss).__module__ == "mine.losses"
@@ -238,18 +274,50 @@ def test_a_package_has_all_its_modules_trusted(own: Path, checkpoint_of: Callabl
     ("trust", "model", "reason"),
     [
         ("mine.scorer", SCORER, r"'trust=\[mine\.scorer,mine\.scorers\]'"),
-        ("mine.scorers", SCORER | {"_target_": "mine.scorers.function"}, "mine.scorers.function is no class"),
-        ("mine.scorers", SCORER | {"_target_": "mine.scorers.NoModule"}, r"is no torch\.nn\.modules\.module\.Module"),
-        ("mine.scorers", SCORER | {"_target_": "mine.scorers.Scorer"}, r"defined elsewhere, in ghpt\.models\.scorer"),
-        ("mine.scorers", SCORER | {"_target_": "mine.scorers.torch.nn.Identity"}, r"'trust=\[mine|defined elsewhere"),
-        ("mine.scorers", SCORER | {"_target_": "mine.scorers.Nothing"}, "no class 'mine.scorers.Nothing'"),
+        (
+            "mine.scorers",
+            SCORER | {"_target_": "mine.scorers.function"},
+            "mine.scorers.function is no class",
+        ),
+        (
+            "mine.scorers",
+            SCORER | {"_target_": "mine.scorers.NoModule"},
+            r"is no torch\.nn\.modules\.module\.Module",
+        ),
+        (
+            "mine.scorers",
+            SCORER | {"_target_": "mine.scorers.Scorer"},
+            r"defined elsewhere, in ghpt\.models\.scorer",
+        ),
+        (
+            "mine.scorers",
+            SCORER | {"_target_": "mine.scorers.torch.nn.Identity"},
+            r"'trust=\[mine|defined elsewhere",
+        ),
+        (
+            "mine.scorers",
+            SCORER | {"_target_": "mine.scorers.Nothing"},
+            "no class 'mine.scorers.Nothing'",
+        ),
         ("mine.scorers", SCORER | {"_partial_": False}, "_partial_: is not True"),
-        ("mine", SCORER | {"_target_": "mine.broken.Scorer"}, r"cannot be imported \(OSError: no such device\)"),
+        (
+            "mine",
+            SCORER | {"_target_": "mine.broken.Scorer"},
+            r"cannot be imported \(OSError: no such device\)",
+        ),
         ("mine", SCORER | {"_target_": "mine.nothing.Scorer"}, "no class 'mine.nothing.Scorer'"),
-        ("mine", SCORER | {"_target_": "os.path.join"}, "is no class that a checkpoint may name here"),
-        ("mine", SCORER | {"_target_": "ghpt.files.sweep_temporaries"}, "is no class that a checkpoint may name here"),
+        (
+            "mine",
+            SCORER | {"_target_": "os.path.join"},
+            "is no class that a checkpoint may name here",
+        ),
+        (
+            "mine",
+            SCORER | {"_target_": "ghpt.files.sweep_temporaries"},
+            "is no class that a checkpoint may name here",
+        ),
     ],
-)  # fmt: skip
+)
 def test_only_classes_of_a_trusted_package_are_built(
     own: Path, checkpoint_of: Callable[..., Path], trust: str, model: dict[str, Any], reason: str
 ) -> None:
@@ -259,10 +327,29 @@ def test_only_classes_of_a_trusted_package_are_built(
 
 
 @pytest.mark.parametrize(
-    "name", ["os", "builtins", "subprocess", "ghpt", "ghpt.files", "torch", "torch.nn", "__main__", "", ".", "*",
-             "mine.", ".mine", "mine scorers", "mine,os", "mine\n"],
-)  # fmt: skip
-def test_what_is_not_the_user_s_own_cannot_be_trusted(checkpoint_of: Callable[..., Path], name: str) -> None:
+    "name",
+    [
+        "os",
+        "builtins",
+        "subprocess",
+        "ghpt",
+        "ghpt.files",
+        "torch",
+        "torch.nn",
+        "__main__",
+        "",
+        ".",
+        "*",
+        "mine.",
+        ".mine",
+        "mine scorers",
+        "mine,os",
+        "mine\n",
+    ],
+)
+def test_what_is_not_the_user_s_own_cannot_be_trusted(
+    checkpoint_of: Callable[..., Path], name: str
+) -> None:
     with pytest.raises(GhptConfigError, match=r"trust: .* is no module of your own"):
         load_model(checkpoint_of(), [name])
 
@@ -275,12 +362,20 @@ def test_a_trusted_package_is_not_imported_for_a_checkpoint_of_ours(
 
 
 def test_the_commands_take_trust(
-    tmp_path: Path, own: Path, checkpoint_of: Callable[..., Path], typed: Callable[..., tuple[int, str, str]]
+    tmp_path: Path,
+    own: Path,
+    checkpoint_of: Callable[..., Path],
+    typed: Callable[..., tuple[int, str, str]],
 ) -> None:
     path = checkpoint_of(scorer=SCORER)
     for command in ("test", "predict"):
         module = importlib.import_module(f"ghpt.commands.{command}")
-        words = (f"ckpt={path}", "trust=[mine.scorers]", f"output={tmp_path / 'out'}", "progress_bar=false")
+        words = (
+            f"ckpt={path}",
+            "trust=[mine.scorers]",
+            f"output={tmp_path / 'out'}",
+            "progress_bar=false",
+        )
         said = typed(CONF, module.COMMAND, words)[2]
         # Its weights are those of another scorer: it has been built.
         assert "does not fit its own model (weights scorer" in said
@@ -290,7 +385,9 @@ def test_training_warns_of_a_class_that_no_checkpoint_may_name(
     own: Path, caplog: pytest.LogCaptureFixture, tmp_path: Path
 ) -> None:
     with caplog.at_level(logging.WARNING, "ghpt.commands.train"):
-        train(settings(scorer=SCORER | {"_target_": "mine.scorers.function", "slope": 1.0}), tmp_path)
+        train(
+            settings(scorer=SCORER | {"_target_": "mine.scorers.function", "slope": 1.0}), tmp_path
+        )
     assert any(
         "will not take this model: model.scorer._target_: mine.scorers.function is no class" in said
         for said in caplog.messages

@@ -27,7 +27,9 @@ def pair(target_turn_deg: float = 0.0, target_shift=(0.0, 0.0, 0.0)) -> Cameras:
     t = np.array([[0.0, 0.0, 4000.0], [0.0, 0.0, 4000.0]])
     turn[1] = Rotation.from_euler("xyz", [target_turn_deg] * 3, degrees=True).as_matrix() @ turn[1]
     t[1] += np.array(target_shift)
-    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(2, 3, 3)
+    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(
+        2, 3, 3
+    )
     return Cameras(K, torch.from_numpy(np.stack(turn)), torch.from_numpy(t))
 
 
@@ -39,7 +41,9 @@ def test_rotation_errors_equal_scipy():
     qa, qb = a.as_quat(canonical=True), b.as_quat(canonical=True)
     nearest = np.minimum(np.linalg.norm(qa - qb, axis=1), np.linalg.norm(qa + qb, axis=1))
     np.testing.assert_allclose(quaternion_error(a_matrix, b_matrix), nearest, atol=1e-12)
-    np.testing.assert_allclose(rotation_deg(a_matrix, b_matrix), np.rad2deg((a * b.inv()).magnitude()), atol=1e-9)
+    np.testing.assert_allclose(
+        rotation_deg(a_matrix, b_matrix), np.rad2deg((a * b.inv()).magnitude()), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("degrees", [0.0, 1e-7, 1e-3, 90.0, 179.9999, 180.0])
@@ -61,7 +65,9 @@ def test_translation_errors():
     truth = torch.tensor([[100.0, 0, 0], [0, 3.0, 0], [1.0, 1.0, 0]])
     estimate = torch.tensor([[100.0, 0, 30], [0, -3.0, 0], [2.0, 2.0, 0]])
     np.testing.assert_allclose(translation_error(estimate, truth), [30, 6, 2**0.5])
-    np.testing.assert_allclose(translation_deg(estimate, truth), [np.rad2deg(np.arctan(0.3)), 180, 0], atol=1e-9)
+    np.testing.assert_allclose(
+        translation_deg(estimate, truth), [np.rad2deg(np.arctan(0.3)), 180, 0], atol=1e-9
+    )
 
 
 def test_error_2d_is_zero_at_the_truth_and_the_principal_shift_away():
@@ -75,25 +81,32 @@ def test_error_2d_is_zero_at_the_truth_and_the_principal_shift_away():
     np.testing.assert_allclose(errors, 5, atol=1e-9)
     K = shifted.K.clone()
     K[0, 0, 2] += 3
-    assert error_2d(Cameras(K, shifted.R, shifted.t), pair(), POINTS)[0].max() == 0  # the reference is given
+    assert (
+        error_2d(Cameras(K, shifted.R, shifted.t), pair(), POINTS)[0].max() == 0
+    )  # the reference is given
 
 
 def test_error_3d_is_zero_at_the_truth_only():
     assert error_3d(pair(), pair(), POINTS)[0].max() < 1e-6
-    errors = [error_3d(pair(degrees), pair(), POINTS)[0].mean().item() for degrees in (0.01, 0.1, 1.0)]
+    errors = [
+        error_3d(pair(degrees), pair(), POINTS)[0].mean().item() for degrees in (0.01, 0.1, 1.0)
+    ]
     assert errors == sorted(errors)
     assert errors[0] > 0.1
 
 
 def test_error_3d_of_a_longer_baseline_is_the_scale():
     truth = pair()
-    # With the reference camera's centre as the origin, a baseline longer by 1 % scales the scene by 1 %.
+    # With the reference camera's centre as the origin, a baseline longer by 1 % scales the scene by
+    # 1 %.
     centre = truth.centre
     longer = centre[0] + 1.01 * (centre[1] - centre[0])
     t = torch.stack((truth.t[0], -truth.R[1] @ longer))
     errors, counted = error_3d(Cameras(truth.K, truth.R, t), truth, POINTS)
     assert counted.all()
-    np.testing.assert_allclose(errors, 0.01 * torch.linalg.vector_norm(POINTS - centre[0], dim=-1), rtol=1e-6)
+    np.testing.assert_allclose(
+        errors, 0.01 * torch.linalg.vector_norm(POINTS - centre[0], dim=-1), rtol=1e-6
+    )
 
 
 def test_points_behind_do_not_count():
@@ -111,10 +124,14 @@ def test_points_behind_do_not_count():
 
 def test_a_point_behind_the_true_cameras_does_not_count_though_the_estimate_has_it_in_front():
     """The estimated baseline points the other way, which changes the sign of every depth."""
-    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(2, 3, 3)
+    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(
+        2, 3, 3
+    )
     R = torch.eye(3, dtype=torch.float64).expand(2, 3, 3)
     t = torch.tensor([[0.0, 0, 0], [-500, 0, 0]], dtype=torch.float64)
-    errors, counted = error_3d(Cameras(K, R, -t), Cameras(K, R, t), POINTS - torch.tensor([0.0, 0.0, 4000.0]))
+    errors, counted = error_3d(
+        Cameras(K, R, -t), Cameras(K, R, t), POINTS - torch.tensor([0.0, 0.0, 4000.0])
+    )
     assert not counted.any()
     assert (errors == 0).all()
 
@@ -128,4 +145,6 @@ def test_mean_error_over_uneven_processes():
     shares[0].merge_state(shares[1])
     assert shares[0].compute().mean.item() == pytest.approx(whole.compute().mean.item(), rel=1e-13)
     assert shares[0].counted == 97
-    assert whole.compute().mean.item() == pytest.approx(rotation_deg(turns, truth).mean().item(), rel=1e-13)
+    assert whole.compute().mean.item() == pytest.approx(
+        rotation_deg(turns, truth).mean().item(), rel=1e-13
+    )

@@ -9,7 +9,12 @@ from scipy.spatial.transform import Rotation
 
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.metrics.relative_pose import error_3d, rotation_deg
-from ghpt.models.relative_pose.problem import RelativePose, RelativePoseHypotheses, quantiles, random_subsets
+from ghpt.models.relative_pose.problem import (
+    RelativePose,
+    RelativePoseHypotheses,
+    quantiles,
+    random_subsets,
+)
 from ghpt.models.relative_pose.scale import KnownScale
 from ghpt.models.selection import SELECTIONS, selection_weights
 from ghpt.recording import PairBatch, RelativePoseEstimate
@@ -27,22 +32,41 @@ def batch_of(seeds: list[int], noise: float = 0.0, views: int = 3) -> PairBatch:
         rig = scene.cameras.index(0)
         pixels, _ = project(Cameras(rig.K[None], rig.R[None], rig.t[None]), scene.points)
         K, R, t = [*K, rig.K], [*R, rig.R], [*t, rig.t]
-        key_points.append(pixels.transpose(0, 1) + torch.from_numpy(rng.normal(0, noise, tuple(pixels.mT.shape))).mT
-                          .reshape(pixels.shape).transpose(0, 1) if noise else pixels.transpose(0, 1))  # fmt: skip
+        key_points.append(
+            pixels.transpose(0, 1)
+            + torch.from_numpy(rng.normal(0, noise, tuple(pixels.mT.shape)))
+            .mT.reshape(pixels.shape)
+            .transpose(0, 1)
+            if noise
+            else pixels.transpose(0, 1)
+        )
         points.append(scene.points.reshape(-1, 3)[:100])
     shape = (len(seeds), views, FRAMES, 17)
     pair = torch.tensor([[0, 1], [0, 2], [1, 2]])[torch.arange(len(seeds)) % 3]
     return PairBatch(
-        sample=torch.arange(len(seeds)), rig=torch.arange(len(seeds)), draw=torch.arange(len(seeds)), pair=pair,
+        sample=torch.arange(len(seeds)),
+        rig=torch.arange(len(seeds)),
+        draw=torch.arange(len(seeds)),
+        pair=pair,
         cameras=Cameras(torch.stack(K), torch.stack(R), torch.stack(t)),
-        key_points=torch.stack(key_points).float(), confidence=torch.ones(shape),
-        seen=torch.ones(shape, dtype=torch.bool), points=torch.stack(points),
-    )  # fmt: skip
+        key_points=torch.stack(key_points).float(),
+        confidence=torch.ones(shape),
+        seen=torch.ones(shape, dtype=torch.bool),
+        points=torch.stack(points),
+    )
 
 
 def problem(**changes) -> RelativePose:
-    settings = {"frames": FRAMES, "draws": 1, "points": 100, "sample": 40, "refine": 1, "features": 16,
-                "scale": KnownScale(), "largest_error": 1000.0}  # fmt: skip
+    settings = {
+        "frames": FRAMES,
+        "draws": 1,
+        "points": 100,
+        "sample": 40,
+        "refine": 1,
+        "features": 16,
+        "scale": KnownScale(),
+        "largest_error": 1000.0,
+    }
     return RelativePose(**(settings | changes))
 
 
@@ -74,7 +98,9 @@ def test_features_are_sorted_and_say_nothing_of_the_order_of_frames_and_joints()
     features = cameras.describe(h)
     assert (features.diff(dim=-1) >= 0).all()
     order = torch.randperm(h.a.shape[1], generator=torch.Generator().manual_seed(0))
-    permuted = RelativePoseHypotheses(h.R, h.t, h.estimated, h.a[:, order], h.b[:, order], h.both[:, order])
+    permuted = RelativePoseHypotheses(
+        h.R, h.t, h.estimated, h.a[:, order], h.b[:, order], h.both[:, order]
+    )
     torch.testing.assert_close(cameras.describe(permuted), features)
 
 
@@ -83,10 +109,14 @@ def test_features_have_one_length_for_any_number_of_frames_and_ignore_what_is_no
     h = cameras.generate(batch, 10, keys(batch))
     seen = batch.seen.clone()
     seen[:, 1, ::3, 4:9] = False
-    partly = replace(batch, seen=seen, key_points=torch.where(seen[..., None], batch.key_points, 1e6))
+    partly = replace(
+        batch, seen=seen, key_points=torch.where(seen[..., None], batch.key_points, 1e6)
+    )
     a, b, both = partly.correspondences()
     hidden = cameras.describe(RelativePoseHypotheses(h.R, h.t, h.estimated, a, b, both))
-    kept = RelativePoseHypotheses(h.R, h.t, h.estimated, a[:, both[0]], b[:, both[0]], both[:, both[0]])
+    kept = RelativePoseHypotheses(
+        h.R, h.t, h.estimated, a[:, both[0]], b[:, both[0]], both[:, both[0]]
+    )
     torch.testing.assert_close(hidden, cameras.describe(kept))
     assert hidden.shape == (1, 10, 16)
 
@@ -97,7 +127,9 @@ def test_quantiles_are_numpy_s():
     mask = rng.random((3, 50)) < 0.7
     found = quantiles(torch.from_numpy(values), torch.from_numpy(mask), 9).numpy()
     for row in range(3):
-        np.testing.assert_allclose(found[row], np.quantile(values[row, mask[row]], np.linspace(0, 1, 9)))
+        np.testing.assert_allclose(
+            found[row], np.quantile(values[row, mask[row]], np.linspace(0, 1, 9))
+        )
     nothing = quantiles(torch.ones(1, 4), torch.zeros(1, 4, dtype=torch.bool), 5)
     assert (nothing == 0).all()
 
@@ -130,8 +162,12 @@ def test_a_pair_s_hypotheses_do_not_depend_on_its_batch():
     batch, cameras = batch_of([5, 6, 7], noise=5.0), problem()
     together = cameras.generate(batch, 20, keys(batch))
     alone = batch_of([5, 6, 7], noise=5.0)
-    alone = PairBatch(**{f: (getattr(alone, f).index(slice(1, 2)) if f == "cameras" else getattr(alone, f)[1:2])
-                         for f in PairBatch.__dataclass_fields__})  # fmt: skip
+    alone = PairBatch(
+        **{
+            f: (getattr(alone, f).index(slice(1, 2)) if f == "cameras" else getattr(alone, f)[1:2])
+            for f in PairBatch.__dataclass_fields__
+        }
+    )
     single = cameras.generate(alone, 20, keys(batch)[1:2])
     torch.testing.assert_close(together.R[1], single.R[0], rtol=0, atol=1e-9)
     torch.testing.assert_close(together.t[1], single.t[0], rtol=0, atol=1e-6)
@@ -157,8 +193,12 @@ def test_what_determines_no_pose_is_said_and_does_not_spoil_its_neighbours():
 
 def test_an_empty_share_of_a_batch_goes_through():
     full = batch_of([0, 1, 2])
-    empty = PairBatch(**{f: (full.cameras.index(slice(0)) if f == "cameras" else getattr(full, f)[:0])
-                         for f in PairBatch.__dataclass_fields__})  # fmt: skip
+    empty = PairBatch(
+        **{
+            f: (full.cameras.index(slice(0)) if f == "cameras" else getattr(full, f)[:0])
+            for f in PairBatch.__dataclass_fields__
+        }
+    )
     cameras = problem()
     h = cameras.generate(empty, 10, keys(empty))
     assert cameras.describe(h).shape == (0, 10, 16)
@@ -172,8 +212,11 @@ def test_one_weight_selects_and_equal_weights_average_whatever_the_quaternions_s
     chosen = cameras.combine(h, torch.tensor([[0.0, 1.0, 0.0]]))
     torch.testing.assert_close(chosen.R[0], h.R[0, 1])
     torch.testing.assert_close(chosen.t[0], h.t[0, 1])
-    # rotations by almost 180 degrees, on both sides of it: their quaternions with w >= 0 are nearly opposite
-    R = torch.from_numpy(Rotation.from_rotvec([[0, 0, np.pi - 0.02], [0, 0, -np.pi + 0.04]]).as_matrix())[None]
+    # rotations by almost 180 degrees, on both sides of it: their quaternions with w >= 0 are nearly
+    # opposite
+    R = torch.from_numpy(
+        Rotation.from_rotvec([[0, 0, np.pi - 0.02], [0, 0, -np.pi + 0.04]]).as_matrix()
+    )[None]
     two = RelativePoseHypotheses(R, torch.ones(1, 2, 3).double(), h.estimated, h.a, h.b, h.both)
     mean = cameras.combine(two, torch.tensor([[0.5, 0.5]]))
     expected = torch.from_numpy(Rotation.from_rotvec([0, 0, np.pi + 0.01]).as_matrix())
@@ -200,12 +243,19 @@ def test_the_average_is_differentiable_in_the_weights():
 def test_the_error_is_nearly_that_of_linear_triangulation():
     batch, cameras = batch_of([11, 12, 13]), problem(largest_error=1e6)
     R, t = truth_of(batch)
-    turn = torch.from_numpy(Rotation.from_rotvec(np.random.default_rng(0).normal(0, 0.004, (3, 3))).as_matrix())
-    estimate = RelativePoseEstimate(turn @ R, t + torch.tensor([10.0, -20.0, 15.0]), torch.ones(3, dtype=torch.bool))
+    turn = torch.from_numpy(
+        Rotation.from_rotvec(np.random.default_rng(0).normal(0, 0.004, (3, 3))).as_matrix()
+    )
+    estimate = RelativePoseEstimate(
+        turn @ R, t + torch.tensor([10.0, -20.0, 15.0]), torch.ones(3, dtype=torch.bool)
+    )
     true = batch.pair_cameras()
     target_t = (estimate.R @ true.t[:, 0, :, None])[..., 0] + estimate.t
-    guess = Cameras(true.K, torch.stack((true.R[:, 0], estimate.R @ true.R[:, 0]), 1),
-                    torch.stack((true.t[:, 0], target_t), 1))  # fmt: skip
+    guess = Cameras(
+        true.K,
+        torch.stack((true.R[:, 0], estimate.R @ true.R[:, 0]), 1),
+        torch.stack((true.t[:, 0], target_t), 1),
+    )
     reference, counted = error_3d(guess, true, batch.points)
     mean = (reference * counted).sum(-1) / counted.sum(-1)
     error, _ = cameras.error(estimate, batch)
@@ -218,7 +268,9 @@ def test_best_is_below_every_selection_and_worst_above():
     errors, _ = cameras.error(cameras.expand(h), batch)
     logits = -cameras.describe(h)[..., 8]
     found = {
-        name: cameras.error(cameras.combine(h, selection_weights(name, logits, errors, 1.2, keys(batch))), batch)[0]
+        name: cameras.error(
+            cameras.combine(h, selection_weights(name, logits, errors, 1.2, keys(batch))), batch
+        )[0]
         for name in SELECTIONS
     }
     for name in ("most", "least", "stochastic", "random"):

@@ -30,13 +30,27 @@ def page():
         Claim("of others", "4.1", None, "25 against 30"),
     ]
     entries = [
-        Entry(Item("first", "table", "A table", dict, dict),
-              Section("embedded (synthetic) Human3.6M", "A table of *x*:\n\n| a | b |\n|---|---|\n| 1 | 2 |",
-                      {}, [good, bad], claims, "Because of this."), ["python train.py data=h36m"]),
-        Entry(Item("second", "figure", "A figure", dict, dict),
-              Section("Human3.6M from /data", "Look:\n\n![curve](curve.svg)", {"curve": figure()}), []),
-    ]  # fmt: skip
-    return Page(entries, {"data": "embedded (synthetic)", "seeds": "2 (0, 1)"}, "seed: 0\nonly: null\n")
+        Entry(
+            Item("first", "table", "A table", dict, dict),
+            Section(
+                "embedded (synthetic) Human3.6M",
+                "A table of *x*:\n\n| a | b |\n|---|---|\n| 1 | 2 |",
+                {},
+                [good, bad],
+                claims,
+                "Because of this.",
+            ),
+            ["python train.py data=h36m"],
+        ),
+        Entry(
+            Item("second", "figure", "A figure", dict, dict),
+            Section("Human3.6M from /data", "Look:\n\n![curve](curve.svg)", {"curve": figure()}),
+            [],
+        ),
+    ]
+    return Page(
+        entries, {"data": "embedded (synthetic)", "seeds": "2 (0, 1)"}, "seed: 0\nonly: null\n"
+    )
 
 
 class Tags(HTMLParser):
@@ -72,7 +86,10 @@ def test_the_page_needs_no_other_file(page, tmp_path):
 
 def test_every_entry_says_its_data_its_claims_and_its_command(page, tmp_path):
     write_page(page, tmp_path)
-    for text in ((tmp_path / "report.md").read_text(), Tags((tmp_path / "report.html").read_text()).text):
+    for text in (
+        (tmp_path / "report.md").read_text(),
+        Tags((tmp_path / "report.html").read_text()).text,
+    ):
         assert "tab:first: A table · embedded (synthetic) Human3.6M" in text
         assert "fig:second: A figure · Human3.6M from /data" in text
         assert "python reproduce.py only=[first]" in text
@@ -87,7 +104,11 @@ def test_every_entry_says_its_data_its_claims_and_its_command(page, tmp_path):
 def test_a_table_that_the_paper_lacks_has_no_label_of_its(page):
     entry = page.entries[0]
     own = Entry(replace(entry.item, of_paper=False), entry.section, [])
-    assert own.heading == entry.heading.removeprefix("tab:") == "first: A table · embedded (synthetic) Human3.6M"
+    assert (
+        own.heading
+        == entry.heading.removeprefix("tab:")
+        == "first: A table · embedded (synthetic) Human3.6M"
+    )
 
 
 def test_explanations_of_embedded_numbers_are_not_given_for_real_ones(page, tmp_path):
@@ -104,7 +125,9 @@ def test_figures_are_vectors_and_the_same_bytes_twice(page, tmp_path):
         a, b = ((tmp_path / name / "figures" / f"curve.{kind}").read_bytes() for name in ("a", "b"))
         assert a == b
         assert b"image/png" not in a
-    assert (tmp_path / "a" / "report.html").read_bytes() == (tmp_path / "b" / "report.html").read_bytes()
+    assert (tmp_path / "a" / "report.html").read_bytes() == (
+        tmp_path / "b" / "report.html"
+    ).read_bytes()
     markdown = (tmp_path / "a" / "report.md").read_text()
     assert "![curve](figures/curve.svg)" in markdown
 
@@ -112,7 +135,12 @@ def test_figures_are_vectors_and_the_same_bytes_twice(page, tmp_path):
 def test_numbers_and_claims_for_programs(page, tmp_path):
     write_page(page, tmp_path)
     items = json.loads((tmp_path / "report.json").read_text())["items"]
-    assert items["first"]["numbers"][0] == {"what": "weight", "paper": 29.1, "ours": [26.0, 27.0], "miss": False}
+    assert items["first"]["numbers"][0] == {
+        "what": "weight",
+        "paper": 29.1,
+        "ours": [26.0, 27.0],
+        "miss": False,
+    }
     assert [claim["holds"] for claim in items["first"]["claims"]] == [True, False, None]
     assert items["second"] == {"data": "Human3.6M from /data", "numbers": [], "claims": []}
 
@@ -141,7 +169,9 @@ def test_a_folder_s_name_is_shown_as_it_is(page, tmp_path):
     entry = Entry(page.entries[0].item, section, [f"python train.py data.root='{name}\n```'"])
     about = {"data": name, "command": code(f"a `b` {name}")}
     write_page(replace(page, entries=[entry, page.entries[1]], about=about), tmp_path)
-    markdown = MarkdownIt("gfm-like", {"linkify": False, "html": False}).render((tmp_path / "report.md").read_text())
+    markdown = MarkdownIt("gfm-like", {"linkify": False, "html": False}).render(
+        (tmp_path / "report.md").read_text()
+    )
     for text in (markdown, (tmp_path / "report.html").read_text()):
         tags = Tags(text)
         assert tags.text.count(name) == 4

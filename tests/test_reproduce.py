@@ -10,12 +10,28 @@ from ghpt.commands.reproduce import ITEMS, chosen, spread
 from ghpt.errors import GhptConfigError
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-SMALL = ("overrides.train=['data.train_samples=16','model.hypotheses=8','data.stride=4096']",
-         "overrides.test=['data.stride=4096','hypotheses=8']", "jobs=1", "progress_bar=false")  # fmt: skip
-PAPER = ("generalization-evaluation", "iskakov-comparison", "remelli-comparison", "sota-comparison", "quantitative",
-         "quantitative-hypotheses", "fundamental-evaluation", "unknown-extrinsics-evaluation",
-         "fundamental-dissection", "hyperparameters", "limitation-table", "qualitative", "pose-prior",
-         "comparison-to-8-point")  # fmt: skip
+SMALL = (
+    "overrides.train=['data.train_samples=16','model.hypotheses=8','data.stride=4096']",
+    "overrides.test=['data.stride=4096','hypotheses=8']",
+    "jobs=1",
+    "progress_bar=false",
+)
+PAPER = (
+    "generalization-evaluation",
+    "iskakov-comparison",
+    "remelli-comparison",
+    "sota-comparison",
+    "quantitative",
+    "quantitative-hypotheses",
+    "fundamental-evaluation",
+    "unknown-extrinsics-evaluation",
+    "fundamental-dissection",
+    "hyperparameters",
+    "limitation-table",
+    "qualitative",
+    "pose-prior",
+    "comparison-to-8-point",
+)
 
 
 @pytest.fixture
@@ -30,7 +46,9 @@ def command(typed, tmp_path):
 
 
 def numbers(folder):
-    return json.loads((folder / "report.json").read_text())["items"]["iskakov-comparison"]["numbers"]
+    return json.loads((folder / "report.json").read_text())["items"]["iskakov-comparison"][
+        "numbers"
+    ]
 
 
 def test_one_table_then_nothing_to_do_then_another_seed(command, tmp_path):
@@ -38,8 +56,13 @@ def test_one_table_then_nothing_to_do_then_another_seed(command, tmp_path):
     assert status == 0, said
     assert "claims hold" in said
     text = (tmp_path / "report" / "report.md").read_text()
-    assert "tab:iskakov-comparison: From Panoptic to Human3.6M, beside Iskakov et al. · embedded (synthetic)" in text
-    assert "for 5 cells that were not there before" in text  # three splits prepared, a training, a test
+    assert (
+        "tab:iskakov-comparison: From Panoptic to Human3.6M, beside Iskakov et al. · embedded (synthetic)"
+        in text
+    )
+    assert (
+        "for 5 cells that were not there before" in text
+    )  # three splits prepared, a training, a test
     first = numbers(tmp_path / "report")
     assert command("only=[tab:iskakov-comparison]")[0] == 0
     assert "for 0 cells" in (tmp_path / "report" / "report.md").read_text()
@@ -69,11 +92,20 @@ def test_hyperparameters_need_no_cell(command, tmp_path):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["only=[generalisation]"], "only: there is no 'generalisation'. Did you mean 'generalization-evaluation'?"),
+        (
+            ["only=[generalisation]"],
+            "only: there is no 'generalisation'. Did you mean 'generalization-evaluation'?",
+        ),
         (["seeds=0"], "seeds: is 0. It must be >= 1."),
         (["jobs=0"], "jobs: is 0. It must be >= 1, or null."),
-        (["data.root={tmp}"], "has no folder human36m. Put the data set there, or name its folder alone"),
-        (["only=[limitation-table]", "data.human36m={tmp}/none"], "none: data.root: there is no such folder"),
+        (
+            ["data.root={tmp}"],
+            "has no folder human36m. Put the data set there, or name its folder alone",
+        ),
+        (
+            ["only=[limitation-table]", "data.human36m={tmp}/none"],
+            "none: data.root: there is no such folder",
+        ),
         (["only=[limitation-table]", "overrides.train=['model.hypothesis=3']"], "hypothes"),
     ],
 )
@@ -86,7 +118,9 @@ def test_what_cannot_be_done_is_said_in_one_line(command, tmp_path, words, said)
 
 
 def test_every_table_and_figure_of_the_paper_is_an_item():
-    assert {label for label, item in ITEMS.items() if item.kind in ("table", "figure") and item.of_paper} == set(PAPER)
+    assert {
+        label for label, item in ITEMS.items() if item.kind in ("table", "figure") and item.of_paper
+    } == set(PAPER)
     assert sum(item.kind == "ablation" for item in ITEMS.values()) >= 5
     assert sum(item.kind == "robustness" for item in ITEMS.values()) >= 5
     assert [item.label for item in chosen(["fig:pose-prior", "tab:sota-comparison"])] == [

@@ -21,7 +21,9 @@ def robustly(scene, loss, iterations, seen=None, tolerance=TOLERANCE):
     seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool) if seen is None else seen
     scale = torch.full(seen.shape[:2], SCALE, dtype=torch.float64)
     scale[:, 1] = 2 * SCALE
-    result = triangulate_robustly(scene.cameras, scene.key_points, seen, scale, WEIGHTS[loss], iterations, tolerance)
+    result = triangulate_robustly(
+        scene.cameras, scene.key_points, seen, scale, WEIGHTS[loss], iterations, tolerance
+    )
     return result, scale
 
 
@@ -29,7 +31,11 @@ def weights_at(scene, points, scale, loss):
     """A view's weight in pixels at these points, over its squared depth."""
     pixels, depth = project(scene.cameras, points)
     r = (pixels - scene.key_points).norm(dim=-1) / scale[..., None]
-    robust = {"huber": 1 / r.clamp(min=1), "cauchy": 1 / (1 + r**2), "geman_mcclure": 1 / (1 + r**2) ** 2}
+    robust = {
+        "huber": 1 / r.clamp(min=1),
+        "cauchy": 1 / (1 + r**2),
+        "geman_mcclure": 1 / (1 + r**2) ** 2,
+    }
     return torch.where(depth > 0, robust[loss], 0.0) / depth**2
 
 
@@ -38,7 +44,9 @@ def test_the_estimate_is_what_its_own_weights_give(loss):
     scene = scene_with_outliers()
     result, scale = robustly(scene, loss, 200)
     assert result.ok.all()
-    again = triangulate(scene.cameras, scene.key_points, weights_at(scene, result.points, scale, loss))
+    again = triangulate(
+        scene.cameras, scene.key_points, weights_at(scene, result.points, scale, loss)
+    )
     torch.testing.assert_close(again.points, result.points, rtol=0, atol=1e-4)
     torch.testing.assert_close(again.depth_min, result.depth_min, rtol=0, atol=1e-3)
 
@@ -47,7 +55,9 @@ def test_one_iteration_is_one_reweighting_of_the_linear_solution():
     scene = scene_with_outliers()
     linear = triangulate(scene.cameras, scene.key_points, torch.ones(scene.key_points.shape[:-1]))
     result, scale = robustly(scene, "cauchy", 1)
-    expected = triangulate(scene.cameras, scene.key_points, weights_at(scene, linear.points, scale, "cauchy"))
+    expected = triangulate(
+        scene.cameras, scene.key_points, weights_at(scene, linear.points, scale, "cauchy")
+    )
     torch.testing.assert_close(result.points, expected.points, rtol=0, atol=1e-6)
 
 

@@ -1,4 +1,6 @@
-"""What is said of two calibrations: exact where the scene is, blind to the gauge, and of the view that is left out."""
+"""What is said of two calibrations: exact where the scene is, blind to the gauge, and of the view
+that is left out.
+"""
 
 from dataclasses import replace
 
@@ -24,7 +26,9 @@ from scenes import random_scene
 from toys import recording
 
 SIMILARITY = Similarity(
-    torch.from_numpy(Rotation.from_rotvec([0.4, -1.1, 2]).as_matrix()), 1.7, torch.tensor([300.0, -20, 5000]).double()
+    torch.from_numpy(Rotation.from_rotvec([0.4, -1.1, 2]).as_matrix()),
+    1.7,
+    torch.tensor([300.0, -20, 5000]).double(),
 )
 
 
@@ -67,7 +71,9 @@ def test_a_camera_that_was_moved_is_the_one_that_differs():
     R[5], t[5] = turn @ R[5], turn @ t[5]
     apart = rig_difference(Cameras(cameras.K, R, t), cameras)
     assert int(apart.rotation_deg.argmax()) == 5
-    assert float(apart.rotation_deg[5]) == pytest.approx(4 * 7 / 8, rel=0.02)  # an eighth goes to the gauge
+    assert float(apart.rotation_deg[5]) == pytest.approx(
+        4 * 7 / 8, rel=0.02
+    )  # an eighth goes to the gauge
 
 
 def test_covariances_turn_with_the_world():
@@ -83,13 +89,17 @@ def test_covariances_turn_with_the_world():
 
 
 def test_the_view_that_is_left_out_does_not_help_itself():
-    """Its key points may be anything: its own errors are what they are off by, and the others' do not see them."""
+    """Its key points may be anything: its own errors are what they are off by, and the others' do
+    not see them.
+    """
     made = take()
     key_points = made.key_points.copy()
     key_points[:, 2] += [30, 40]
     errors, measured = held_out_errors(replace(made, key_points=key_points), Linear())
     assert measured.all()
-    torch.testing.assert_close(errors[:, 2], torch.full_like(errors[:, 2], 50), rtol=1e-3, atol=1e-2)
+    torch.testing.assert_close(
+        errors[:, 2], torch.full_like(errors[:, 2], 50), rtol=1e-3, atol=1e-2
+    )
     exact, _ = held_out_errors(made, Linear())
     assert float(exact.max()) < 0.05
 
@@ -120,7 +130,9 @@ def test_segments_of_a_rigid_body_do_not_vary():
     assert float(variation.max()) < 1e-12
     breathing = 1 + 0.05 * torch.linspace(-1, 1, 20).double()
     variation, _ = segment_variation(points * breathing[:, None, None], estimated)
-    torch.testing.assert_close(variation, torch.full_like(variation, 1.4826 * 0.025), rtol=0.1, atol=0)
+    torch.testing.assert_close(
+        variation, torch.full_like(variation, 1.4826 * 0.025), rtol=0.1, atol=0
+    )
     estimated[:, JOINT["nose"]] = False
     _, known = segment_variation(points, estimated)
     assert [JOINTS[a] for (a, b), k in zip(BONES, known, strict=True) if not k] == ["head_top"]
@@ -130,7 +142,8 @@ def test_chunks_of_frames_change_nothing():
     made = take(frames=300)
     whole, _ = triangulate_recording(made, Linear())
     rows = {
-        name: getattr(made, name)[280:] for name in ("key_points", "seen", "confidence", "frame", "truth", "truth_seen")
+        name: getattr(made, name)[280:]
+        for name in ("key_points", "seen", "confidence", "frame", "truth", "truth_seen")
     }
     last, _ = triangulate_recording(replace(made, **rows), Linear())
     torch.testing.assert_close(whole[280:], last)

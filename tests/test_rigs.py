@@ -6,7 +6,9 @@ from ghpt.data.synthetic.rigs import ARRANGEMENTS, human36m_rig, panoptic_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import project
 
-RIGS = {f"S{k}": human36m_rig(f"S{k}") for k in range(1, 12)} | {"panoptic": panoptic_rig(range(31))}
+RIGS = {f"S{k}": human36m_rig(f"S{k}") for k in range(1, 12)} | {
+    "panoptic": panoptic_rig(range(31))
+}
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -32,8 +34,12 @@ def test_knees_to_shoulders_of_a_person_in_the_middle_are_in_every_image(name):
 
 @pytest.mark.parametrize("name", RIGS)
 def test_the_head_is_above_the_feet_in_every_image(name):
-    up = torch.tensor([0.0, -1.0, 0.0] if name == "panoptic" else [0.0, 0.0, 1.0], dtype=torch.float64)
-    pixels, _ = project(RIGS[name].cameras, up * torch.tensor([[300.0], [1700.0]], dtype=torch.float64))
+    up = torch.tensor(
+        [0.0, -1.0, 0.0] if name == "panoptic" else [0.0, 0.0, 1.0], dtype=torch.float64
+    )
+    pixels, _ = project(
+        RIGS[name].cameras, up * torch.tensor([[300.0], [1700.0]], dtype=torch.float64)
+    )
     assert (pixels[:, 1, 1] < pixels[:, 0, 1]).all()
 
 
@@ -58,7 +64,9 @@ def test_every_arrangement_exists():
 def test_the_numbers_are_those_of_the_real_files(shared_data):
     import json
 
-    table = json.loads((shared_data / "panoptic/160906_band2/calibration_160906_band2.json").read_text())
+    table = json.loads(
+        (shared_data / "panoptic/160906_band2/calibration_160906_band2.json").read_text()
+    )
     other = {c["name"]: c for c in table["cameras"] if c["type"] == "hd"}
     for name, K in zip(RIGS["panoptic"].names, RIGS["panoptic"].cameras.K, strict=True):
         np.testing.assert_allclose(K.numpy(), other[name]["K"], rtol=0.02)

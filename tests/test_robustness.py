@@ -1,4 +1,6 @@
-"""The robustness curves: who suffers from what, on a toy; what the report says of them, on made-up numbers."""
+"""The robustness curves: who suffers from what, on a toy; what the report says of them, on made-up
+numbers.
+"""
 
 from collections.abc import Callable, Mapping
 from itertools import pairwise
@@ -19,26 +21,54 @@ from toys import DATA, TRAIN
 CONF = Path(__file__).resolve().parents[1] / "conf"
 BY_LABEL = {item.label: item for item in ITEMS}
 SIZES = {
-    "trained_on": "cmu2", "stride": {"h36m": 512, "panoptic": 512}, "outliers": [0, 0.1, 0.4],
-    "outliers_shortest": 0.1, "outliers_longest": 0.5, "noise": [0, 0.01], "views": [2, 8], "rotation": [0, 1.0],
-    "missing_detections": [0, 0.5], "missing_views": [0, 2], "shift": [0, 20.0],
-}  # fmt: skip
+    "trained_on": "cmu2",
+    "stride": {"h36m": 512, "panoptic": 512},
+    "outliers": [0, 0.1, 0.4],
+    "outliers_shortest": 0.1,
+    "outliers_longest": 0.5,
+    "noise": [0, 0.01],
+    "views": [2, 8],
+    "rotation": [0, 1.0],
+    "missing_detections": [0, 0.5],
+    "missing_views": [0, 2],
+    "shift": [0, 20.0],
+}
 BASELINES = {
     "linear": {"_target_": "ghpt.models.estimators.classical.Linear"},
-    "m_estimator": {"_target_": "ghpt.models.estimators.classical.MEstimator", "loss": "geman_mcclure", "scale": 0.02,
-                    "iterations": 10, "tolerance": 1.0},
-    "lo_ransac": {"_target_": "ghpt.models.estimators.lo_ransac.LoRansac", "threshold": 0.02, "seed": 0},
-}  # fmt: skip
+    "m_estimator": {
+        "_target_": "ghpt.models.estimators.classical.MEstimator",
+        "loss": "geman_mcclure",
+        "scale": 0.02,
+        "iterations": 10,
+        "tolerance": 1.0,
+    },
+    "lo_ransac": {
+        "_target_": "ghpt.models.estimators.lo_ransac.LoRansac",
+        "threshold": 0.02,
+        "seed": 0,
+    },
+}
 VIEW_WEIGHTS = {
-    "_target_": "ghpt.models.estimators.view_weights.ViewWeights", "_partial_": True, "power": 1.5,
-    "consensus": {"_target_": "ghpt.models.estimators.ransac.AdaptiveRansac", "threshold": 0.02, "pairs": 64, "seed": 0,
-                  "adapt": 5.0, "quantile": 0.55, "rounds": 4},
-}  # fmt: skip
+    "_target_": "ghpt.models.estimators.view_weights.ViewWeights",
+    "_partial_": True,
+    "power": 1.5,
+    "consensus": {
+        "_target_": "ghpt.models.estimators.ransac.AdaptiveRansac",
+        "threshold": 0.02,
+        "pairs": 64,
+        "seed": 0,
+        "adapt": 5.0,
+        "quantile": 0.55,
+        "rounds": 4,
+    },
+}
 
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dict[str, Any]]]:
-    """``measured(perturbation, setting, levels)``: the toy's estimators at each level, with six views."""
+    """``measured(perturbation, setting, levels)``: the toy's estimators at each level, with six
+    views.
+    """
     folder = tmp_path_factory.mktemp("toy")
     data = DATA | {"cache": str(folder / "cache"), "views": 6, "missing": 0.03}
     train(TRAIN | {"data": data, "trainer": TRAIN["trainer"] | {"max_epochs": 1}}, folder / "model")
@@ -74,7 +104,11 @@ def test_two_cameras_leave_nothing_to_choose_and_more_are_better(measured):
     two, six = measured("FewerCameras", count=[2, 6])
     errors = {name: numbers["relative"] for name, numbers in two.items() if name != "m_estimator"}
     assert max(errors.values()) == pytest.approx(min(errors.values()), rel=1e-3)
-    assert two["linear"]["coverage"]["relative"] < six["linear"]["coverage"]["relative"] == pytest.approx(1)
+    assert (
+        two["linear"]["coverage"]["relative"]
+        < six["linear"]["coverage"]["relative"]
+        == pytest.approx(1)
+    )
     assert six["linear"]["relative"] < 0.8 * two["linear"]["relative"]
 
 
@@ -88,56 +122,88 @@ def test_wrong_cameras_move_the_whole_person(measured):
 def test_a_level_at_which_nothing_can_be_counted_has_no_number(measured):
     (nothing,) = measured("MissingDetections", rate=[1.0])
     assert all(numbers["relative"] is None for numbers in nothing.values())
-    assert all(numbers["coverage"] == {"relative": 0, "absolute": 0} for numbers in nothing.values())
+    assert all(
+        numbers["coverage"] == {"relative": 0, "absolute": 0} for numbers in nothing.values()
+    )
 
 
 def setup(seed: int = 0) -> Setup:
-    return Setup(CONF, {"human36m": None, "panoptic": None}, {"train": (), "test": ()}, {"robustness": SIZES}, seed)
+    return Setup(
+        CONF,
+        {"human36m": None, "panoptic": None},
+        {"train": (), "test": ()},
+        {"robustness": SIZES},
+        seed,
+    )
 
 
 def section(
     label: str, errors: Callable[[int, str, int], Mapping[str, float]], folder: Path, seeds: int = 1
 ) -> Section:
-    """Of cells in which an estimator has ``errors(seed, cell, level)[name]``; the levels of a cell are counted."""
+    """Of cells in which an estimator has ``errors(seed, cell, level)[name]``; the levels of a cell
+    are counted.
+    """
     setups = [setup(seed) for seed in range(seeds)]
     cells = [BY_LABEL[label].cells(one) for one in setups]
     for one, by_name in zip(setups, cells, strict=True):
         for name, cell in by_name.items():
             levels = [
-                {n: {"relative": e, "absolute": e, "coverage": {"relative": 0.9 if i else 1.0}}
-                 for n, e in errors(one.seed, name, i).items()}
+                {
+                    n: {"relative": e, "absolute": e, "coverage": {"relative": 0.9 if i else 1.0}}
+                    for n, e in errors(one.seed, name, i).items()
+                }
                 for i in range(len(cell.config["perturbations"]))
-            ]  # fmt: skip
+            ]
             cell.folder(folder).mkdir(parents=True, exist_ok=True)
             write_json(cell.folder(folder) / "result.json", {"frames": 5, "levels": levels})
     return BY_LABEL[label].section(Results(setups, cells, folder))
 
 
 def equal(seed: int, cell: str, level: int) -> dict[str, float]:
-    return {"weight": 30.0, "average": 32.0, "most": 33.0, "best": 20.0, "view_weights": 29.0, "linear": 30.0,
-            "lo_ransac": 31.0}  # fmt: skip
+    return {
+        "weight": 30.0,
+        "average": 32.0,
+        "most": 33.0,
+        "best": 20.0,
+        "view_weights": 29.0,
+        "linear": 30.0,
+        "lo_ransac": 31.0,
+    }
 
 
 def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
     def errors(seed: int, cell: str, level: int) -> dict[str, float]:
-        clean = {"weight": 20.0 + seed, "average": 40.0, "most": 30.0, "best": 15.0, "view_weights": 24.0,
-                 "linear": 42.0, "lo_ransac": 25.0}  # fmt: skip
-        return clean if cell == "clean" else {n: 2 * e if n == "lo_ransac" else 5 * e for n, e in clean.items()}
+        clean = {
+            "weight": 20.0 + seed,
+            "average": 40.0,
+            "most": 30.0,
+            "best": 15.0,
+            "view_weights": 24.0,
+            "linear": 42.0,
+            "lo_ransac": 25.0,
+        }
+        return (
+            clean
+            if cell == "clean"
+            else {n: 2 * e if n == "lo_ransac" else 5 * e for n, e in clean.items()}
+        )
 
     found = section("robustness-outliers", errors, tmp_path, seeds=2)
     assert (
         "At 0 % the paper's selection (20.5 mm) beats the best classical estimator, LO-RANSAC (25.0 mm) by 18.0 %"
         in (found.body)
     )
-    assert "At 40 % the paper's selection (102.5 mm) loses to the best classical estimator, LO-RANSAC (50.0 mm) by" in (
-        found.body
+    assert (
+        "At 40 % the paper's selection (102.5 mm) loses to the best classical estimator, LO-RANSAC (50.0 mm) by"
+        in (found.body)
     )
     assert "It is ahead of all classical estimators at 0 %, of LO-RANSAC at 0 %." in found.body
     assert "20.5 ± 0.7" in found.body
     assert "**25.0 ± 0.0**" not in found.body
     assert (
         "Against the best classical estimator of each of 3 levels the view weights win 1, tie 0 and lose 2: "
-        "from -140.0 % (120.0 mm, LO-RANSAC 50.0) at 10 % to +4.0 % (24.0 mm, LO-RANSAC 25.0) at 0 %." in found.body
+        "from -140.0 % (120.0 mm, LO-RANSAC 50.0) at 10 % to +4.0 % (24.0 mm, LO-RANSAC 25.0) at 0 %."
+        in found.body
     )
     papers, ours = found.claims
     assert not papers.holds
@@ -151,7 +217,10 @@ def test_equal_errors_are_called_equal_and_coverage_is_told(tmp_path: Path):
     found = section("robustness-views", equal, tmp_path)
     assert "view weights win 2, tie 0 and lose 0" in found.body
     assert "is level with the best classical estimator, linear (30.0 mm), and" in found.body
-    assert "It is ahead of all classical estimators at no level, of LO-RANSAC at every level." in found.body
+    assert (
+        "It is ahead of all classical estimators at no level, of LO-RANSAC at every level."
+        in found.body
+    )
     assert "90.0 %" in found.body
     assert found.data == "embedded (synthetic) Panoptic"
 
@@ -164,8 +233,12 @@ def test_every_figure_has_every_estimator_and_says_which_data(label: str, tmp_pa
     assert "embedded (synthetic)" in figure.get_suptitle()
     for axes in figure.axes:
         assert {line.get_label() for line in axes.containers} == {
-            "the paper's selection", "average of its pool", "learned view weights", "linear", "LO-RANSAC"
-        }  # fmt: skip
+            "the paper's selection",
+            "average of its pool",
+            "learned view weights",
+            "linear",
+            "LO-RANSAC",
+        }
         assert axes.get_xlabel()
     assert ("Absolute MPJPE" in found.body) == (label == "robustness-calibration")
 

@@ -22,12 +22,16 @@ SHAPES = [(), (1,), (3, 1, 2, 1)]
 
 def random_rotations(shape, seed=0):
     count = int(np.prod(shape))
-    return torch.from_numpy(Rotation.random(count, np.random.default_rng(seed)).as_matrix()).reshape(*shape, 3, 3)
+    return torch.from_numpy(
+        Rotation.random(count, np.random.default_rng(seed)).as_matrix()
+    ).reshape(*shape, 3, 3)
 
 
 def special_rotations():
     """Angles about every kind of axis at 0, tiny, and around half turns."""
-    axes = torch.tensor([[1, 0, 0], [0, 1, 0], [0, 0, -1], [1, 1, 0], [-1, 2, 3]], dtype=torch.float64)
+    axes = torch.tensor(
+        [[1, 0, 0], [0, 1, 0], [0, 0, -1], [1, 1, 0], [-1, 2, 3]], dtype=torch.float64
+    )
     axes = axes / axes.norm(dim=-1, keepdim=True)
     pi = torch.pi
     angles = [0, 1e-300, 1e-160, 1e-12, 1e-8, 1e-4, 1, pi / 2, pi - 1e-4, pi - 1e-8, pi - 1e-12, pi]
@@ -40,7 +44,9 @@ def test_quaternions_and_vectors_are_scipy_s(shape):
     reference = Rotation.from_matrix(R.reshape(-1, 3, 3).numpy())
     q = matrix_to_quaternion(R)
     assert (q[..., 0] >= 0).all()
-    expected = torch.from_numpy(np.roll(reference.as_quat(canonical=True), 1, axis=-1)).reshape(*shape, 4)
+    expected = torch.from_numpy(np.roll(reference.as_quat(canonical=True), 1, axis=-1)).reshape(
+        *shape, 4
+    )
     torch.testing.assert_close(q, expected, rtol=0, atol=1e-12)
     v = torch.from_numpy(reference.as_rotvec()).reshape(*shape, 3)
     torch.testing.assert_close(matrix_to_vector(R), v, rtol=0, atol=1e-12)
@@ -52,7 +58,9 @@ def test_round_trips_hold_at_0_and_at_half_turns():
     v = special_rotations()
     R = vector_to_matrix(v)
     assert is_rotation(R, 1e-14).all()
-    torch.testing.assert_close(R, torch.from_numpy(Rotation.from_rotvec(v).as_matrix()), rtol=0, atol=1e-14)
+    torch.testing.assert_close(
+        R, torch.from_numpy(Rotation.from_rotvec(v).as_matrix()), rtol=0, atol=1e-14
+    )
     torch.testing.assert_close(vector_to_matrix(matrix_to_vector(R)), R, rtol=0, atol=1e-14)
     torch.testing.assert_close(quaternion_to_matrix(matrix_to_quaternion(R)), R, rtol=0, atol=1e-14)
     small = v.norm(dim=-1) < 1e-3
@@ -96,15 +104,24 @@ def test_one_bad_matrix_does_not_spoil_the_batch(value):
 
 
 direction = st.lists(
-    st.one_of(st.floats(-1e3, 1e3), st.sampled_from([0.0, -0.0, 1e-300, 1.0, -1.0])), min_size=3, max_size=3
+    st.one_of(st.floats(-1e3, 1e3), st.sampled_from([0.0, -0.0, 1e-300, 1.0, -1.0])),
+    min_size=3,
+    max_size=3,
 )
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
-@given(direction, direction, st.sampled_from([1.0, -1.0]), st.sampled_from([0.0, 1e-16, 1e-12, 1e-8, 1e-4, 1.0]))
+@given(
+    direction,
+    direction,
+    st.sampled_from([1.0, -1.0]),
+    st.sampled_from([0.0, 1e-16, 1e-12, 1e-8, 1e-4, 1.0]),
+)
 def test_rotation_between_takes_one_direction_to_the_other(a, b, sign, mix):
     a = torch.tensor(a, dtype=torch.float64)
-    b = sign * a + mix * torch.tensor(b, dtype=torch.float64)  # from exactly on the line of a to anywhere
+    b = sign * a + mix * torch.tensor(
+        b, dtype=torch.float64
+    )  # from exactly on the line of a to anywhere
     R = rotation_between(a, b)
     assert is_rotation(R, 1e-13)
     lengths = a.abs().max(), b.abs().max()
@@ -124,7 +141,9 @@ def test_rotations_between_a_batch_of_directions_are_those_between_each_pair():
     b[0, 0], b[1, 1], a[2, 2] = -a[0, 0], a[1, 1], 0.0
     together = rotation_between(a, b)
     for i, j in np.ndindex(4, 3):
-        torch.testing.assert_close(together[i, j], rotation_between(a[i, j], b[i, j]), rtol=0, atol=1e-15)
+        torch.testing.assert_close(
+            together[i, j], rotation_between(a[i, j], b[i, j]), rtol=0, atol=1e-15
+        )
 
 
 def test_rotation_between_is_the_identity_where_a_direction_is_none():
@@ -135,7 +154,9 @@ def test_rotation_between_is_the_identity_where_a_direction_is_none():
     assert torch.equal(rotation_between(good.expand(3, 3), bad), identity)
 
 
-@pytest.mark.parametrize("degrees", [0, 90, 179.9])  # the quaternions of half turns have either sign
+@pytest.mark.parametrize(
+    "degrees", [0, 90, 179.9]
+)  # the quaternions of half turns have either sign
 def test_an_average_rotation_is_that_of_the_aligned_quaternions(degrees):
     rng = np.random.default_rng(0)
     base = Rotation.from_rotvec([0, np.deg2rad(degrees), 0])
@@ -191,7 +212,10 @@ def test_procrustes_fits_the_masked_joints_only_and_moves_them_all():
     target, rng = random_poses()
     points = target + torch.from_numpy(rng.normal(0, 100, target.shape))
     mask = torch.from_numpy(rng.random((6, 17)) < 0.7)
-    part = [procrustes(p[m][None], t[m][None], m[m][None])[0] for p, t, m in zip(points, target, mask, strict=True)]
+    part = [
+        procrustes(p[m][None], t[m][None], m[m][None])[0]
+        for p, t, m in zip(points, target, mask, strict=True)
+    ]
     whole = procrustes(points, target, mask)
     for b in range(6):
         torch.testing.assert_close(whole[b, mask[b]], part[b])

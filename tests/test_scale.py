@@ -36,11 +36,20 @@ def batch(noise=0.0):
     cameras = Cameras(two(scene.cameras.K), two(scene.cameras.R), two(scene.cameras.t))
     seen = two(scene.seen.transpose(0, 1))
     problem = PairBatch(
-        sample=torch.arange(2), rig=torch.zeros(2, dtype=torch.int64), draw=torch.zeros(2, dtype=torch.int64),
-        pair=pairs, cameras=cameras, key_points=two(scene.key_points.transpose(0, 1)),
-        confidence=torch.ones(seen.shape), seen=seen, points=torch.zeros(2, 1, 3, dtype=torch.float64),
-    )  # fmt: skip
-    R, t = (torch.stack(x) for x in zip(*(relative(scene.cameras, *p) for p in pairs.tolist()), strict=True))
+        sample=torch.arange(2),
+        rig=torch.zeros(2, dtype=torch.int64),
+        draw=torch.zeros(2, dtype=torch.int64),
+        pair=pairs,
+        cameras=cameras,
+        key_points=two(scene.key_points.transpose(0, 1)),
+        confidence=torch.ones(seen.shape),
+        seen=seen,
+        points=torch.zeros(2, 1, 3, dtype=torch.float64),
+    )
+    R, t = (
+        torch.stack(x)
+        for x in zip(*(relative(scene.cameras, *p) for p in pairs.tolist()), strict=True)
+    )
     return problem, R, t, scene
 
 
@@ -56,7 +65,9 @@ def test_every_scale_finds_the_true_length():
     torch.testing.assert_close(BodyHeight(height)(estimate, problem), length, rtol=1e-6, atol=0)
     # twice the unit, half the scale; hypotheses as a second dimension
     many = RelativePoseEstimate(
-        R[:, None].expand(-1, 3, -1, -1), torch.stack([k * t for k in (1, 2, 4)], 1), torch.ones(2, 3, dtype=torch.bool)
+        R[:, None].expand(-1, 3, -1, -1),
+        torch.stack([k * t for k in (1, 2, 4)], 1),
+        torch.ones(2, 3, dtype=torch.bool),
     )
     for scale in (KnownScale(), segments, BodyHeight(height)):
         expected = torch.tensor([1, 0.5, 0.25], dtype=torch.float64).expand(2, -1)
@@ -108,7 +119,9 @@ def test_average_adult_is_the_median_of_many():
     for number in range(1000, 1060):
         person = body.random_body(np.random.default_rng(number))
         standing = torch.from_numpy(body.pose(person, np.zeros((1, len(body.SEGMENTS), 3))))
-        heights.append(float(stature(standing, torch.ones(1, 17, dtype=torch.bool))) / person.stature)
+        heights.append(
+            float(stature(standing, torch.ones(1, 17, dtype=torch.bool))) / person.stature
+        )
     assert np.median(heights) == pytest.approx(1, abs=0.01)
     assert np.abs(np.array(heights) - 1).max() < 0.1
 
@@ -119,8 +132,14 @@ def test_segments_have_names_on_both_sides():
         if name.endswith("thigh"):
             side = name.split("_")[0]
             assert {JOINTS[j] for j in ends} == {f"{side}_knee", f"{side}_hip"}
-    both = dict(zip(SEGMENTS, SegmentLengths({"thigh": 430.0, "left_forearm": 250.0}).lengths, strict=True))
-    assert {name for name, mm in both.items() if mm} == {"right_thigh", "left_thigh", "left_forearm"}
+    both = dict(
+        zip(SEGMENTS, SegmentLengths({"thigh": 430.0, "left_forearm": 250.0}).lengths, strict=True)
+    )
+    assert {name for name, mm in both.items() if mm} == {
+        "right_thigh",
+        "left_thigh",
+        "left_forearm",
+    }
 
 
 @pytest.mark.parametrize("lengths", [{}, {"tail": 300.0}, {"thigh": 0.0}, {"thigh": -1.0}])
@@ -142,7 +161,9 @@ NOTHING = {"height": None, "segments": None, "baseline": None, "assumed_height":
 )
 def test_a_height_in_metres_or_centimetres_is_taken_for_one(given, mm):
     assert read_scale(NOTHING | {"height": given}, "ab")["height"] == pytest.approx(mm)
-    assert read_scale(NOTHING | {"assumed_height": given}, "ab")["assumed_height"] == pytest.approx(mm)
+    assert read_scale(NOTHING | {"assumed_height": given}, "ab")["assumed_height"] == pytest.approx(
+        mm
+    )
 
 
 @pytest.mark.parametrize("given", [-1, 0, math.nan, math.inf, 17500, 5.9, 69, 17.5, 0.175, True])
@@ -154,14 +175,25 @@ def test_a_height_that_is_nobodys_is_an_error(key, given):
 
 @pytest.mark.parametrize(
     ("given", "mm"),
-    [({"thigh": 430, "forearm": 250}, 430.0), ({"thigh": 43, "forearm": 25.0}, 430.0), ({"thigh": 0.43}, 430.0)],
+    [
+        ({"thigh": 430, "forearm": 250}, 430.0),
+        ({"thigh": 43, "forearm": 25.0}, 430.0),
+        ({"thigh": 0.43}, 430.0),
+    ],
 )
 def test_segments_are_all_of_one_unit(given, mm):
     assert read_scale(NOTHING | {"segments": given}, "ab")["segments"]["thigh"] == pytest.approx(mm)
 
 
 @pytest.mark.parametrize(
-    "given", [{"thigh": 430, "forearm": 0.25}, {"thigh": 4.3}, {"thigh": 4300}, {"thigh": -43}, {"thigh": math.nan}]
+    "given",
+    [
+        {"thigh": 430, "forearm": 0.25},
+        {"thigh": 4.3},
+        {"thigh": 4300},
+        {"thigh": -43},
+        {"thigh": math.nan},
+    ],
 )
 def test_segments_that_are_nobodys_are_an_error(given):
     with pytest.raises(GhptConfigError, match=r"scale\.segments"):
@@ -170,7 +202,11 @@ def test_segments_that_are_nobodys_are_an_error(given):
 
 @pytest.mark.parametrize(("given", "mm"), [(3000, 3000.0), (3.2, 3200.0), (0.4, 400.0)])
 def test_a_baseline_in_metres_is_taken_for_one(given, mm):
-    assert read_scale(NOTHING | {"baseline": ["a", "b", given]}, "ab")["baseline"] == ["a", "b", pytest.approx(mm)]
+    assert read_scale(NOTHING | {"baseline": ["a", "b", given]}, "ab")["baseline"] == [
+        "a",
+        "b",
+        pytest.approx(mm),
+    ]
 
 
 @pytest.mark.parametrize("given", [30, 100, 0.01, -3, math.nan, "3000"])

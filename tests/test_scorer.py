@@ -13,7 +13,9 @@ def test_standardised_training_features_have_mean_0_and_deviation_1():
     standardise.fit(features)
     result = standardise(features)
     torch.testing.assert_close(result.mean(0), torch.zeros(3), atol=1e-4, rtol=0)
-    torch.testing.assert_close(result.std(0, correction=0), torch.tensor([1.0, 1.0, 0.0]), atol=1e-4, rtol=0)
+    torch.testing.assert_close(
+        result.std(0, correction=0), torch.tensor([1.0, 1.0, 0.0]), atol=1e-4, rtol=0
+    )
     assert torch.isfinite(standardise(torch.full((1, 3), 1e30))).all()
     assert standardise(torch.full((1, 3), 1e30)).max() == 100
 
@@ -36,7 +38,8 @@ def test_each_hypothesis_is_scored_alone():
 
 
 @pytest.mark.parametrize(
-    ("settings", "key"), [({"layers": []}, "layers"), ({"layers": [0]}, "layers"), ({"clip": 0.0}, "clip")]
+    ("settings", "key"),
+    [({"layers": []}, "layers"), ({"layers": [0]}, "layers"), ({"clip": 0.0}, "clip")],
 )
 def test_out_of_range(settings, key):
     with pytest.raises(GhptConfigError, match=rf"model\.scorer\.{key}"):

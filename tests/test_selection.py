@@ -20,13 +20,18 @@ def test_weights_sum_to_one_and_do_not_depend_on_batch_mates(name):
     torch.testing.assert_close(weights.sum(-1), torch.ones(len(logits)))
     for i in (0, 7):
         one = slice(i, i + 1)
-        assert torch.equal(selection_weights(name, logits[one], errors[one], 1.5, keys[one]), weights[one])
+        assert torch.equal(
+            selection_weights(name, logits[one], errors[one], 1.5, keys[one]), weights[one]
+        )
 
 
 @pytest.mark.parametrize("name", SELECTIONS)
 def test_selected_error_lies_between_best_and_worst(name):
     logits, errors, keys = pool()
-    expected = {n: (selection_weights(n, logits, errors, 1.5, keys) * errors).sum(-1) for n in (name, "best", "worst")}
+    expected = {
+        n: (selection_weights(n, logits, errors, 1.5, keys) * errors).sum(-1)
+        for n in (name, "best", "worst")
+    }
     torch.testing.assert_close(expected["best"], errors.amin(-1))
     torch.testing.assert_close(expected["worst"], errors.amax(-1))
     assert (expected["best"] <= expected[name] + 1e-6).all()
@@ -43,15 +48,22 @@ def test_most_and_least_are_the_extreme_logits():
 def test_temperature_limits():
     logits, errors, keys = pool()
     cold, hot = softmax_weights(logits, 1e-4), softmax_weights(logits, 1e6)
-    torch.testing.assert_close(cold, selection_weights("most", logits, errors, 1.0, keys), atol=1e-3, rtol=0)
-    torch.testing.assert_close(hot, selection_weights("average", logits, errors, 1.0, keys), atol=1e-5, rtol=0)
+    torch.testing.assert_close(
+        cold, selection_weights("most", logits, errors, 1.0, keys), atol=1e-3, rtol=0
+    )
+    torch.testing.assert_close(
+        hot, selection_weights("average", logits, errors, 1.0, keys), atol=1e-5, rtol=0
+    )
 
 
 def test_stochastic_follows_the_weights_and_random_is_uniform():
     count, draws = 4, 40_000
     logits = torch.tensor([0.0, 1.0, 2.0, -1.0]).expand(draws, count)
     keys = randomness.key(0, "draws", torch.arange(draws))
-    for name, expected in (("stochastic", torch.softmax(logits[0] / 1.5, -1)), ("random", torch.full((count,), 0.25))):
+    for name, expected in (
+        ("stochastic", torch.softmax(logits[0] / 1.5, -1)),
+        ("random", torch.full((count,), 0.25)),
+    ):
         share = selection_weights(name, logits, -logits, 1.5, keys).mean(0)
         assert (share - expected).abs().max() < 4 * np.sqrt(0.25 / draws)
 
@@ -59,7 +71,11 @@ def test_stochastic_follows_the_weights_and_random_is_uniform():
 def test_gumbel_noise_draws_from_the_softmax():
     logits = torch.tensor([0.0, 1.0, 2.0]).expand(30_000, 3)
     noise = randomness.gumbel(randomness.key(0, "g", torch.arange(30_000)), (3,)).float()
-    share = torch.nn.functional.one_hot(softmax_weights(logits, 1e-3, noise).argmax(-1), 3).float().mean(0)
+    share = (
+        torch.nn.functional.one_hot(softmax_weights(logits, 1e-3, noise).argmax(-1), 3)
+        .float()
+        .mean(0)
+    )
     assert (share - torch.softmax(logits[0], -1)).abs().max() < 0.015
 
 
@@ -74,7 +90,9 @@ def test_a_limited_spread_keeps_the_order_and_small_differences():
     wide, narrow = limit_spread(100 * logits, 1.0), limit_spread(0.01 * logits, 1.0)
     torch.testing.assert_close(wide.std(-1, correction=0), torch.ones(len(logits)))
     assert torch.equal(wide.argsort(-1), logits.argsort(-1))
-    torch.testing.assert_close(narrow.diff(dim=-1), 0.01 * logits.diff(dim=-1), atol=1e-6, rtol=1e-4)
+    torch.testing.assert_close(
+        narrow.diff(dim=-1), 0.01 * logits.diff(dim=-1), atol=1e-6, rtol=1e-4
+    )
     assert torch.equal(limit_spread(logits, None), logits)
     one = torch.zeros(3, 1, requires_grad=True)
     limit_spread(one, 1.0).sum().backward()

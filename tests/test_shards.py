@@ -38,7 +38,10 @@ def test_what_is_read_is_what_was_written(tmp_path, whole):
     assert [len(p) for p in parts] == [10, 10, 5]
     for field in fields(Reconstruction):
         torch.testing.assert_close(
-            torch.cat([getattr(p, field.name) for p in parts]), getattr(whole, field.name), rtol=0, atol=0
+            torch.cat([getattr(p, field.name) for p in parts]),
+            getattr(whole, field.name),
+            rtol=0,
+            atol=0,
         )
 
 
@@ -113,7 +116,8 @@ def test_an_unlisted_shard_does_not_count(tmp_path, whole):
 
 
 @pytest.mark.parametrize(
-    "line", ["null", "[]", '{"shard": "0"}', '{"shard": true}', '{"shard": -1}', '{"shard": 99}', "{"]
+    "line",
+    ["null", "[]", '{"shard": "0"}', '{"shard": true}', '{"shard": -1}', '{"shard": 99}', "{"],
 )
 def test_lines_that_are_no_entries_are_passed_over(tmp_path, whole, line):
     filled(tmp_path, whole).close()

@@ -49,7 +49,9 @@ def test_a_signal_ends_a_command_with_its_status_and_no_word(typed, tmp_path, na
         send(name)
         time.sleep(60)
 
-    status, said, errors = typed(CONF, Command("cameras", task, str, lambda settings: Files()), [f"output={tmp_path}"])
+    status, said, errors = typed(
+        CONF, Command("cameras", task, str, lambda settings: Files()), [f"output={tmp_path}"]
+    )
     assert (status, said, errors) == (STATUS[name], "", "")
 
 
@@ -83,9 +85,14 @@ def test_an_error_after_a_command_that_was_stopped_is_an_error():
         raise ValueError("own")
 
 
-@pytest.mark.parametrize(("first", "second", "ended"), [
-    ("SIGTERM", "SIGTERM", -signal.SIGTERM), ("SIGINT", "SIGINT", -signal.SIGINT), ("SIGHUP", "SIGHUP", 143),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("first", "second", "ended"),
+    [
+        ("SIGTERM", "SIGTERM", -signal.SIGTERM),
+        ("SIGINT", "SIGINT", -signal.SIGINT),
+        ("SIGHUP", "SIGHUP", 143),
+    ],
+)
 def test_a_second_signal_ends_the_process_at_once(first, second, ended):
     """But for SIGHUP, which a closed terminal and its shell both send."""
     child = os.fork()
@@ -103,7 +110,9 @@ def test_a_second_signal_ends_the_process_at_once(first, second, ended):
 
 
 def test_pycolmap_s_handler_of_sigterm_is_not_there():
-    program = "import os, signal\nfrom ghpt.colmap import pycolmap\nos.kill(os.getpid(), signal.SIGTERM)"
+    program = (
+        "import os, signal\nfrom ghpt.colmap import pycolmap\nos.kill(os.getpid(), signal.SIGTERM)"
+    )
     ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
 
@@ -111,7 +120,11 @@ def test_pycolmap_s_handler_of_sigterm_is_not_there():
 def test_pycolmap_is_imported_in_one_place():
     package = Path(ghpt.__file__).parent
     importing = re.compile(r"^\s*(import|from) pycolmap\b", re.MULTILINE)
-    found = [path.name for path in package.rglob("*.py") if importing.search(path.read_text(encoding="utf-8"))]
+    found = [
+        path.name
+        for path in package.rglob("*.py")
+        if importing.search(path.read_text(encoding="utf-8"))
+    ]
     assert found == ["colmap.py"]
 
 
@@ -121,7 +134,11 @@ def predict(tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "argv", ["predict.py"])
     monkeypatch.setattr(prediction, "_from_data", lambda _: frames_of(500))
     settings = config("triangulation=linear", "shard_frames=100", "batch=50", "formats=[npz,csv]")
-    monkeypatch.setattr(prediction, "provenance", lambda seed: {"ghpt": "0", "commit": "", "seed": seed, "command": ""})
+    monkeypatch.setattr(
+        prediction,
+        "provenance",
+        lambda seed: {"ghpt": "0", "commit": "", "seed": seed, "command": ""},
+    )
     return lambda folder: prediction.predict(settings, tmp_path / folder)
 
 
@@ -137,11 +154,15 @@ WHERE = {
     "while another is written": (Shards, "read", 8, 5),
     "while it is evaluated": (prediction, "evaluate", 1, 5),
 }
-"""What the signal interrupts: an object's function, at which call of it, and how many shards there are then."""
+"""What the signal interrupts: an object's function, at which call of it, and how many shards there
+are then.
+"""
 
 
 @pytest.mark.parametrize("where", WHERE)
-def test_a_stopped_prediction_goes_on_to_the_same_bytes(predict, tmp_path, monkeypatch, caplog, where):
+def test_a_stopped_prediction_goes_on_to_the_same_bytes(
+    predict, tmp_path, monkeypatch, caplog, where
+):
     owner, function, at, shards = WHERE[where]
     original, calls = getattr(owner, function), []
 
@@ -180,7 +201,11 @@ def test_a_prediction_has_our_handler(predict, monkeypatch):
 def test_a_stopped_test_leaves_no_rows(tmp_path, monkeypatch):
     train(toys.TRAIN, tmp_path / "model")
     baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
-    settings = toys.TRAIN | {"ckpt": str(tmp_path / "model" / "last.ckpt"), "hypotheses": None, "baselines": baselines}
+    settings = toys.TRAIN | {
+        "ckpt": str(tmp_path / "model" / "last.ckpt"),
+        "hypotheses": None,
+        "baselines": baselines,
+    }
     handlers = []
 
     def stopped(self, batch):
@@ -192,7 +217,9 @@ def test_a_stopped_test_leaves_no_rows(tmp_path, monkeypatch):
         testing.test(settings, tmp_path / "test")
     assert stop.value.code == 143
     assert handlers == [handler]  # Lightning's would have several processes wait for each other
-    assert not {".predictions", "predictions.npz", "metrics.json"} & set(os.listdir(tmp_path / "test"))
+    assert not {".predictions", "predictions.npz", "metrics.json"} & set(
+        os.listdir(tmp_path / "test")
+    )
 
 
 def test_git_is_asked_without_its_lock(monkeypatch):

@@ -48,7 +48,9 @@ def test_the_site_builds_without_a_warning_and_fetches_nothing_from_elsewhere(si
 
 
 def test_every_public_module_is_in_the_api_reference(site):
-    anchors = set().union(*(Fetched(page.read_text()).anchors for page in (site / "api").glob("*.html")))
+    anchors = set().union(
+        *(Fetched(page.read_text()).anchors for page in (site / "api").glob("*.html"))
+    )
     source = ROOT / "src"
     modules = [
         ".".join(path.relative_to(source).with_suffix("").parts)

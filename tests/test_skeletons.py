@@ -1,4 +1,6 @@
-"""Detectors' skeletons as the 17 joints: by name, with left and right checked on real people in real cameras."""
+"""Detectors' skeletons as the 17 joints: by name, with left and right checked on real people in
+real cameras.
+"""
 
 import numpy as np
 import pytest
@@ -25,14 +27,21 @@ def test_every_joint_comes_from_its_own_parts(name):
     joints = SKELETONS[name]
     k = np.arange(len(joints), dtype=np.float64)
     points, sure, seen = joints17(
-        "x", joints, np.stack([k, -k], -1)[None, None], k[None, None] / 100, np.ones((1, 1, len(k)), bool)
+        "x",
+        joints,
+        np.stack([k, -k], -1)[None, None],
+        k[None, None] / 100,
+        np.ones((1, 1, len(k)), bool),
     )
     assert seen.all()
     value = dict(zip(JOINTS, points[0, 0, :, 0], strict=True))
     for joint in set(JOINTS) & set(joints):
         assert value[joint] == joints.index(joint)
     if name != "human36m":
-        mean = {j: np.mean([joints.index(f"{side}_{j}") for side in ("left", "right")]) for j in ("hip", "shoulder")}
+        mean = {
+            j: np.mean([joints.index(f"{side}_{j}") for side in ("left", "right")])
+            for j in ("hip", "shoulder")
+        }
         assert value["pelvis"] == (joints.index("mid_hip") if "mid_hip" in joints else mean["hip"])
         assert value["thorax"] == (joints.index("neck") if "neck" in joints else mean["shoulder"])
         assert value["spine"] == (value["pelvis"] + value["thorax"]) / 2
@@ -52,7 +61,9 @@ def test_a_mean_is_seen_where_all_of_its_parts_are():
 
 def test_a_joint_that_the_detector_lacks_is_never_seen():
     joints = tuple(j for j in SKELETONS["coco_17"] if j not in ("nose", "left_ear"))
-    found = joints17("x", joints, np.ones((2, 3, 15, 2)), np.ones((2, 3, 15)), np.ones((2, 3, 15), bool))[2]
+    found = joints17(
+        "x", joints, np.ones((2, 3, 15, 2)), np.ones((2, 3, 15)), np.ones((2, 3, 15), bool)
+    )[2]
     assert {JOINTS[i] for i in np.flatnonzero(~found.any((0, 1)))} == {"nose", "head_top"}
 
 
@@ -73,10 +84,25 @@ def test_bad_skeletons_are_named():
 def test_skeletons_with_as_many_joints_are_told_apart(name):
     """From one upright person, in the detector's order."""
     rng = np.random.default_rng(0)
-    height = {"ankle": 0, "heel": 0, "toe": 0, "knee": 50, "hip": 95, "pelvis": 95, "spine": 120, "thorax": 145,
-              "neck": 145, "shoulder": 143, "elbow": 115, "wrist": 95, "head_top": 175}  # fmt: skip
+    height = {
+        "ankle": 0,
+        "heel": 0,
+        "toe": 0,
+        "knee": 50,
+        "hip": 95,
+        "pelvis": 95,
+        "spine": 120,
+        "thorax": 145,
+        "neck": 145,
+        "shoulder": 143,
+        "elbow": 115,
+        "wrist": 95,
+        "head_top": 175,
+    }
     side = [20 if "left" in joint else -20 if "right" in joint else 0 for joint in SKELETONS[name]]
-    up = [next((h for part, h in height.items() if part in joint), 160) for joint in SKELETONS[name]]
+    up = [
+        next((h for part, h in height.items() if part in joint), 160) for joint in SKELETONS[name]
+    ]
     body = np.stack([side, up], -1) * [1, -1]
     people = body + rng.normal(0, 2, (50, *body.shape))
     assert recognise("file", people, np.ones(people.shape[:2], bool)) == name
@@ -84,13 +110,21 @@ def test_skeletons_with_as_many_joints_are_told_apart(name):
 
 @pytest.mark.parametrize("data", REAL)
 def test_left_is_left_on_real_people(data, shared_data):
-    """In the cameras' own calibration: a person's left is up x forward, forward being from heels to toes."""
+    """In the cameras' own calibration: a person's left is up x forward, forward being from heels to
+    toes.
+    """
     raw = read_key_points(shared_data / data / REAL[data][0])
     views = look_through(raw, read_cameras(shared_data / data / REAL[data][1]))
     points, ok = world(views.cameras.cameras, views.key_points, views.seen)
     # the feet are not among the 17: put them where the ankles are
-    feet = [raw.joints.index(f"{side}_{part}") for side in ("left", "right") for part in ("big_toe", "heel")]
-    foot, foot_ok = world(views.cameras.cameras, raw.key_points[:, :, feet].astype(np.float32), raw.seen[:, :, feet])
+    feet = [
+        raw.joints.index(f"{side}_{part}")
+        for side in ("left", "right")
+        for part in ("big_toe", "heel")
+    ]
+    foot, foot_ok = world(
+        views.cameras.cameras, raw.key_points[:, :, feet].astype(np.float32), raw.seen[:, :, feet]
+    )
     forward = (foot[:, [0, 2]] - foot[:, [1, 3]]).mean(1)
     up = (
         points[:, THORAX] - points[:, PELVIS]
@@ -99,7 +133,9 @@ def test_left_is_left_on_real_people(data, shared_data):
     )
     if data == "caliscope":  # seated, feet hardly seen: forward is where the nose is of the ears
         forward, foot_ok = points[:, JOINT["nose"]] - points[:, JOINT["head_top"]], ok
-    good = ok[:, [JOINT["left_shoulder"], JOINT["right_shoulder"], THORAX]].all(-1) & foot_ok.all(-1)
+    good = ok[:, [JOINT["left_shoulder"], JOINT["right_shoulder"], THORAX]].all(-1) & foot_ok.all(
+        -1
+    )
     side = points[:, JOINT["left_shoulder"]] - points[:, JOINT["right_shoulder"]]
     agrees = (torch.linalg.cross(up, forward) * side).sum(-1)[good] > 0
     assert good.sum() > 50
@@ -120,7 +156,9 @@ def test_the_views_agree_on_left_and_right(data, shared_data):
 
 def world(cameras, key_points, seen):
     rig = Cameras(*(x[None].expand(len(seen), *x.shape) for x in (cameras.K, cameras.R, cameras.t)))
-    result = triangulate(rig, torch.from_numpy(key_points).double(), torch.from_numpy(seen).double())
+    result = triangulate(
+        rig, torch.from_numpy(key_points).double(), torch.from_numpy(seen).double()
+    )
     return result.points, result.ok
 
 

@@ -21,23 +21,30 @@ from ghpt.recording import Recording
 def recording(seed: int, frames: int = 7, views: int = 3) -> Recording:
     rng = np.random.default_rng(seed)
     return Recording(
-        name=f"S1/take-{seed}", subject="S1", action="Größe 走", rate_hz=29.97,
+        name=f"S1/take-{seed}",
+        subject="S1",
+        action="Größe 走",
+        rate_hz=29.97,
         camera_names=tuple(f"c{v}" for v in range(views)),
-        cameras=Cameras(*(torch.from_numpy(rng.normal(size=(views, *s))) for s in ((3, 3), (3, 3), (3,)))),
+        cameras=Cameras(
+            *(torch.from_numpy(rng.normal(size=(views, *s))) for s in ((3, 3), (3, 3), (3,)))
+        ),
         key_points=rng.normal(size=(frames, views, 17, 2)).astype(np.float32),
         confidence=rng.random((frames, views, 17), dtype=np.float32),
         seen=rng.random((frames, views, 17)) < 0.7,
         truth=rng.normal(size=(frames, 17, 3)).astype(np.float32),
         truth_seen=rng.random((frames, 17)) < 0.7,
         frame=rng.permutation(2**40 + np.arange(frames)),
-    )  # fmt: skip
+    )
 
 
 def assert_same(a: Recording, b: Recording) -> None:
     for field in fields(Recording):
         x, y = getattr(a, field.name), getattr(b, field.name)
         if field.name == "cameras":
-            assert all(torch.equal(p, q) for p, q in zip((x.K, x.R, x.t), (y.K, y.R, y.t), strict=True))
+            assert all(
+                torch.equal(p, q) for p, q in zip((x.K, x.R, x.t), (y.K, y.R, y.t), strict=True)
+            )
         elif isinstance(x, np.ndarray):
             assert x.dtype == y.dtype
             assert np.array_equal(x, y)
@@ -45,7 +52,9 @@ def assert_same(a: Recording, b: Recording) -> None:
             assert x == y
 
 
-def test_round_trip_is_exact_with_takes_longer_than_a_chunk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_round_trip_is_exact_with_takes_longer_than_a_chunk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(store, "_CHUNK", 4)
     takes = [recording(0), recording(1, frames=1), recording(2, frames=13)]
     store.write_store(tmp_path / "s", iter(takes), {"source": "test", 3: [1, 2]})
@@ -72,7 +81,9 @@ def test_prepares_once_per_key(tmp_path: Path) -> None:
         return [recording(seed)]
 
     for seed in (0, 0, 1, 0):
-        (take,) = store.prepared(tmp_path, {"name": "embedded", "seed": seed}, lambda s=seed: make(s), {})
+        (take,) = store.prepared(
+            tmp_path, {"name": "embedded", "seed": seed}, lambda s=seed: make(s), {}
+        )
         assert_same(take, recording(seed))
     assert made == [0, 1]
     assert sorted(p.name.rsplit("-", 1)[0] for p in tmp_path.iterdir()) == ["embedded"] * 2
@@ -134,7 +145,9 @@ def test_processes_that_prepare_the_same_at_once(tmp_path: Path) -> None:
     for child in children:
         child.start()
     start.set()
-    assert [results.get(timeout=300) for _ in children] == [int(recording(0, frames=3000).frame.sum())] * 4
+    assert [results.get(timeout=300) for _ in children] == [
+        int(recording(0, frames=3000).frame.sum())
+    ] * 4
     for child in children:
         child.join()
     assert len(list(tmp_path.iterdir())) == 1
@@ -176,8 +189,12 @@ def test_any_changed_digit_of_the_manifest_is_refused(tmp_path: Path) -> None:
     good = file.read_bytes()
     digits = [i for i, byte in enumerate(good) if chr(byte).isdigit()]
     for i in np.random.default_rng(0).choice(digits, 200):
-        file.write_bytes(good[:i] + bytes([ord("0") + (good[i] - ord("0") + 1) % 10]) + good[i + 1 :])
-        if json.loads(file.read_bytes()) != json.loads(good):  # else a digit beyond double precision
+        file.write_bytes(
+            good[:i] + bytes([ord("0") + (good[i] - ord("0") + 1) % 10]) + good[i + 1 :]
+        )
+        if json.loads(file.read_bytes()) != json.loads(
+            good
+        ):  # else a digit beyond double precision
             with pytest.raises(GhptDataError):
                 store.open_store(tmp_path / "s")
 
@@ -199,14 +216,19 @@ def test_verification_finds_one_flipped_bit(tmp_path: Path) -> None:
         ([recording(0, frames=0)], "no frames"),
         ([recording(0), recording(0)], "twice"),
         ([recording(0), recording(1, views=2)], "2 views"),
-        ([replace(recording(0), truth=np.full((7, 17, 3), np.nan, np.float32))], "truth: is not finite"),
+        (
+            [replace(recording(0), truth=np.full((7, 17, 3), np.nan, np.float32))],
+            "truth: is not finite",
+        ),
         (
             [replace(recording(0), camera_names=("a", "b"), cameras=recording(1, views=2).cameras)],
             "has shape",
         ),
     ],
 )
-def test_what_does_not_fit_is_refused_and_nothing_written(tmp_path: Path, takes: list, problem: str) -> None:
+def test_what_does_not_fit_is_refused_and_nothing_written(
+    tmp_path: Path, takes: list, problem: str
+) -> None:
     with pytest.raises(GhptDataError, match=problem):
         store.write_store(tmp_path / "s", takes, {})
     assert list(tmp_path.iterdir()) == []

@@ -52,7 +52,9 @@ def test_unranking_does_not_overflow_at_the_word_s_end():
 
 
 def test_too_few_seen_views_give_the_empty_subset():
-    views = torch.tensor([[[0, 1, 1], [0, 0, 1], [0, 0, 1]]], dtype=torch.bool)  # 0, 1 and 3 of 3 views
+    views = torch.tensor(
+        [[[0, 1, 1], [0, 0, 1], [0, 0, 1]]], dtype=torch.bool
+    )  # 0, 1 and 3 of 3 views
     subsets = random_subsets(views, 500, key(2, "test", torch.tensor([0])))
     assert not subsets[:, :, :2].any()
     assert (subsets[:, :, 2].sum(-1) >= 2).all()
@@ -85,16 +87,22 @@ def test_a_frame_s_draw_depends_on_its_key_and_its_own_views_alone(views):
 
 
 def test_nothing_in_gives_nothing_out():
-    assert random_subsets(torch.ones(0, 4, 17, dtype=torch.bool), 9, key(0, "x", torch.arange(0))).shape == (
+    assert random_subsets(
+        torch.ones(0, 4, 17, dtype=torch.bool), 9, key(0, "x", torch.arange(0))
+    ).shape == (
         0,
         9,
         17,
         4,
     )
-    assert random_subsets(torch.ones(2, 4, 17, dtype=torch.bool), 0, key(0, "x", torch.arange(2))).shape == (
+    assert random_subsets(
+        torch.ones(2, 4, 17, dtype=torch.bool), 0, key(0, "x", torch.arange(2))
+    ).shape == (
         2,
         0,
         17,
         4,
     )
-    assert not random_subsets(torch.ones(2, 0, 17, dtype=torch.bool), 3, key(0, "x", torch.arange(2))).any()
+    assert not random_subsets(
+        torch.ones(2, 0, 17, dtype=torch.bool), 3, key(0, "x", torch.arange(2))
+    ).any()

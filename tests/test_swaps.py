@@ -25,7 +25,9 @@ def swapped(batch, share=0.05):
     generator = torch.Generator().manual_seed(0)
     hit = torch.rand(frames, 1, generator=generator) < share * views
     hit = hit & (torch.randint(views, (frames, 1), generator=generator) == torch.arange(views))
-    points = torch.where(hit[..., None, None], batch.key_points[:, :, list(MIRROR)], batch.key_points)
+    points = torch.where(
+        hit[..., None, None], batch.key_points[:, :, list(MIRROR)], batch.key_points
+    )
     return replace(batch, key_points=points), hit
 
 
@@ -38,7 +40,9 @@ def test_nearly_all_swaps_are_found_and_nearly_none_invented(views, share):
     assert (found & ~hit).sum() <= 0.005 * (~hit).sum()
     right = (found == hit).all(1)
     same = (mended.key_points == batch.key_points).all(-1).all(-1).all(-1)
-    assert same[right & hit.any(1)].double().mean() > 0.9  # the rest: one pair of limbs that overlap is left
+    assert (
+        same[right & hit.any(1)].double().mean() > 0.9
+    )  # the rest: one pair of limbs that overlap is left
     error = [(ROBUST(b).points - batch.truth).norm(dim=-1).mean() for b in (batch, mended, bad)]
     assert error[1] < error[0] + 2 * (1 - share) * (error[2] - error[0])
 
@@ -47,9 +51,9 @@ def test_good_views_stay_as_they_are():
     batch = good()
     mended, found = undo_swaps(batch, SWAPS)
     assert found.double().mean() <= 0.001
-    assert (ROBUST(mended).points - batch.truth).norm(dim=-1).mean() <= (ROBUST(batch).points - batch.truth).norm(
-        dim=-1
-    ).mean()
+    assert (ROBUST(mended).points - batch.truth).norm(dim=-1).mean() <= (
+        ROBUST(batch).points - batch.truth
+    ).norm(dim=-1).mean()
 
 
 def test_two_views_cannot_tell():
@@ -79,7 +83,8 @@ def test_the_order_of_the_views_is_nothing():
     cameras = Cameras(*(x[:, order] for x in (bad.cameras.K, bad.cameras.R, bad.cameras.t)))
     fields = {name: getattr(bad, name)[:, order] for name in ("key_points", "confidence", "seen")}
     assert torch.equal(
-        undo_swaps(replace(bad, cameras=cameras, **fields), SWAPS)[1], undo_swaps(bad, SWAPS)[1][:, order]
+        undo_swaps(replace(bad, cameras=cameras, **fields), SWAPS)[1],
+        undo_swaps(bad, SWAPS)[1][:, order],
     )
 
 

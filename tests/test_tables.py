@@ -13,18 +13,31 @@ MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 
 def metrics(data="h36m", source="embedded", split="test", trained="h36m", value=30.0) -> dict:
     numbers = {
-        "mpjpe_absolute": 1234.56, "mpjpe_relative": value, "mpjpe_aligned": 22.0, "mpjpe_6_joints": None,
+        "mpjpe_absolute": 1234.56,
+        "mpjpe_relative": value,
+        "mpjpe_aligned": 22.0,
+        "mpjpe_6_joints": None,
         "coverage": 0.99876,
-        "per_joint": {}, "per_action": {"Eating": 29.0, "WalkingTogether": None},
+        "per_joint": {},
+        "per_action": {"Eating": 29.0, "WalkingTogether": None},
         "pose_prior": {"S9": dict.fromkeys(PARTS, 0.00123), "S11": dict.fromkeys(PARTS)},
         "without_damaged": dict.fromkeys(MEANS, 28.25),
-    }  # fmt: skip
-    provenance = {"ghpt": "0.1.0", "commit": "abc", "checkpoint": "last.ckpt",
-                  "training": {"data": trained, "source": source}}  # fmt: skip
+    }
+    provenance = {
+        "ghpt": "0.1.0",
+        "commit": "abc",
+        "checkpoint": "last.ckpt",
+        "training": {"data": trained, "source": source},
+    }
     return {
-        "data": data, "source": source, "split": split, "frames": 100, "seed": 0, "provenance": provenance,
+        "data": data,
+        "source": source,
+        "split": split,
+        "frames": 100,
+        "seed": 0,
+        "provenance": provenance,
         "selections": dict.fromkeys(NAMES, numbers),
-    }  # fmt: skip
+    }
 
 
 def cells(values: dict) -> dict[str, dict[str, str]]:
@@ -43,9 +56,19 @@ def test_the_papers_own_table_gives_its_last_column():
 
 def test_papers_tables_agree_with_each_other():
     assert paper.GENERALIZATION["h36m", "h36m"] == paper.QUANTITATIVE_HYPOTHESES["h36m"]["weight"]
-    assert paper.QUANTITATIVE_MEAN == paper.QUANTITATIVE_HYPOTHESES["h36m"]["weight"] == paper.LIMITATION["test"]
-    assert sum(paper.QUANTITATIVE.values()) / 15 == pytest.approx(29.6, abs=0.1)  # by frames, not by actions: 29.1
-    others = [v for (train, test), v in paper.GENERALIZATION.items() if train != test and "h36m" not in (train, test)]
+    assert (
+        paper.QUANTITATIVE_MEAN
+        == paper.QUANTITATIVE_HYPOTHESES["h36m"]["weight"]
+        == paper.LIMITATION["test"]
+    )
+    assert sum(paper.QUANTITATIVE.values()) / 15 == pytest.approx(
+        29.6, abs=0.1
+    )  # by frames, not by actions: 29.1
+    others = [
+        v
+        for (train, test), v in paper.GENERALIZATION.items()
+        if train != test and "h36m" not in (train, test)
+    ]
     assert sum(others) / 12 == pytest.approx(25.42, abs=0.005)  # tab:sota-comparison
 
 
@@ -85,13 +108,17 @@ def test_report_fits_100_columns_and_every_row_has_every_column():
     blocks = report(metrics()).split("\n\n")
     for block in (block for block in blocks if block.startswith("|")):
         assert len({line.count("|") for line in block.splitlines()}) == 1
-    assert sum(line.startswith("| weight ") for line in tables) == 2  # the main table and the one without damaged
+    assert (
+        sum(line.startswith("| weight ") for line in tables) == 2
+    )  # the main table and the one without damaged
     assert "28.2" in report(metrics())
 
 
 def test_terminal_table_fits_80_columns():
     buffer = io.StringIO()
-    print_table(metrics(data="cmu4", trained="cmu2"), Console(file=buffer, width=80, color_system=None))
+    print_table(
+        metrics(data="cmu4", trained="cmu2"), Console(file=buffer, width=80, color_system=None)
+    )
     lines = buffer.getvalue().splitlines()
     assert "embedded (synthetic) Panoptic CMU4" in " ".join(lines)
     assert max(map(len, lines)) <= 80

@@ -59,7 +59,9 @@ def test_noisy_key_points_give_the_least_squares_solution():
     weights = torch.from_numpy(np.random.default_rng(0).uniform(0.1, 3, (3, 4, 17)))
     weights[:, 0, :5] = 0
     expected = least_squares(cameras, scene.key_points, weights)
-    torch.testing.assert_close(triangulate(cameras, scene.key_points, weights).points, expected, rtol=0, atol=1e-7)
+    torch.testing.assert_close(
+        triangulate(cameras, scene.key_points, weights).points, expected, rtol=0, atol=1e-7
+    )
 
 
 @pytest.mark.parametrize("hypotheses", [7, 64])
@@ -75,14 +77,18 @@ def test_subsets_are_the_same_looked_up_and_solved_one_by_one(hypotheses):
     for h in range(hypotheses):
         result = triangulate(scene.cameras, scene.key_points, subsets[:, h].mT.double())
         assert torch.equal(ok[:, h] | unseen[:, h], result.ok | unseen[:, h])
-        torch.testing.assert_close(points[:, h][ok[:, h]], result.points[ok[:, h]], rtol=0, atol=1e-6)
+        torch.testing.assert_close(
+            points[:, h][ok[:, h]], result.points[ok[:, h]], rtol=0, atol=1e-6
+        )
 
 
 def test_the_order_of_the_views_is_nothing():
     scene = random_scene(3, views=6).noisy(5, 0)
     order = torch.tensor([3, 0, 5, 1, 4, 2])
     there = triangulate(scene.cameras, scene.key_points, ones(scene))
-    back = triangulate(scene.cameras.index((slice(None), order)), scene.key_points[:, order], ones(scene))
+    back = triangulate(
+        scene.cameras.index((slice(None), order)), scene.key_points[:, order], ones(scene)
+    )
     torch.testing.assert_close(there.points, back.points, rtol=0, atol=1e-8)
 
 
@@ -125,7 +131,9 @@ def test_a_batch_is_the_stack_of_its_frames_under_any_leading_dimensions():
         alone = triangulate(scene.cameras.index(b), scene.key_points[b], weights[b])
         torch.testing.assert_close(alone.points, together.points[b], rtol=0, atol=1e-9)
         torch.testing.assert_close(alone.angle, together.angle[b], rtol=0, atol=1e-9)
-    cameras = Cameras(*(x.unflatten(0, (2, 3)) for x in (scene.cameras.K, scene.cameras.R, scene.cameras.t)))
+    cameras = Cameras(
+        *(x.unflatten(0, (2, 3)) for x in (scene.cameras.K, scene.cameras.R, scene.cameras.t))
+    )
     folded = triangulate(cameras, *(x.unflatten(0, (2, 3)) for x in (scene.key_points, weights)))
     assert torch.equal(folded.points.flatten(0, 1), together.points)
 
@@ -135,7 +143,9 @@ def test_a_weight_counts_how_often_a_view_is_there():
     twice = torch.tensor([0, 1, 2, 2])
     weights = ones(scene)
     weights[:, 2] = 2
-    doubled = triangulate(scene.cameras.index((slice(None), twice)), scene.key_points[:, twice], ones(scene)[:, twice])
+    doubled = triangulate(
+        scene.cameras.index((slice(None), twice)), scene.key_points[:, twice], ones(scene)[:, twice]
+    )
     weighted = triangulate(scene.cameras, scene.key_points, weights)
     torch.testing.assert_close(doubled.points, weighted.points, rtol=0, atol=1e-8)
     scaled = triangulate(scene.cameras, scene.key_points, weights * 1e-200)
@@ -159,7 +169,9 @@ def test_small_systems_are_solved_and_their_condition_is_bounded():
     i, j = np.triu_indices(3)
     *solution, cond = solve_symmetric(tuple(torch.from_numpy(x) for x in (*M[:, i, j].T, *right.T)))
     expected = np.linalg.solve(M, right[..., None])[..., 0]
-    np.testing.assert_allclose(torch.stack(solution, -1), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        torch.stack(solution, -1), expected, rtol=1e-6, atol=1e-9 * np.abs(expected).max()
+    )
     true = np.linalg.cond(M)
     assert (cond.numpy() >= true * (1 - 1e-6)).all()
     assert (cond.numpy() <= 9 * true * (1 + 1e-6)).all()
@@ -169,7 +181,9 @@ def test_gradients_are_right_and_none_reaches_what_is_masked():
     scene = random_scene(10, frames=1, views=3).noisy(3, 0)
     weights = ones(scene)[..., :2]
     key_points = scene.key_points[..., :2, :].clone().requires_grad_()
-    assert torch.autograd.gradcheck(lambda x: triangulate(scene.cameras, x, weights).points, key_points, atol=1e-4)
+    assert torch.autograd.gradcheck(
+        lambda x: triangulate(scene.cameras, x, weights).points, key_points, atol=1e-4
+    )
     broken = key_points.detach().clone()
     broken[0, 0, 0] = torch.nan
     weights[0, 0, 0] = 0
@@ -203,7 +217,9 @@ def test_31_views_and_many_subsets_stay_small():
 def test_far_from_the_world_s_origin_no_digits_are_lost_but_those_of_t():
     scene = random_scene(13, frames=20, views=3, place=1e10)
     seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
-    points, ok = triangulate_subsets(scene.cameras, scene.key_points, seen, every_subset(3, frames=20))
+    points, ok = triangulate_subsets(
+        scene.cameras, scene.key_points, seen, every_subset(3, frames=20)
+    )
     assert ok.all()
     rounding = scene.cameras.t.abs().max() * torch.finfo(torch.float64).eps
     assert (points - scene.points[:, None]).norm(dim=-1).median() < 10 * rounding
@@ -216,13 +232,17 @@ def test_a_camera_on_the_moon_costs_the_others_no_digits():
     cameras = Cameras(scene.cameras.K, scene.cameras.R, away)
     weights = ones(scene)
     weights[:, 3] = 0
-    assert (triangulate(cameras, scene.key_points, weights).points - scene.points).abs().max() < 1e-8
+    assert (
+        triangulate(cameras, scene.key_points, weights).points - scene.points
+    ).abs().max() < 1e-8
 
 
 def test_a_narrow_baseline_keeps_the_digits_that_squaring_would_cost():
     scene = random_scene(15, frames=20, views=2)
     K, R = (x[:, :1].expand(-1, 2, -1, -1) for x in (scene.cameras.K, scene.cameras.R))
-    t = scene.cameras.t[:, :1] - torch.tensor([[0.0, 0, 0], [1, 0, 0]], dtype=torch.float64)  # 1 mm apart
+    t = scene.cameras.t[:, :1] - torch.tensor(
+        [[0.0, 0, 0], [1, 0, 0]], dtype=torch.float64
+    )  # 1 mm apart
     cameras = Cameras(K, R, t)
     result = triangulate(cameras, project(cameras, scene.points)[0], ones(scene))
     assert result.ok.all()
@@ -232,7 +252,9 @@ def test_a_narrow_baseline_keeps_the_digits_that_squaring_would_cost():
 
 def test_the_numbers_of_the_states_are_those_of_the_files():
     names = ("OK", "FEW_VIEWS", "PARALLEL", "BEHIND", "NONFINITE_INPUT", "NOT_CONVERGED")
-    assert {state.name: state.value for state in Status} == {name: i for i, name in enumerate(names)}
+    assert {state.name: state.value for state in Status} == {
+        name: i for i, name in enumerate(names)
+    }
 
 
 @pytest.mark.parametrize("coordinate", [0, 1])

@@ -10,7 +10,14 @@ from ghpt.data.datasets.frames import Frames
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
-from ghpt.paper.camera.extrinsics import PARTS, from_pairs, relative, replaced, seen_by, with_true_scale
+from ghpt.paper.camera.extrinsics import (
+    PARTS,
+    from_pairs,
+    relative,
+    replaced,
+    seen_by,
+    with_true_scale,
+)
 from ghpt.recording import PairBatch, RelativePoseEstimate
 
 TRUTH = human36m_rig("S9").cameras
@@ -19,7 +26,9 @@ TRUTH = human36m_rig("S9").cameras
 def wrong() -> tuple[torch.Tensor, torch.Tensor]:
     """True relative poses turned by some degrees and moved by some centimetres, but for the first."""
     R, t = relative(TRUTH)
-    turn = torch.from_numpy(Rotation.from_euler("xyz", [[0, 0, 0], [3, 0, 1], [0, 2, 0], [1, 1, 1]], True).as_matrix())
+    turn = torch.from_numpy(
+        Rotation.from_euler("xyz", [[0, 0, 0], [3, 0, 1], [0, 2, 0], [1, 1, 1]], True).as_matrix()
+    )
     return turn @ R, t + torch.tensor([[0.0], [40.0], [-70.0], [25.0]])
 
 
@@ -31,7 +40,9 @@ def test_true_relative_poses_give_back_the_true_cameras(part):
     assert found.K is TRUTH.K
 
 
-@pytest.mark.parametrize(("part", "use_R", "use_t"), [("R", True, False), ("t", False, True), ("both", True, True)])
+@pytest.mark.parametrize(
+    ("part", "use_R", "use_t"), [("R", True, False), ("t", False, True), ("both", True, True)]
+)
 def test_only_the_wanted_part_of_the_relative_pose_is_estimated(part, use_R, use_t):
     estimate = wrong()
     found = replaced(TRUTH, estimate, *PARTS[part])
@@ -40,7 +51,9 @@ def test_only_the_wanted_part_of_the_relative_pose_is_estimated(part, use_R, use
     torch.testing.assert_close(R, estimate[0] if use_R else true_R, rtol=0, atol=1e-12)
     torch.testing.assert_close(t, estimate[1] if use_t else true_t, rtol=0, atol=1e-8)
     assert (found.R[1:] - TRUTH.R[1:]).abs().amax() > 1e-3 or part == "t"
-    assert (found.t[1:] - TRUTH.t[1:]).abs().amax() > 1  # a turn about the reference moves the others too
+    assert (
+        found.t[1:] - TRUTH.t[1:]
+    ).abs().amax() > 1  # a turn about the reference moves the others too
     torch.testing.assert_close(found.R[0], TRUTH.R[0], rtol=0, atol=1e-12)
     torch.testing.assert_close(found.t[0], TRUTH.t[0], rtol=0, atol=1e-8)
 
@@ -48,7 +61,11 @@ def test_only_the_wanted_part_of_the_relative_pose_is_estimated(part, use_R, use
 def test_rig_in_any_frame_and_unit_gives_back_the_true_cameras():
     turn = torch.from_numpy(Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix())
     R = TRUTH.R @ turn
-    moved = Cameras(TRUTH.K, R, 0.002 * (TRUTH.t + R @ torch.tensor([100.0, -2000.0, 700.0], dtype=torch.float64)))
+    moved = Cameras(
+        TRUTH.K,
+        R,
+        0.002 * (TRUTH.t + R @ torch.tensor([100.0, -2000.0, 700.0], dtype=torch.float64)),
+    )
     found = replaced(TRUTH, with_true_scale(moved, TRUTH), True, True)
     torch.testing.assert_close(found.R, TRUTH.R, rtol=0, atol=1e-12)
     torch.testing.assert_close(found.t, TRUTH.t, rtol=0, atol=1e-7)
@@ -59,7 +76,17 @@ def test_pairs_with_the_first_camera_are_taken_in_its_order():
     rig = Cameras(*(x.expand(len(pair), *x.shape) for x in (TRUTH.K, TRUTH.R, TRUTH.t)))
     number, view = torch.arange(len(pair)), torch.zeros(len(pair), 4, 1, 17)
     points = torch.zeros(len(pair), 1, 3, dtype=torch.float64)
-    batch = PairBatch(number, 0 * number, 0 * number, pair, rig, torch.zeros(*view.shape, 2), view, view > 0, points)
+    batch = PairBatch(
+        number,
+        0 * number,
+        0 * number,
+        pair,
+        rig,
+        torch.zeros(*view.shape, 2),
+        view,
+        view > 0,
+        points,
+    )
     a, b = (batch.pair_cameras().index((slice(None), i)) for i in (0, 1))
     R = b.R @ a.R.mT
     t = b.t - (R @ a.t[..., None])[..., 0]
@@ -78,7 +105,10 @@ def test_draws_take_turns_over_the_frames_of_their_rigs():
     frames = Frames(recordings, np.array([0, 2, 4, 7, 9, 11]))
     R, t = relative(recordings[0].cameras)
     shifts = [[0, 10, 20], [30, 40, 50]]  # of a rig's cameras in its draws, mm
-    rigs = [{"recordings": [i], "draws": [(R.tolist(), (t + shift).tolist()) for shift in shifts[i]]} for i in range(2)]
+    rigs = [
+        {"recordings": [i], "draws": [(R.tolist(), (t + shift).tolist()) for shift in shifts[i]]}
+        for i in range(2)
+    ]
     batch, true = seen_by(frames, rigs, False, True)[range(6)], frames[range(6)]
     torch.testing.assert_close(batch.key_points, true.key_points, rtol=0, atol=0)
     moved = (batch.cameras.t - true.cameras.t)[:, 1:]

@@ -51,7 +51,10 @@ def spoil(field: str, index: tuple, value: float) -> dict[str, np.ndarray]:
         (spoil("K", (1, 0, 0), np.nan), "file: camera b, K: holds a value that is not finite"),
         (spoil("R", (1, 0, 0), np.inf), "camera b, R: holds a value that is not finite"),
         (spoil("t", (2, 0), -np.inf), "camera c, t: holds a value that is not finite"),
-        (spoil("distortion", (0, 4), np.nan), "camera a, distortion: holds a value that is not finite"),
+        (
+            spoil("distortion", (0, 4), np.nan),
+            "camera a, distortion: holds a value that is not finite",
+        ),
         (spoil("K", (0, 1, 1), -5), "camera a, K: the focal lengths are 1100 and -5"),
         (spoil("K", (0, 2, 0), 5), "camera a, K: is not of the form"),
         (spoil("K", (0, 1, 0), 5), "camera a, K: is not of the form"),
@@ -59,7 +62,10 @@ def spoil(field: str, index: tuple, value: float) -> dict[str, np.ndarray]:
         (spoil("R", (0,), np.diag([1, 1, -1])), "R is not a rotation .*det = -1"),
         (spoil("R", (0,), np.zeros((3, 3))), "R is not a rotation"),
         (cameras() | {"K": np.ones((3, 4, 3))}, "K: has shape 3 x 4 x 3 instead of 3 x 3 x 3"),
-        (cameras() | {"t": np.array([["1"] * 3] * 3)}, "t: holds <U1, not floating-point numbers or integers"),
+        (
+            cameras() | {"t": np.array([["1"] * 3] * 3)},
+            "t: holds <U1, not floating-point numbers or integers",
+        ),
     ],
 )
 def test_bad_cameras_are_named(given: dict, message: str) -> None:
@@ -77,7 +83,12 @@ def test_bad_lists_of_cameras() -> None:
 
 
 @pytest.mark.parametrize(
-    "array", [np.ones((4, 3), np.float32), np.asfortranarray(np.arange(15.0).reshape(5, 3)), np.ones((0, 3))]
+    "array",
+    [
+        np.ones((4, 3), np.float32),
+        np.asfortranarray(np.arange(15.0).reshape(5, 3)),
+        np.ones((0, 3)),
+    ],
 )
 def test_npy_is_read_as_numpy_reads_it(tmp_path: Path, array: np.ndarray) -> None:
     np.save(tmp_path / "a.npy", array)
@@ -98,7 +109,10 @@ BAD_NPY = {
     "text": (b"1 2 3 4 5 6 7 8 9", "is not a numpy array file"),
     "one byte short": (GOOD[:-1], "claims 96 bytes of float64 and holds 95"),
     "one byte long": (GOOD + b"0", "claims 96 bytes of float64 and holds 97"),
-    "huge claim": (GOOD.replace(b"(4, 3)", b"(4000000000000, 3)".ljust(6))[:300], "claims|damaged header"),
+    "huge claim": (
+        GOOD.replace(b"(4, 3)", b"(4000000000000, 3)".ljust(6))[:300],
+        "claims|damaged header",
+    ),
     "negative": (GOOD.replace(b"(4, 3), }", b"(-4,-3),}"), "claims|damaged header"),
     "4 GiB header": (b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + GOOD[12:], "header of more than"),
     "long header": (b"\x93NUMPY\x01\x00\xff\xff" + b" " * 70000, "header of more than"),
@@ -174,7 +188,9 @@ def test_npz_lacking_an_array_and_npz_bomb(tmp_path: Path) -> None:
         zipfile.ZipFile(tmp_path / "b.npz", "w", zipfile.ZIP_DEFLATED) as archive,
         archive.open("x.npy", "w", force_zip64=True) as member,
     ):
-        np.lib.format.write_array_header_1_0(member, {"descr": "<f8", "fortran_order": False, "shape": (1 << 24, 3)})
+        np.lib.format.write_array_header_1_0(
+            member, {"descr": "<f8", "fortran_order": False, "shape": (1 << 24, 3)}
+        )
         for _ in range(24):
             member.write(bytes(1 << 24))
     assert (tmp_path / "b.npz").stat().st_size < 1 << 20
@@ -182,9 +198,13 @@ def test_npz_lacking_an_array_and_npz_bomb(tmp_path: Path) -> None:
         read_npz(tmp_path / "b.npz", FIELDS)
 
 
-@pytest.mark.parametrize("text", ["", "{", '{"a": NaN}', "[Infinity]", "[" * 100_000, "9" * 10_000, "\ud800\udfff"])
+@pytest.mark.parametrize(
+    "text", ["", "{", '{"a": NaN}', "[Infinity]", "[" * 100_000, "9" * 10_000, "\ud800\udfff"]
+)
 def test_bad_json(tmp_path: Path, text: str) -> None:
-    (tmp_path / "a.json").write_bytes(text.encode("utf-16" if "\ud800" in text else "utf-8", "surrogatepass"))
+    (tmp_path / "a.json").write_bytes(
+        text.encode("utf-16" if "\ud800" in text else "utf-8", "surrogatepass")
+    )
     with pytest.raises(GhptDataError, match=r"a\.json: is not valid JSON"):
         read_json(tmp_path / "a.json")
 

@@ -1,4 +1,6 @@
-"""What predict.py says of its own result: good recordings are good, and each way to spoil one is said."""
+"""What predict.py says of its own result: good recordings are good, and each way to spoil one is
+said.
+"""
 
 from __future__ import annotations
 
@@ -57,7 +59,9 @@ def points_file(path: Path, values: np.ndarray, joints: list[int] | None = None)
     values = np.where(seen[..., None], values, 0.0)
     names = NAMES[: values.shape[1]]
     frame = np.arange(len(values))
-    points = KeyPoints("", names, JOINTS, frame, values, seen.astype(float), seen, 50.0, (0,) * len(names))
+    points = KeyPoints(
+        "", names, JOINTS, frame, values, seen.astype(float), seen, 50.0, (0,) * len(names)
+    )
     write_key_points(path, points)
     return path
 
@@ -67,11 +71,15 @@ def rig_file(path: Path, unit_mm: float, write=write_aniposelib) -> Path:
     cameras = Cameras(RIG.cameras.K, RIG.cameras.R, RIG.cameras.t * 1000 / unit_mm)
     write(path, Rig(NAMES, cameras, 0 * RIG.distortion, RIG.size), {})
     if write is write_aniposelib:  # which writes no such line itself, and says no unit
-        path.write_text(path.read_text(encoding="utf-8").replace("fisheye = false\n", ""), encoding="utf-8")
+        path.write_text(
+            path.read_text(encoding="utf-8").replace("fisheye = false\n", ""), encoding="utf-8"
+        )
     return path
 
 
-def judged(folder: Path, values: np.ndarray, cameras: Path | None = None, *more: str, joints=None) -> dict:
+def judged(
+    folder: Path, values: np.ndarray, cameras: Path | None = None, *more: str, joints=None
+) -> dict:
     """What predict.py makes of these key points."""
     points = points_file(folder / "points.npz", values, joints)
     words = [f"keypoints={points}", f"cameras={cameras or cameras_file(folder)}"]
@@ -102,7 +110,10 @@ def half_rate(values: np.ndarray, view: int) -> np.ndarray:
 def test_a_good_recording_is_good(tmp_path):
     numbers = judged(tmp_path, pixels(), None, "strict=true")
     assert numbers["verdict"] == {"level": "good", "findings": [], "undecidable": []}
-    assert json.loads((tmp_path / "out" / "prediction.json").read_text())["verdict"] == numbers["verdict"]
+    assert (
+        json.loads((tmp_path / "out" / "prediction.json").read_text())["verdict"]
+        == numbers["verdict"]
+    )
     assert "**good**" in (tmp_path / "out" / "report.md").read_text()
 
 
@@ -111,7 +122,9 @@ def test_little_to_go_by_is_no_alarm(frames, views, tmp_path):
     used = ",".join(NAMES[:views])
     numbers = judged(tmp_path, pixels()[:frames, :views], None, f"views=[{used}]")
     assert numbers["verdict"]["level"] == "good"
-    assert any("left-out views" in text for text in numbers["verdict"]["undecidable"]) == (views == 2)
+    assert any("left-out views" in text for text in numbers["verdict"]["undecidable"]) == (
+        views == 2
+    )
 
 
 def test_an_upper_body_is_good_and_measured_by_its_arms(tmp_path):
@@ -140,7 +153,10 @@ def test_a_unit_that_fits_nobody_is_asked_for(tmp_path):
 
 
 def test_a_unit_that_no_limb_tells_is_asked_for(tmp_path):
-    trunk = [JOINT[name] for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "nose", "thorax")]
+    trunk = [
+        JOINT[name]
+        for name in ("left_hip", "right_hip", "left_shoulder", "right_shoulder", "nose", "thorax")
+    ]
     with pytest.raises(GhptDataError, match="of whom no limb is seen"):
         judged(tmp_path, pixels(), rig_file(tmp_path / "rig.toml", 1000.0), joints=trunk)
 
@@ -162,7 +178,9 @@ def test_a_stated_unit_that_makes_a_giant_is_not_to_be_used_and_the_command_mend
 
 def test_a_view_that_is_late_is_said_with_a_command_and_strict_fails_after_writing(tmp_path):
     values = late(pixels(), 3, 10)
-    with pytest.raises(GhptDataError, match=r"verdict: .*cam_03 is 10 frames late.* Next: python cameras\.py"):
+    with pytest.raises(
+        GhptDataError, match=r"verdict: .*cam_03 is 10 frames late.* Next: python cameras\.py"
+    ):
         judged(tmp_path, values, None, "strict=true")
     numbers = json.loads((tmp_path / "out" / "prediction.json").read_text())
     assert codes(numbers) == ["out_of_sync"]
@@ -212,8 +230,17 @@ def test_normalised_key_points_are_an_error_in_every_command(bounds, tmp_path):
 def test_without_an_image_size_twice_the_principal_point_is_one(tmp_path):
     values = SCALES["0 and 1"]
     cameras = read_cameras(cameras_file(tmp_path))
-    points = KeyPoints("", NAMES, JOINTS, np.arange(len(values)), values, np.ones(values.shape[:-1]),
-                       np.ones(values.shape[:-1], bool), 50.0, (0,) * 4)  # fmt: skip
+    points = KeyPoints(
+        "",
+        NAMES,
+        JOINTS,
+        np.arange(len(values)),
+        values,
+        np.ones(values.shape[:-1]),
+        np.ones(values.shape[:-1], bool),
+        50.0,
+        (0,) * 4,
+    )
     with pytest.raises(GhptDataError, match="normalised"):
         look_through(points, type(cameras)(**{**vars(cameras), "size": None}))
 
@@ -223,7 +250,9 @@ def test_images_that_are_turned_are_named(tmp_path):
     K = wide.K.clone()
     K[:, 0, 2] += 600
     size = RIG.size + torch.tensor([1200, 0])
-    write_pose2sim(tmp_path / "wide.toml", Rig(NAMES, Cameras(K, wide.R, wide.t), 0 * RIG.distortion, size), {})
+    write_pose2sim(
+        tmp_path / "wide.toml", Rig(NAMES, Cameras(K, wide.R, wide.t), 0 * RIG.distortion, size), {}
+    )
     values = (pixels() + np.array([600.0, 0.0]))[..., ::-1]
     with pytest.raises(GhptDataError, match="turned by 90 degrees"):
         judged(tmp_path, values, tmp_path / "wide.toml")
@@ -234,26 +263,52 @@ def judge() -> Judge:
         return build(plain(hydra.compose("predict", []))["verdict"], "verdict")
 
 
-def said(height: float | None = 1730.0, error: float = 0.01, rejected: float = 0.0, unit_mm: float = 1000.0):
+def said(
+    height: float | None = 1730.0,
+    error: float = 0.01,
+    rejected: float = 0.0,
+    unit_mm: float = 1000.0,
+):
     views = dict.fromkeys(NAMES, error)
-    numbers = {"stature_mm": height, "scales": {"all": error, "views": views}, "cameras": list(NAMES),
-               "share": {"rejected": rejected, "observed": 1 - rejected}}  # fmt: skip
+    numbers = {
+        "stature_mm": height,
+        "scales": {"all": error, "views": views},
+        "cameras": list(NAMES),
+        "share": {"rejected": rejected, "observed": 1 - rejected},
+    }
     commands = Commands("cameras", "calibrate", lambda **more: f"predict {more}")
     return judge()(numbers, None, unit_mm, commands)
 
 
 @pytest.mark.parametrize(
     ("height", "level"),
-    [(1100.0, Level.GOOD), (2150.0, Level.GOOD), (850.0, Level.LOOK), (2500.0, Level.LOOK), (173.0, Level.DO_NOT_USE),
-     (17300.0, Level.DO_NOT_USE), (1.66e6, Level.DO_NOT_USE), (1.73, Level.DO_NOT_USE), (None, Level.GOOD)],
-)  # fmt: skip
+    [
+        (1100.0, Level.GOOD),
+        (2150.0, Level.GOOD),
+        (850.0, Level.LOOK),
+        (2500.0, Level.LOOK),
+        (173.0, Level.DO_NOT_USE),
+        (17300.0, Level.DO_NOT_USE),
+        (1.66e6, Level.DO_NOT_USE),
+        (1.73, Level.DO_NOT_USE),
+        (None, Level.GOOD),
+    ],
+)
 def test_the_size_of_the_person_decides(height, level):
     assert said(height).level == level
 
 
 def test_left_out_errors_and_rejected_joints_decide():
-    assert [said(error=error).level for error in (0.02, 0.04, 0.08)] == [Level.GOOD, Level.LOOK, Level.DO_NOT_USE]
-    assert [said(rejected=part).level for part in (0.01, 0.1, 0.5)] == [Level.GOOD, Level.LOOK, Level.DO_NOT_USE]
+    assert [said(error=error).level for error in (0.02, 0.04, 0.08)] == [
+        Level.GOOD,
+        Level.LOOK,
+        Level.DO_NOT_USE,
+    ]
+    assert [said(rejected=part).level for part in (0.01, 0.1, 0.5)] == [
+        Level.GOOD,
+        Level.LOOK,
+        Level.DO_NOT_USE,
+    ]
 
 
 def test_a_unit_is_suggested_in_which_the_person_is_one():
@@ -265,9 +320,15 @@ def test_a_unit_is_suggested_in_which_the_person_is_one():
 
 @pytest.mark.parametrize(
     ("key", "value"),
-    [("views", ["cam01", "54138969", "c 1", 'a"b']), ("match", {"front json": "cam01"}), ("keypoints", "/a b/c,d/(e)"),
-     ("person", 2), ("unit_mm", 25.4), ("cameras", "Calib.toml")],
-)  # fmt: skip
+    [
+        ("views", ["cam01", "54138969", "c 1", 'a"b']),
+        ("match", {"front json": "cam01"}),
+        ("keypoints", "/a b/c,d/(e)"),
+        ("person", 2),
+        ("unit_mm", 25.4),
+        ("cameras", "Calib.toml"),
+    ],
+)
 def test_a_setting_comes_back_through_the_shell_and_hydra(key, value):
     (word,) = shlex.split(setting(key, value))
     override = OverridesParser.create().parse_override(word)
@@ -281,12 +342,23 @@ def test_a_setting_comes_back_through_the_shell_and_hydra(key, value):
 
 
 def test_commands_hold_what_was_given(tmp_path):
-    given = config("keypoints=/my data/pose", "cameras=Calib.toml", "views=[a,b]", "person=1", "skeleton=coco_17")
+    given = config(
+        "keypoints=/my data/pose",
+        "cameras=Calib.toml",
+        "views=[a,b]",
+        "person=1",
+        "skeleton=coco_17",
+    )
     commands = commands_on(given, tmp_path / "out")
     assert shlex.split(commands.predict(unit_mm=1.0))[2:] == [
-        "keypoints='/my data/pose'", "cameras=Calib.toml", "views=[a,b]", "skeleton=coco_17", "person=1", "unit_mm=1",
+        "keypoints='/my data/pose'",
+        "cameras=Calib.toml",
+        "views=[a,b]",
+        "skeleton=coco_17",
+        "person=1",
+        "unit_mm=1",
         f"output={tmp_path / 'out'}_again",
-    ]  # fmt: skip
+    ]
     assert "person" not in commands.cameras
     assert "scale.height=1750" in commands.calibrate
 

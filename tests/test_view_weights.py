@@ -1,4 +1,6 @@
-"""The scorer's weights as view weights. Scorers are put in the place of a trained one, so that what is due is known."""
+"""The scorer's weights as view weights. Scorers are put in the place of a trained one, so that what
+is due is known.
+"""
 
 from dataclasses import replace
 
@@ -35,9 +37,17 @@ class Scores(nn.Module):
 def view_weights(power=2.0, hypotheses=300, consensus=CONSENSUS):
     loss = StochasticLoss(alpha=1.0, beta=0.01, gamma=0.02, relative_errors=True)
     model = StochasticEstimator(
-        PoseTriangulation(coordinates=True, lengths=True), lambda size: Scores(), loss, torch.optim.Adam, hypotheses,
-        temperature=1.5, gumbel=True, spread=None, selection="weight", seed=0,
-    )  # fmt: skip
+        PoseTriangulation(coordinates=True, lengths=True),
+        lambda size: Scores(),
+        loss,
+        torch.optim.Adam,
+        hypotheses,
+        temperature=1.5,
+        gumbel=True,
+        spread=None,
+        selection="weight",
+        seed=0,
+    )
     return ViewWeights(model, consensus, power)
 
 
@@ -45,7 +55,9 @@ def knowing(estimator, scene):
     """Let the scorer know the true poses' features."""
     problem = estimator.model.problem
     truth = problem.generate(scene.batch(), 1, torch.zeros(len(scene.points), dtype=torch.int64))
-    estimator.model.scorer.wanted = problem.describe(replace(truth, points=scene.points[:, None].float()))[:, 0]
+    estimator.model.scorer.wanted = problem.describe(
+        replace(truth, points=scene.points[:, None].float())
+    )[:, 0]
     return estimator
 
 
@@ -93,22 +105,31 @@ def test_hypotheses_are_made_of_views_that_agree():
     found = view_weights().weigh(far.batch())
     assert torch.equal(found.views, ~wrong)
     assert not (found.hypotheses.views & ~found.views.mT[:, None]).any()
-    assert error(found.triangulation.points, scene) < 0.2 * error(Linear()(far.batch()).points, scene)
+    assert error(found.triangulation.points, scene) < 0.2 * error(
+        Linear()(far.batch()).points, scene
+    )
     torch.testing.assert_close(found.weights.sum(-1), torch.ones(3))
 
 
 def test_where_the_views_disagree_as_a_whole_a_scorer_that_is_wrong_harms_less():
     scene = random_scene(7, frames=20, views=4).noisy(1, 0)
     batch = RotatedCameras(2.0)(scene.batch(), 0)
-    adaptive = AdaptiveRansac(threshold=0.005, pairs=64, seed=0, adapt=100.0, quantile=0.6, rounds=4)
+    adaptive = AdaptiveRansac(
+        threshold=0.005, pairs=64, seed=0, adapt=100.0, quantile=0.6, rounds=4
+    )
     wrong = replace(scene, points=scene.points.roll(1, 0))
     points = {}
-    for name, consensus in {"adaptive": adaptive, "fixed": Ransac(threshold=10.0, pairs=64, seed=0)}.items():
+    for name, consensus in {
+        "adaptive": adaptive,
+        "fixed": Ransac(threshold=10.0, pairs=64, seed=0),
+    }.items():
         found = knowing(view_weights(consensus=consensus), wrong).weigh(batch)
         assert found.views.all()  # the same pool
         points[name] = found.triangulation.points
     linear = error(Linear()(batch).points, scene)
-    assert error(points["adaptive"], scene) - linear < 0.5 * (error(points["fixed"], scene) - linear)
+    assert error(points["adaptive"], scene) - linear < 0.5 * (
+        error(points["fixed"], scene) - linear
+    )
 
 
 def test_what_linear_determines_is_estimated_and_nothing_else():

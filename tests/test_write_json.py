@@ -7,7 +7,10 @@ from ghpt.files import write_json
 
 
 def test_json_has_no_number_that_json_has_no_word_for(tmp_path):
-    content = {"a": [float("nan"), 1.5, (float("inf"), -float("inf"))], "b": {"c": float("nan"), "d": None}}
+    content = {
+        "a": [float("nan"), 1.5, (float("inf"), -float("inf"))],
+        "b": {"c": float("nan"), "d": None},
+    }
     write_json(tmp_path / "a.json", content)
 
     def refuse(word):

@@ -23,4 +23,10 @@ def add(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
 
 def cell(diary: Path, number: float, *needs: Cell, **config: Any) -> Cell:
     config |= {"number": number, "diary": str(diary)}
-    return Cell(f"add-{number}", "toy_cells.add", config, {before.name: before for before in needs}, seconds=1.0)
+    return Cell(
+        f"add-{number}",
+        "toy_cells.add",
+        config,
+        {before.name: before for before in needs},
+        seconds=1.0,
+    )

@@ -1,4 +1,6 @@
-"""A command for tests of sweeps: ``toy_sweep.py -m how=well,user``: jobs that end in different ways."""
+"""A command for tests of sweeps: ``toy_sweep.py -m how=well,user``: jobs that end in different
+ways.
+"""
 
 import json
 import os
@@ -36,7 +38,10 @@ def task(config, output):
 
 
 def after(jobs):
-    told = [{"name": j.name, "how": j.config.get("how"), "result": j.result, "failed": j.failed} for j in jobs]
+    told = [
+        {"name": j.name, "how": j.config.get("how"), "result": j.result, "failed": j.failed}
+        for j in jobs
+    ]
     print("after", json.dumps({"pid": os.getpid(), "jobs": told}))
 
 

@@ -12,33 +12,68 @@ from ghpt.geometry.cameras import Cameras, project
 from ghpt.recording import Recording
 
 DATA = {
-    "_target_": "toys.ToyData", "name": "toy", "root": None, "cache": None, "seed": 0, "train_samples": 80,
-    "least_joints": 5, "stride": 3, "evaluate": "test", "batch_size": 16, "workers": 0, "views": 4, "missing": 0.1,
-}  # fmt: skip
+    "_target_": "toys.ToyData",
+    "name": "toy",
+    "root": None,
+    "cache": None,
+    "seed": 0,
+    "train_samples": 80,
+    "least_joints": 5,
+    "stride": 3,
+    "evaluate": "test",
+    "batch_size": 16,
+    "workers": 0,
+    "views": 4,
+    "missing": 0.1,
+}
 
 MODEL = {
     "_target_": "ghpt.models.module.StochasticEstimator",
-    "problem": {"_target_": "ghpt.models.pose.problem.PoseTriangulation", "coordinates": True, "lengths": True},
+    "problem": {
+        "_target_": "ghpt.models.pose.problem.PoseTriangulation",
+        "coordinates": True,
+        "lengths": True,
+    },
     "scorer": {
-        "_target_": "ghpt.models.scorer.Scorer", "_partial_": True,
-        "layers": [32, 16], "clip": 10.0, "bfloat16": False,
+        "_target_": "ghpt.models.scorer.Scorer",
+        "_partial_": True,
+        "layers": [32, 16],
+        "clip": 10.0,
+        "bfloat16": False,
     },
     "loss": {
         "_target_": "ghpt.models.loss.StochasticLoss",
-        "alpha": 1.0, "beta": 0.01, "gamma": 0.02, "relative_errors": True,
+        "alpha": 1.0,
+        "beta": 0.01,
+        "gamma": 0.02,
+        "relative_errors": True,
     },
     "optimizer": {"_target_": "torch.optim.Adam", "_partial_": True, "lr": 1e-3},
-    "hypotheses": 12, "temperature": 1.5, "gumbel": True, "spread": 1.5, "selection": "weight", "seed": 0,
-}  # fmt: skip
+    "hypotheses": 12,
+    "temperature": 1.5,
+    "gumbel": True,
+    "spread": 1.5,
+    "selection": "weight",
+    "seed": 0,
+}
 
 TRAINER = {
-    "accelerator": "cpu", "devices": 1, "max_epochs": 2, "log_every_n_steps": 1, "enable_model_summary": False,
-}  # fmt: skip
+    "accelerator": "cpu",
+    "devices": 1,
+    "max_epochs": 2,
+    "log_every_n_steps": 1,
+    "enable_model_summary": False,
+}
 
 TRAIN = {
-    "data": DATA, "model": MODEL, "trainer": TRAINER, "seed": 0, "save_every": 1000, "resume": False,
+    "data": DATA,
+    "model": MODEL,
+    "trainer": TRAINER,
+    "seed": 0,
+    "save_every": 1000,
+    "resume": False,
     "progress_bar": False,
-}  # fmt: skip
+}
 
 
 class ToyData(KeyPointDataModule):
@@ -55,14 +90,25 @@ class ToyData(KeyPointDataModule):
         rng = np.random.default_rng(["train", "validation", "test"].index(split))
         for take in range(2):
             yield recording(
-                f"S{take}/Walking-1", f"S{take}", 60 if split == "train" else 45, self.views, self.missing, rng
+                f"S{take}/Walking-1",
+                f"S{take}",
+                60 if split == "train" else 45,
+                self.views,
+                self.missing,
+                rng,
             )
 
 
-def recording(name: str, subject: str, frames: int, views: int, missing: float, rng: np.random.Generator) -> Recording:
+def recording(
+    name: str, subject: str, frames: int, views: int, missing: float, rng: np.random.Generator
+) -> Recording:
     angles = np.linspace(0, 2 * np.pi, views, endpoint=False)
-    R = torch.from_numpy(np.stack([Rotation.from_euler("yx", [a, 0.2]).as_matrix() for a in angles]))
-    K = torch.tensor([[1100.0, 0, 500], [0, 1100, 500], [0, 0, 1]], dtype=torch.float64).expand(views, 3, 3)
+    R = torch.from_numpy(
+        np.stack([Rotation.from_euler("yx", [a, 0.2]).as_matrix() for a in angles])
+    )
+    K = torch.tensor([[1100.0, 0, 500], [0, 1100, 500], [0, 0, 1]], dtype=torch.float64).expand(
+        views, 3, 3
+    )
     cameras = Cameras(K, R, torch.tensor([0.0, 0, 5000], dtype=torch.float64).expand(views, 3))
     body = rng.normal(0, 400, (17, 3))
     truth = body + rng.normal(0, 60, (frames, 17, 3))

@@ -1,8 +1,9 @@
-"""From plain configuration to objects: ``_target_`` names a class, the other keys are its arguments.
+"""From plain configuration to objects: ``_target_`` names a class, the other keys are its
+arguments.
 
-Hydra composes the yaml; this builds it, because a checkpoint carries its configuration too, and what comes out of
-a file must not be able to name arbitrary callables or read the environment through interpolations.
-What a checkpoint may name is in ``ghpt.models.registry``.
+Hydra composes the yaml; this builds it, because a checkpoint carries its configuration too, and
+what comes out of a file must not be able to name arbitrary callables or read the environment
+through interpolations. What a checkpoint may name is in ``ghpt.models.registry``.
 """
 
 import difflib
@@ -35,7 +36,9 @@ def suggest(word: str, existing: Iterable[object]) -> str:
     """One sentence that says what exists, the nearest name first where there is one."""
     names = sorted(map(str, existing))
     near = difflib.get_close_matches(word, names, n=1)
-    return (f"Did you mean {near[0]!r}? " if near else "") + f"Existing: {', '.join(names) or 'none'}."
+    return (
+        f"Did you mean {near[0]!r}? " if near else ""
+    ) + f"Existing: {', '.join(names) or 'none'}."
 
 
 def locate(node: Mapping[str, Any], path: str) -> Callable[..., Any]:
@@ -130,8 +133,11 @@ def _is_module(name: str) -> bool:
     return True
 
 
-def check_arguments(target: Any, values: Mapping[str, Any], path: str, partial: bool = False) -> None:
-    """Raise GhptConfigError unless ``target(**values)`` has its arguments, by name and by annotated type.
+def check_arguments(
+    target: Any, values: Mapping[str, Any], path: str, partial: bool = False
+) -> None:
+    """Raise GhptConfigError unless ``target(**values)`` has its arguments, by name and by annotated
+    type.
 
     ``partial``: more may come later. ``path`` is the key that the values stand under.
     """
@@ -141,32 +147,48 @@ def check_arguments(target: Any, values: Mapping[str, Any], path: str, partial: 
             check_type(value, parameters[key][0], f"{path}.{key}")
         elif not open_ended:
             raise GhptConfigError(
-                f"{path}.{key}", f"{target.__qualname__} has no such setting", suggest(key, parameters)
+                f"{path}.{key}",
+                f"{target.__qualname__} has no such setting",
+                suggest(key, parameters),
             )
-    missing = [name for name, (_, required) in parameters.items() if required and name not in values]
+    missing = [
+        name for name, (_, required) in parameters.items() if required and name not in values
+    ]
     if missing and not partial:
-        raise GhptConfigError(path, f"{target.__qualname__} needs {', '.join(missing)}", "Set it in the yaml.")
+        raise GhptConfigError(
+            path, f"{target.__qualname__} needs {', '.join(missing)}", "Set it in the yaml."
+        )
 
 
 def check_type(value: Any, wanted: Any, key: str) -> None:
-    """Raise GhptConfigError unless a plain value is what the annotation ``wanted`` says; an integer is a number too."""
+    """Raise GhptConfigError unless a plain value is what the annotation ``wanted`` says; an integer
+    is a number too.
+    """
     if is_typeddict(wanted) and isinstance(value, Mapping):
         for name, inner in get_type_hints(wanted).items():
             if name not in value:
                 if name in wanted.__optional_keys__:
                     continue
-                raise GhptConfigError(f"{key}.{name}".lstrip("."), "is missing", "Set it in the yaml.")
+                raise GhptConfigError(
+                    f"{key}.{name}".lstrip("."), "is missing", "Set it in the yaml."
+                )
             check_type(value[name], inner, f"{key}.{name}".lstrip("."))
     elif not _fits(value, wanted):
         shown = "null" if value is None else repr(value)
-        raise GhptConfigError(key, f"is {shown}, not {_words(wanted)}", "Give a value of this kind.")
+        raise GhptConfigError(
+            key, f"is {shown}, not {_words(wanted)}", "Give a value of this kind."
+        )
 
 
 def _parameters(target: Any) -> tuple[dict[str, tuple[Any, bool]], bool]:
-    """Name -> (annotation, required), with what ``**settings`` hands on to parent classes; whether any name goes."""
+    """Name -> (annotation, required), with what ``**settings`` hands on to parent classes; whether
+    any name goes.
+    """
     found: dict[str, tuple[Any, bool]] = {}
     own = int(inspect.isclass(target))  # self is no setting
-    for function in [vars(c)["__init__"] for c in target.__mro__ if "__init__" in vars(c)] if own else [target]:
+    for function in (
+        [vars(c)["__init__"] for c in target.__mro__ if "__init__" in vars(c)] if own else [target]
+    ):
         try:
             signature = inspect.signature(function).parameters.values()
         except ValueError:  # of C, without a signature
@@ -184,11 +206,18 @@ def _parameters(target: Any) -> tuple[dict[str, tuple[Any, bool]], bool]:
 
 
 _PLAIN = "A configuration is numbers, text, true, false and null, in lists and groups."
-_SCALARS = {int: "an integer", float: "a finite number", bool: "true or false", str: "text", types.NoneType: "null"}
+_SCALARS = {
+    int: "an integer",
+    float: "a finite number",
+    bool: "true or false",
+    str: "text",
+    types.NoneType: "null",
+}
 
 
 def _fits(value: Any, wanted: Any) -> bool:
-    origin, inner = get_origin(wanted), get_args(wanted)
+    origin = get_origin(wanted)
+    inner = get_args(wanted)
     if origin in (Union, types.UnionType):
         return any(_fits(value, one) for one in inner)
     if origin is Literal:
@@ -200,7 +229,9 @@ def _fits(value: Any, wanted: Any) -> bool:
     if origin is Callable:
         return callable(value)
     if origin in (list, tuple, Sequence, Iterable):
-        return isinstance(value, list | tuple) and (len(inner) != 1 or all(_fits(one, inner[0]) for one in value))
+        return isinstance(value, list | tuple) and (
+            len(inner) != 1 or all(_fits(one, inner[0]) for one in value)
+        )
     if origin in (dict, Mapping) or is_typeddict(wanted):
         return isinstance(value, Mapping)
     return not isinstance(wanted, type) or wanted in (object, Any) or type(value) not in _SCALARS
@@ -208,7 +239,8 @@ def _fits(value: Any, wanted: Any) -> bool:
 
 def _words(wanted: Any) -> str:
     """What ``_fits`` looks for, for people."""
-    origin, inner = get_origin(wanted), get_args(wanted)
+    origin = get_origin(wanted)
+    inner = get_args(wanted)
     if origin in (Union, types.UnionType):
         plain_ones = [one for one in inner if one in _SCALARS or get_origin(one) is Literal]
         return " or ".join(dict.fromkeys(map(_words, plain_ones or inner)))
@@ -218,4 +250,7 @@ def _words(wanted: Any) -> str:
         return "a list" + (f" ({_words(inner[0])} each)" if inner else "")
     if origin in (dict, Mapping) or is_typeddict(wanted):
         return "a group of settings"
-    return _SCALARS.get(wanted) or f"a {getattr(wanted, '__name__', wanted)}: a group of settings with _target_"
+    return (
+        _SCALARS.get(wanted)
+        or f"a {getattr(wanted, '__name__', wanted)}: a group of settings with _target_"
+    )

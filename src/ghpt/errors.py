@@ -28,7 +28,10 @@ class GhptDataError(GhptError):
     """
 
     def __init__(self, where: object, field: str, problem: str, mend: str) -> None:
-        self.where, self.field, self.problem, self.mend = str(where), field, problem, mend
+        self.where = str(where)
+        self.field = field
+        self.problem = problem
+        self.mend = mend
         super().__init__(f"{where}: {f'{field}: ' if field else ''}{problem}. {mend}")
 
 
@@ -36,7 +39,9 @@ class GhptConfigError(GhptError):
     """A setting that cannot work. Reads as ``KEY: PROBLEM. MEND``."""
 
     def __init__(self, key: str, problem: str, mend: str) -> None:
-        self.key, self.problem, self.mend = key, problem, mend
+        self.key = key
+        self.problem = problem
+        self.mend = mend
         super().__init__(f"{key}: {problem}. {mend}")
 
 
@@ -44,7 +49,9 @@ class GhptCheckpointError(GhptError):
     """A checkpoint that is missing, damaged, foreign, or of another model."""
 
     def __init__(self, path: object, problem: str, mend: str) -> None:
-        self.path, self.problem, self.mend = str(path), problem, mend
+        self.path = str(path)
+        self.problem = problem
+        self.mend = mend
         super().__init__(f"{path}: {problem}. {mend}")
 
 
@@ -64,7 +71,9 @@ def out_of_memory(error: Exception) -> GhptConfigError | None:
 
 
 def check(condition: bool, key: str, problem: str, mend: str) -> None:
-    """Raise GhptConfigError unless ``condition`` holds: for the constructors that yaml values reach."""
+    """Raise GhptConfigError unless ``condition`` holds: for the constructors that yaml values
+    reach.
+    """
     if not condition:
         raise GhptConfigError(key, problem, mend)
 

@@ -1,7 +1,9 @@
-"""Every output is written through here: to a temporary name in the same folder, checked, then moved.
+"""Every output is written through here: to a temporary name in the same folder, checked, then
+moved.
 
 A reader therefore never sees half a file, and a crash at any instant leaves the previous file as it
-was. Within the output folder of a command, `ghpt.commands.outputs` guards what may be replaced or removed.
+was. Within the output folder of a command, `ghpt.commands.outputs` guards what may be replaced or
+removed.
 """
 
 import errno
@@ -27,7 +29,8 @@ from ghpt.errors import GhptDataError
 _WINDOWS = os.name == "nt"
 _HOST = re.sub(r"[^\w-]", "_", platform.node())[:32] or "host"
 _TEMPORARY = re.compile(rf"^\..+\.{_HOST}-(?P<pid>\d+)-[0-9a-f]{{8}}\.tmp$")
-"""What this machine's writers call their files; another machine's, on a shared disk, may be alive."""
+"""What this machine's writers call their files; another machine's, on a shared disk, may be alive.
+"""
 _ABANDONED = 24 * 3600.0
 """Seconds after which a temporary file counts as abandoned where processes cannot be asked for."""
 
@@ -112,19 +115,22 @@ def atomic_write(
     verify: Callable[[Path], Any] | None = None,
     previous: Path | None = None,
 ) -> Iterator[IO[Any]]:
-    """Yield a file open for writing that takes ``path``'s place when the block ends without an error.
+    """Yield a file open for writing that takes ``path``'s place when the block ends without an
+    error.
 
-    ``verify`` gets the finished temporary file and raises if it is not right. On any failure (the block's,
-    the disk's, the check's) the temporary file is removed, ``path`` is untouched and the error is passed on.
-    ``previous``: what stood at ``path`` is kept under this name, in the same folder. A kill at any
-    instant leaves two files, both whole and not the same.
+    ``verify`` gets the finished temporary file and raises if it is not right. On any failure (the
+    block's, the disk's, the check's) the temporary file is removed, ``path`` is untouched and the
+    error is passed on. ``previous``: what stood at ``path`` is kept under this name, in the same
+    folder. A kill at any instant leaves two files, both whole and not the same.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = _temporary(path)
     second = _temporary(path)
     try:
-        with open(temporary, mode, **({} if "b" in mode else {"encoding": "utf-8", "newline": "\n"})) as handle:
+        with open(
+            temporary, mode, **({} if "b" in mode else {"encoding": "utf-8", "newline": "\n"})
+        ) as handle:
             yield handle
             handle.flush()
             os.fsync(handle.fileno())
@@ -152,7 +158,9 @@ def atomic_write(
 
 
 def remove(path: str | Path) -> None:
-    """Remove a file that ghpt wrote, if it is there. Raises GhptDataError if its folder's guard objects."""
+    """Remove a file that ghpt wrote, if it is there. Raises GhptDataError if its folder's guard
+    objects.
+    """
     path = Path(path)
     if not path.exists():
         return
@@ -188,7 +196,9 @@ def _second_name(path: Path, second: Path) -> None:
 
 
 def write_json(path: str | Path, content: Any) -> None:
-    """Write plain data as JSON, indented; a number that is not finite, for which JSON has no word, as null."""
+    """Write plain data as JSON, indented; a number that is not finite, for which JSON has no word,
+    as null.
+    """
     with atomic_write(path, "w") as handle:
         json.dump(finite(content), handle, indent=1, allow_nan=False)
         handle.write("\n")
@@ -218,7 +228,9 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
             yield temporary
         for path_within in (temporary, *temporary.rglob("*")):
             if path_within.is_file():
-                with open(path_within, "rb+") as handle:  # Windows syncs only what is open for writing
+                with open(
+                    path_within, "rb+"
+                ) as handle:  # Windows syncs only what is open for writing
                     os.fsync(handle.fileno())
             else:  # the names of its files
                 _sync_folder(path_within)
@@ -237,9 +249,9 @@ def atomic_folder(path: str | Path) -> Iterator[Path]:
 def allocate(handle: IO[bytes], size: int, name: str | Path) -> None:
     """Make an open file ``size`` bytes long, and take all of them from the disk at once.
 
-    A file that is only declared to be long has holes; where the disk is full when a memory map fills
-    one, SIGBUS ends the process without a word. Here that is an OSError which names ``name``. What the
-    file holds stays, and new bytes are 0.
+    A file that is only declared to be long has holes; where the disk is full when a memory map
+    fills one, SIGBUS ends the process without a word. Here that is an OSError which names ``name``.
+    What the file holds stays, and new bytes are 0.
     """
     try:
         if not _reserved(handle, size):
@@ -267,12 +279,16 @@ def _reserved(handle: IO[bytes], size: int) -> bool:
 
 
 def sweep_temporaries(folder: str | Path) -> list[Path]:
-    """Remove what writers that died have left in ``folder`` (not below it); returns what was removed."""
+    """Remove what writers that died have left in ``folder`` (not below it); returns what was
+    removed.
+    """
     swept = []
     for path in Path(folder).iterdir() if Path(folder).is_dir() else ():
         match = _TEMPORARY.match(path.name)
         if match and _abandoned(path, int(match["pid"])):
-            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(missing_ok=True)
+            shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(
+                missing_ok=True
+            )
             swept.append(path)
     return swept
 
@@ -312,4 +328,6 @@ def acquire(path: Path, problem: str) -> BaseFileLock:
             mend = "Wait for it, or name another output."
             raise GhptDataError(path.parent, "", problem, mend) from None
         return lock
-    raise GhptDataError(path.parent, "", "cannot be locked on this file system", "Name another output.")
+    raise GhptDataError(
+        path.parent, "", "cannot be locked on this file system", "Name another output."
+    )

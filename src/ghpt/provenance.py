@@ -30,9 +30,16 @@ def commit() -> str:
     """The git commit of the source tree, with + if files differ from it; '' where there is none."""
     folder = Path(__file__).parent
     try:
-        options = {"cwd": folder, "capture_output": True, "text": True, "timeout": 10, "check": True}
+        options = {
+            "cwd": folder,
+            "capture_output": True,
+            "text": True,
+            "timeout": 10,
+            "check": True,
+        }
         head = subprocess.run(["git", "rev-parse", "HEAD"], **options).stdout.strip()
-        # A command that is stopped here kills git, whose lock would then stay in the user's repository.
+        # A command that is stopped here kills git, whose lock would then stay in the user's
+        # repository.
         changed = subprocess.run(
             ["git", "--no-optional-locks", "status", "--porcelain", "-uno"], **options
         ).stdout.strip()

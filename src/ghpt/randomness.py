@@ -1,8 +1,10 @@
-"""Counter-based randomness: a draw is a pure function of what it is for, never of what was drawn before.
+"""Counter-based randomness: a draw is a pure function of what it is for, never of what was drawn
+before.
 
-A key is made of the seed, a purpose and any indices (epoch, sample, ...); every number of a draw is a hash of its
-key and its position (SplitMix64's output function applied twice, Steele et al. 2014). So a frame's hypotheses are
-the same in any batch, on any process, on CPU or GPU, and after any resume, without generator state to save.
+A key is made of the seed, a purpose and any indices (epoch, sample, ...); every number of a draw is
+a hash of its key and its position (SplitMix64's output function applied twice, Steele et al. 2014).
+So a frame's hypotheses are the same in any batch, on any process, on CPU or GPU, and after any
+resume, without generator state to save.
 """
 
 import zlib
@@ -17,7 +19,9 @@ def _int64(value: int) -> int:
     return value - (1 << 64) if value >= 1 << 63 else value
 
 
-_GOLDEN, _MIX1, _MIX2 = (_int64(x) for x in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB))
+_GOLDEN, _MIX1, _MIX2 = (
+    _int64(x) for x in (0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
+)
 
 
 def _shift(x: Tensor, bits: int) -> Tensor:
@@ -31,11 +35,17 @@ def _mix(x: Tensor) -> Tensor:
     return x ^ _shift(x, 31)
 
 
-def key(seed: int, purpose: str, *indices: int | Int[Tensor, "*B"], device: torch.device | str = "cpu") -> Tensor:
+def key(
+    seed: int, purpose: str, *indices: int | Int[Tensor, "*B"], device: torch.device | str = "cpu"
+) -> Tensor:
     """The key(s) of a draw: one int64 for each element of the (broadcast) indices."""
     state = torch.tensor(_int64(seed), dtype=torch.int64, device=device)
     for part in (zlib.crc32(purpose.encode()), *indices):
-        part = part.to(torch.int64) if isinstance(part, Tensor) else torch.tensor(_int64(part), device=device)
+        part = (
+            part.to(torch.int64)
+            if isinstance(part, Tensor)
+            else torch.tensor(_int64(part), device=device)
+        )
         state = _mix(_mix(state * _GOLDEN + _GOLDEN).to(part.device) ^ (part * _GOLDEN))
     return state
 
@@ -52,7 +62,9 @@ def bits(keys: Int[Tensor, "*B"], shape: tuple[int, ...]) -> Int[Tensor, "..."]:
 def uniform(
     keys: Int[Tensor, "*B"], shape: tuple[int, ...], dtype: torch.dtype = torch.float64
 ) -> Float[Tensor, "..."]:
-    """Uniform numbers in the open interval (0, 1): [*B, *shape]. Neither end occurs, so logs are finite."""
+    """Uniform numbers in the open interval (0, 1): [*B, *shape]. Neither end occurs, so logs are
+    finite.
+    """
     digits = 52 if dtype == torch.float64 else 23
     return (_shift(bits(keys, shape), 64 - digits).to(dtype) + 0.5) * 2.0**-digits
 

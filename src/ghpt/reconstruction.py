@@ -1,4 +1,6 @@
-"""What a recording becomes: 3D joints in which every number says whether it was seen, filled or is missing."""
+"""What a recording becomes: 3D joints in which every number says whether it was seen, filled or is
+missing.
+"""
 
 from __future__ import annotations
 
@@ -59,13 +61,17 @@ class Reconstruction:
     state: Int8[Tensor, "T J"]
     """Values of ``State``."""
     error: Float[Tensor, "T J"]
-    """Root mean square reprojection error over the used views, pixels; 0 where nothing was observed."""
+    """Root mean square reprojection error over the used views, pixels; 0 where nothing was
+    observed.
+    """
     views: Bool[Tensor, "T V J"]
     """The views that made the joint."""
     covariance: Float[Tensor, "T J 6"]
     """xx xy xz yy yz zz of the position, mm^2; 0 where nothing was observed."""
     score: Float[Tensor, " T"]
-    """Mean logit of the pool under its weights for a learned estimator: higher is more plausible; 0 for others."""
+    """Mean logit of the pool under its weights for a learned estimator: higher is more plausible; 0
+    for others.
+    """
     swapped: Bool[Tensor, "T V"]
     """Views in which left and right were exchanged before triangulating."""
 

@@ -16,11 +16,12 @@ from ghpt.geometry.epipolar import normalise
 
 @dataclass(frozen=True)
 class Recording:
-    """One take of one person by one rig: T frames, V views, J = 17 joints. Arrays may be memory maps.
+    """One take of one person by one rig: T frames, V views, J = 17 joints. Arrays may be memory
+    maps.
 
-    All quirks of a data set end here: millimetres, ideal pinhole pixels (lens distortion is undone), world to
-    camera, joints in the order of ``ghpt.skeleton.JOINTS``. A value whose mask is False is finite but
-    meaningless.
+    All quirks of a data set end here: millimetres, ideal pinhole pixels (lens distortion is
+    undone), world to camera, joints in the order of ``ghpt.skeleton.JOINTS``. A value whose mask is
+    False is finite but meaningless.
     """
 
     name: str
@@ -52,7 +53,9 @@ class KeyPointBatch:
     """B frames, from any recordings of one camera arrangement."""
 
     sample: Int[Tensor, " B"]
-    """Position in the data set: the key of the frame's random draws, whatever batch or process it is in."""
+    """Position in the data set: the key of the frame's random draws, whatever batch or process it
+    is in.
+    """
     recording: Int[Tensor, " B"]
     """Index of the frame's recording in the data set."""
     cameras: Cameras
@@ -68,7 +71,9 @@ class KeyPointBatch:
 
     def to(self, *args: Any, **kwargs: Any) -> KeyPointBatch:
         """Move to a device."""
-        return KeyPointBatch(**{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})
+        return KeyPointBatch(
+            **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)}
+        )
 
     def rows(self, index: Int[Tensor, " b"]) -> KeyPointBatch:
         """The frames at these places."""
@@ -81,8 +86,9 @@ class KeyPointBatch:
 
 @dataclass(frozen=True)
 class PoseEstimate:
-    """3D poses from any selection or classical estimator. A joint that is not ``estimated`` is finite but
-    meaningless: it had too few views, and nothing was invented for it."""
+    """3D poses from any selection or classical estimator. A joint that is not ``estimated`` is
+    finite but meaningless: it had too few views, and nothing was invented for it.
+    """
 
     points: Float[Tensor, "*B J 3"]
     """World frame, mm."""
@@ -91,8 +97,10 @@ class PoseEstimate:
 
 @dataclass(frozen=True)
 class PairBatch:
-    """B pairs of cameras, each with M frames of one person before its rig. All views travel with a pair, so that
-    whoever estimates a whole rig has the same frames; the pairs of one ``draw`` share theirs."""
+    """B pairs of cameras, each with M frames of one person before its rig. All views travel with a
+    pair, so that whoever estimates a whole rig has the same frames; the pairs of one ``draw`` share
+    theirs.
+    """
 
     sample: Int[Tensor, " B"]
     """Position in the data set: the key of the pair's random draws."""
@@ -103,7 +111,9 @@ class PairBatch:
     pair: Int[Tensor, "B 2"]
     """The views: reference a, then target b; ``x_b = R x_a + t``."""
     cameras: Cameras
-    """K (known) and the true R, t (for errors and the known scale alone), leading dimensions B V, float64."""
+    """K (known) and the true R, t (for errors and the known scale alone), leading dimensions B V,
+    float64.
+    """
     key_points: Float[Tensor, "B V M J 2"]
     confidence: Float[Tensor, "B V M J"]
     seen: Bool[Tensor, "B V M J"]
@@ -114,7 +124,9 @@ class PairBatch:
         return len(self.sample)
 
     def to(self, *args: Any, **kwargs: Any) -> PairBatch:
-        return PairBatch(**{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)})
+        return PairBatch(
+            **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)}
+        )
 
     def pin_memory(self) -> PairBatch:
         return PairBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
@@ -123,11 +135,18 @@ class PairBatch:
         """Of values [B, V, ...] those of the pair: [B, 2, ...]."""
         return values[torch.arange(len(self), device=values.device)[:, None], self.pair]
 
-    def correspondences(self) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
-        """The pairs' points in a and in b, N = M x J, normalised image coordinates (float64), and which of them both
-        see; the others are 0."""
-        points = normalise(self.of_pair(self.cameras.K), self.of_pair(self.key_points).flatten(2, 3))
-        both = self.of_pair(self.seen).flatten(2, 3).all(dim=1) & torch.isfinite(points).all(-1).all(1)
+    def correspondences(
+        self,
+    ) -> tuple[Float[Tensor, "B N 2"], Float[Tensor, "B N 2"], Bool[Tensor, "B N"]]:
+        """The pairs' points in a and in b, N = M x J, normalised image coordinates (float64), and
+        which of them both see; the others are 0.
+        """
+        points = normalise(
+            self.of_pair(self.cameras.K), self.of_pair(self.key_points).flatten(2, 3)
+        )
+        both = self.of_pair(self.seen).flatten(2, 3).all(dim=1) & torch.isfinite(points).all(
+            -1
+        ).all(1)
         points = torch.where(both[:, None, :, None], points, 0.0)
         return points[:, 0], points[:, 1], both
 
@@ -138,8 +157,9 @@ class PairBatch:
 
 @dataclass(frozen=True)
 class RelativePoseEstimate:
-    """Relative camera poses from any selection or classical estimator: ``x_b = R x_a + t``. One that is not
-    ``estimated`` is the identity with t = 0 and means nothing."""
+    """Relative camera poses from any selection or classical estimator: ``x_b = R x_a + t``. One
+    that is not ``estimated`` is the identity with t = 0 and means nothing.
+    """
 
     R: Float[Tensor, "*B 3 3"]
     t: Float[Tensor, "*B 3"]

@@ -1,4 +1,6 @@
-"""What ends a command from outside: an interrupt (Ctrl-C), SIGTERM, or the end of its terminal (SIGHUP)."""
+"""What ends a command from outside: an interrupt (Ctrl-C), SIGTERM, or the end of its terminal
+(SIGHUP).
+"""
 
 import signal
 import threading
@@ -20,9 +22,10 @@ class Terminated(KeyboardInterrupt):
 def stopped_by_signals() -> Iterator[None]:
     """Within the block a signal stops the program where it is, and the block ends in SystemExit.
 
-    The status is what shells expect: 130 after SIGINT, 143 after SIGTERM and SIGHUP. Files are written whole or not at
-    all, so this may be anywhere. A second SIGINT or SIGTERM ends the process at once. A signal that the process was
-    started to ignore (by `nohup`, or as a script's background job) stays ignored.
+    The status is what shells expect: 130 after SIGINT, 143 after SIGTERM and SIGHUP. Files are
+    written whole or not at all, so this may be anywhere. A second SIGINT or SIGTERM ends the
+    process at once. A signal that the process was started to ignore (by `nohup`, or as a script's
+    background job) stays ignored.
     """
     if threading.current_thread() is not threading.main_thread():  # signals are not sent to others
         yield
@@ -36,7 +39,8 @@ def stopped_by_signals() -> Iterator[None]:
     try:
         yield
     except BaseException as error:
-        # Code that was interrupted may raise what it likes while it tidies up, as OmegaConf and Lightning do.
+        # Code that was interrupted may raise what it likes while it tidies up, as OmegaConf and
+        # Lightning do.
         if _received:
             raise SystemExit(130 if _received[0] == signal.SIGINT else 143) from error
         raise

@@ -1,4 +1,6 @@
-"""The scorecard: each row prints its figure, and appends it to the file that GHPT_RELIABILITY names."""
+"""The scorecard: each row prints its figure, and appends it to the file that GHPT_RELIABILITY
+names.
+"""
 
 import json
 import os
@@ -34,6 +36,9 @@ def record_row() -> Callable[[str, str, int, int], None]:
         print(f"{row}: {figure} ({passed}/{total})")
         if path := os.environ.get("GHPT_RELIABILITY"):
             with open(path, "a", encoding="utf-8") as handle:
-                handle.write(json.dumps({"row": row, "figure": figure, "passed": passed, "total": total}) + "\n")
+                handle.write(
+                    json.dumps({"row": row, "figure": figure, "passed": passed, "total": total})
+                    + "\n"
+                )
 
     return record

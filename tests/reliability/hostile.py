@@ -1,7 +1,8 @@
 """Hostile files, and a worker that reads them in children with little memory and little time.
 
-``python hostile.py A1 openpose 1000 5`` reads 1,000 mutated files from seed 5 on, in batches, and prints what happened
-as JSON. A batch's process that dies, or that Python cannot interrupt, counts as a crash or a hang of its own.
+``python hostile.py A1 openpose 1000 5`` reads 1,000 mutated files from seed 5 on, in batches, and
+prints what happened as JSON. A batch's process that dies, or that Python cannot interrupt, counts
+as a crash or a hang of its own.
 """
 
 import io
@@ -33,7 +34,9 @@ from ghpt.data.synthetic.rigs import panoptic_rig
 from ghpt.errors import GhptDataError
 
 SECONDS, BATCH, MEMORY = 1.0, 200, 1 << 30
-"""Of the processor for one file; files in a process; bytes that a process may add to those of the imports."""
+"""Of the processor for one file; files in a process; bytes that a process may add to those of the
+imports.
+"""
 RNG = np.random.default_rng(0)
 BODY = np.column_stack([RNG.uniform(0, 400, (17, 2)).round(2), RNG.uniform(0.1, 1, 17).round(3)])
 
@@ -55,7 +58,9 @@ def openpose(folder: Path) -> Path:
         (folder / view).mkdir()
         for frame in (1, 2):
             people = [{"person_id": [-1], "pose_keypoints_2d": BODY.ravel().tolist()}]
-            (folder / view / f"{frame:06d}.json").write_text(json.dumps({"version": 1.3, "people": people}))
+            (folder / view / f"{frame:06d}.json").write_text(
+                json.dumps({"version": 1.3, "people": people})
+            )
     return folder / "a" / "000001.json"
 
 
@@ -70,14 +75,22 @@ def mmpose(folder: Path) -> Path:
 
 
 def coco(folder: Path) -> Path:
-    people = [{"image_id": f, "category_id": 1, "keypoints": BODY.ravel().tolist(), "score": 0.9} for f in (1, 2)]
+    people = [
+        {"image_id": f, "category_id": 1, "keypoints": BODY.ravel().tolist(), "score": 0.9}
+        for f in (1, 2)
+    ]
     for view in ("a", "b"):
         (folder / f"{view}.json").write_text(json.dumps(people))
     return folder / "a.json"
 
 
 def caliscope(folder: Path) -> Path:
-    rows = [f"{t},{port},{t},0.5,{k},{x},{y},," for t in (0, 1) for port in (0, 1) for k, (x, y, _) in enumerate(BODY)]
+    rows = [
+        f"{t},{port},{t},0.5,{k},{x},{y},,"
+        for t in (0, 1)
+        for port in (0, 1)
+        for k, (x, y, _) in enumerate(BODY)
+    ]
     head = "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"
     (folder / "xy.csv").write_text("\n".join([head, *rows]) + "\n")
     return folder / "xy.csv"
@@ -87,7 +100,9 @@ def own_points() -> KeyPoints:
     """Ours: 3 frames, 2 views."""
     points = np.broadcast_to(BODY[:, :2], (3, 2, 17, 2)) + 0.25
     sure = np.broadcast_to(BODY[:, 2], (3, 2, 17)).copy()
-    return KeyPoints("", ("a", "b"), SKELETONS["coco_17"], np.arange(3), points, sure, sure > 0, 60.0, (0, 0))
+    return KeyPoints(
+        "", ("a", "b"), SKELETONS["coco_17"], np.arange(3), points, sure, sure > 0, 60.0, (0, 0)
+    )
 
 
 def npz(folder: Path) -> Path:
@@ -97,7 +112,10 @@ def npz(folder: Path) -> Path:
 
 def npy(folder: Path) -> Path:
     crop = np.broadcast_to(BODY[:, :2], (2, 2, 17, 2)).astype(np.float32)
-    np.save(folder / "all_bboxes.npy", np.broadcast_to(np.array([[0, 0], [500, 500]], np.float32), (2, 2, 2, 2)))
+    np.save(
+        folder / "all_bboxes.npy",
+        np.broadcast_to(np.array([[0, 0], [500, 500]], np.float32), (2, 2, 2, 2)),
+    )
     np.save(folder / "all_2d_preds.npy", crop)
     return folder / "all_2d_preds.npy"
 
@@ -115,20 +133,37 @@ def yaml(folder: Path) -> Path:
 def panoptic(folder: Path) -> Path:
     rig = panoptic_rig((1, 2))
     cameras = [
-        {"name": name, "type": "hd", "resolution": rig.size[v].tolist(), "K": rig.cameras.K[v].tolist(),
-         "distCoef": rig.distortion[v].tolist(), "R": rig.cameras.R[v].tolist(), "t": rig.cameras.t[v].tolist()}
+        {
+            "name": name,
+            "type": "hd",
+            "resolution": rig.size[v].tolist(),
+            "K": rig.cameras.K[v].tolist(),
+            "distCoef": rig.distortion[v].tolist(),
+            "R": rig.cameras.R[v].tolist(),
+            "t": rig.cameras.t[v].tolist(),
+        }
         for v, name in enumerate(rig.names)
-    ]  # fmt: skip
+    ]
     (folder / "calibration.json").write_text(json.dumps({"cameras": cameras}))
     return folder / "calibration.json"
 
 
 def human36m(folder: Path) -> Path:
     rig = panoptic_rig((1, 2))
-    intrinsics = {name: {"calibration_matrix": rig.cameras.K[v].tolist(), "distortion": rig.distortion[v].tolist()}
-                  for v, name in enumerate(rig.names)}  # fmt: skip
-    poses = {name: {"R": rig.cameras.R[v].tolist(), "t": rig.cameras.t[v].tolist()} for v, name in enumerate(rig.names)}
-    (folder / "cameras.json").write_text(json.dumps({"intrinsics": intrinsics, "extrinsics": {"S1": poses}}))
+    intrinsics = {
+        name: {
+            "calibration_matrix": rig.cameras.K[v].tolist(),
+            "distortion": rig.distortion[v].tolist(),
+        }
+        for v, name in enumerate(rig.names)
+    }
+    poses = {
+        name: {"R": rig.cameras.R[v].tolist(), "t": rig.cameras.t[v].tolist()}
+        for v, name in enumerate(rig.names)
+    }
+    (folder / "cameras.json").write_text(
+        json.dumps({"intrinsics": intrinsics, "extrinsics": {"S1": poses}})
+    )
     return folder / "cameras.json"
 
 
@@ -138,12 +173,19 @@ def colmap(folder: Path) -> Path:
     scene = pycolmap.Reconstruction()
     for number in (1, 2):
         scene.add_camera_with_trivial_rig(
-            pycolmap.Camera(model="OPENCV", width=640, height=480, params=[500, 500, 320, 240, 0, 0, 0, 0],
-                            camera_id=number)
-        )  # fmt: skip
+            pycolmap.Camera(
+                model="OPENCV",
+                width=640,
+                height=480,
+                params=[500, 500, 320, 240, 0, 0, 0, 0],
+                camera_id=number,
+            )
+        )
         image = pycolmap.Image(name=f"cam{number}.png", camera_id=number, image_id=number)
         image.points2D = [pycolmap.Point2D(np.array([3.0, 4.0]))] * 2
-        scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([number, 0.0, 5.0])))
+        scene.add_image_with_trivial_frame(
+            image, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([number, 0.0, 5.0]))
+        )
     scene.write_binary(folder)
     return folder / "images.bin"
 
@@ -198,15 +240,40 @@ def mutate_json(data: bytes, chance: random.Random) -> bytes:
 def _place(content: Any, chance: random.Random) -> tuple[Any, Any]:
     parent, key = None, None
     while isinstance(content, dict | list) and content and chance.random() < 0.8:
-        parent, key = content, chance.choice(list(content) if isinstance(content, dict) else range(len(content)))
+        parent, key = (
+            content,
+            chance.choice(list(content) if isinstance(content, dict) else range(len(content))),
+        )
         content = parent[key]
     return parent, key
 
 
 TOKENS = (
-    "nan", "-nan", "inf", "1e308", "-1", "1e400", "[]", "{}", '""', "true", "null", "~", "!!python/object:x", "&a",
-    "*a", "${oc.env:HOME}", "[[1, 2], [3]]", "2026-01-01", "é", "\t", "0x", "'", "[" * 500, "9" * 5000,
-)  # fmt: skip
+    "nan",
+    "-nan",
+    "inf",
+    "1e308",
+    "-1",
+    "1e400",
+    "[]",
+    "{}",
+    '""',
+    "true",
+    "null",
+    "~",
+    "!!python/object:x",
+    "&a",
+    "*a",
+    "${oc.env:HOME}",
+    "[[1, 2], [3]]",
+    "2026-01-01",
+    "é",
+    "\t",
+    "0x",
+    "'",
+    "[" * 500,
+    "9" * 5000,
+)
 
 
 def mutate_text(data: bytes, chance: random.Random) -> bytes:
@@ -255,7 +322,11 @@ def mutate_npy(data: bytes, chance: random.Random) -> bytes:
 
 def mutate_npz(data: bytes, chance: random.Random) -> bytes:
     with np.load(io.BytesIO(data)) as stored:
-        arrays = {name: stored[name] for name in stored.files if name != "members" or chance.random() < 0.1}
+        arrays = {
+            name: stored[name]
+            for name in stored.files
+            if name != "members" or chance.random() < 0.1
+        }
     name = chance.choice(list(arrays))
     if chance.random() < 0.2:
         del arrays[name]
@@ -270,7 +341,9 @@ def mutate_records(data: bytes, chance: random.Random) -> bytes:
     """Fields of 4 or 8 bytes replaced by extreme ones."""
     spoilt = bytearray(data)
     place = chance.randrange(0, len(spoilt) - 8)
-    value = chance.choice((b"\xff" * 8, b"\x00" * 8, b"\x00" * 6 + b"\xf0\x7f", b"\x00" * 7 + b"\x80", b"\xff" * 4))
+    value = chance.choice(
+        (b"\xff" * 8, b"\x00" * 8, b"\x00" * 6 + b"\xf0\x7f", b"\x00" * 7 + b"\x80", b"\xff" * 4)
+    )
     spoilt[place : place + len(value)] = value
     return bytes(spoilt)
 
@@ -284,7 +357,9 @@ FORMATS: dict[str, Format] = {
     "npy": Format(npy, read_people, mutate_npy),
     "toml": Format(toml, lambda folder: read_cameras(folder / "rig.toml"), mutate_text),
     "yaml": Format(yaml, read_cameras, mutate_text),
-    "panoptic": Format(panoptic, lambda folder: read_cameras(folder / "calibration.json"), mutate_json),
+    "panoptic": Format(
+        panoptic, lambda folder: read_cameras(folder / "calibration.json"), mutate_json
+    ),
     "human36m": Format(human36m, lambda folder: read_cameras(folder / "cameras.json"), mutate_json),
     "colmap": Format(colmap, lambda folder: read_cameras(folder, unit_mm=1), mutate_records),
 }
@@ -302,10 +377,16 @@ def same(a: Any, b: Any) -> bool:
 
 
 def part_of(found: Any, whole: Any) -> bool:
-    """Whether a reading holds nothing but values of the whole's: fewer frames at the end, or cameras without poses."""
+    """Whether a reading holds nothing but values of the whole's: fewer frames at the end, or
+    cameras without poses.
+    """
     one, other = values(found), values(whole)
     if "K" in one:
-        return all(one[name] is None or np.array_equal(one[name], other[name]) for name in one if name != "unit_known")
+        return all(
+            one[name] is None or np.array_equal(one[name], other[name])
+            for name in one
+            if name != "unit_known"
+        )
     if not {*one["views"]} <= {*other["views"]} or one["joints"] != other["joints"]:
         return False
     rows, views = len(one["row"]), [other["views"].index(view) for view in one["views"]]
@@ -313,12 +394,15 @@ def part_of(found: Any, whole: Any) -> bool:
     at = np.flatnonzero(kept)
     seen = one["seen"]
     return rows <= len(at) and all(
-        np.array_equal(one[name][seen], other[name][at[:rows]][seen]) for name in ("key_points", "confidence")
+        np.array_equal(one[name][seen], other[name][at[:rows]][seen])
+        for name in ("key_points", "confidence")
     )
 
 
 def spoilt(row: str, whole: bytes, form: Format, numbers: range) -> Iterator[bytes]:
-    """The files of a row: A1 mutates structure and bytes by turns, A2 bytes alone, A3 cuts the file at every byte."""
+    """The files of a row: A1 mutates structure and bytes by turns, A2 bytes alone, A3 cuts the file
+    at every byte.
+    """
     for number in numbers:
         chance = random.Random(number)
         if row == "A3":
@@ -341,7 +425,10 @@ def batch(row: str, form: Format, numbers: range, folder: Path, target: Path) ->
     """Reads one file after the other; what each gave, and by how much the memory grew."""
     whole, reference, outcomes, notes = target.read_bytes(), form.read(folder), Counter(), []
     signal.signal(signal.SIGPROF, late)
-    held = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0]) * resource.getpagesize()
+    held = (
+        int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[0])
+        * resource.getpagesize()
+    )
     resource.setrlimit(resource.RLIMIT_AS, (held + MEMORY, held + MEMORY))
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     for number, data in zip(numbers, spoilt(row, whole, form, numbers), strict=True):
@@ -349,7 +436,13 @@ def batch(row: str, form: Format, numbers: range, folder: Path, target: Path) ->
         signal.setitimer(signal.ITIMER_PROF, SECONDS)
         try:
             found = form.read(folder)
-            outcome = "same" if same(found, reference) else "part" if part_of(found, reference) else "different"
+            outcome = (
+                "same"
+                if same(found, reference)
+                else "part"
+                if part_of(found, reference)
+                else "different"
+            )
         except GhptDataError:
             outcome = "named"
         except Late:
@@ -403,19 +496,33 @@ def main(row: str, name: str, count: int, seed: int) -> dict[str, Any]:
         last = len(whole) if row == "A3" else count
         for start in range(0, last, BATCH):
             numbers = range(seed + start, seed + min(start + BATCH, last))
-            found = forked(lambda numbers=numbers: batch(row, form, numbers, folder, target), 10 + SECONDS * BATCH / 4)
+            found = forked(
+                lambda numbers=numbers: batch(row, form, numbers, folder, target),
+                10 + SECONDS * BATCH / 4,
+            )
             target.write_bytes(whole)
             outcomes.update(found["outcomes"])
             notes += found["notes"]
             grown = max(grown, found["grown_kib"])
-    return {"outcomes": outcomes, "notes": notes, "grown_kib": grown, "file_kib": len(whole) / 1024, "total": last}
+    return {
+        "outcomes": outcomes,
+        "notes": notes,
+        "grown_kib": grown,
+        "file_kib": len(whole) / 1024,
+        "total": last,
+    }
 
 
 if __name__ == "__main__":
     import warnings
 
     warnings.simplefilter("error")
-    row, names, count, seed = sys.argv[1], sys.argv[2].split(","), int(sys.argv[3]), int(sys.argv[4])
+    row, names, count, seed = (
+        sys.argv[1],
+        sys.argv[2].split(","),
+        int(sys.argv[3]),
+        int(sys.argv[4]),
+    )
     started = {}
     for name in names:
         clock = time.monotonic()

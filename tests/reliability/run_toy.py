@@ -1,6 +1,8 @@
-"""A script for tests that need processes of their own: ``run_toy.py FOLDER JSON`` trains (and tests) the toy.
+"""A script for tests that need processes of their own: ``run_toy.py FOLDER JSON`` trains (and
+tests) the toy.
 
-JSON: changes to the toy's settings, ``{"data": {}, "model": {}, "trainer": {}, "train": {}, "test": true}``.
+JSON: changes to the toy's settings, ``{"data": {}, "model": {}, "trainer": {}, "train": {}, "test":
+true}``.
 """
 
 import json
@@ -23,7 +25,12 @@ def main(folder: str, changes: str) -> None:
         from ghpt.commands.test import test
 
         baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
-        again = {**config, "ckpt": str(Path(folder) / "last.ckpt"), "hypotheses": None, "baselines": baselines}
+        again = {
+            **config,
+            "ckpt": str(Path(folder) / "last.ckpt"),
+            "hypotheses": None,
+            "baselines": baselines,
+        }
         test(again, Path(folder))
 
 

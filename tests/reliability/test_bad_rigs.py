@@ -1,4 +1,6 @@
-"""D6: a recording that cannot give the rig, or was mixed up, is named; one that can is not slandered."""
+"""D6: a recording that cannot give the rig, or was mixed up, is named; one that can is not
+slandered.
+"""
 
 from dataclasses import replace
 
@@ -25,8 +27,14 @@ def one_frame(scene: People) -> People:
 
 
 def constant_pose(scene: People) -> People:
-    noise = torch.randn(scene.key_points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
-    return replace(scene, key_points=scene.key_points[:1] + 3 * noise, seen=scene.seen[:1].expand_as(scene.seen))
+    noise = torch.randn(
+        scene.key_points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
+    )
+    return replace(
+        scene,
+        key_points=scene.key_points[:1] + 3 * noise,
+        seen=scene.seen[:1].expand_as(scene.seen),
+    )
 
 
 def flipped(scene: People) -> torch.Tensor:
@@ -57,7 +65,11 @@ def exchanged(scene: People) -> People:
 
 
 def doubled(scene: People) -> People:
-    noise = torch.randn(scene.key_points[:, 0].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    noise = torch.randn(
+        scene.key_points[:, 0].shape,
+        dtype=torch.float64,
+        generator=torch.Generator().manual_seed(1),
+    )
     twice = scene.changed(1, scene.key_points[:, 0] + 2 * noise)
     return replace(twice, K=scene.K[[0, 0, 2, 3]])
 
@@ -67,9 +79,21 @@ CASES = {
     "unsynchronised camera": (unsynchronised, "unlinked", {"60457274"}),
     "1 frame": (one_frame, "few_frames", None),
     "constant pose": (constant_pose, "little_motion", None),
-    "mirrored image, labels not": (lambda s: s.changed(1, flipped(s)), "mirrored_key_points", {"55011271"}),
-    "mirrored image": (lambda s: s.changed(1, flipped(s)[:, SIDES]), "mirrored_image", {"55011271"}),
-    "left and right exchanged": (lambda s: s.changed(1, s.key_points[:, 1][:, SIDES]), "sides_swapped", {"55011271"}),
+    "mirrored image, labels not": (
+        lambda s: s.changed(1, flipped(s)),
+        "mirrored_key_points",
+        {"55011271"},
+    ),
+    "mirrored image": (
+        lambda s: s.changed(1, flipped(s)[:, SIDES]),
+        "mirrored_image",
+        {"55011271"},
+    ),
+    "left and right exchanged": (
+        lambda s: s.changed(1, s.key_points[:, 1][:, SIDES]),
+        "sides_swapped",
+        {"55011271"},
+    ),
     "exchanged names": (exchanged, "names_swapped", None),
     "one camera's resolution halved": (lambda s: with_K(s, [2], 2.0), "resolution", {"58860488"}),
     "one camera's resolution doubled": (lambda s: with_K(s, [2], 0.5), "resolution", {"58860488"}),
@@ -86,7 +110,9 @@ def test_d6_bad_rigs_are_named(name, record_row):
     found = [d for d in estimate.diagnoses if d.code == code]
     right = bool(found) and any(d.severity == "error" for d in found) and not estimate.succeeded
     right &= cameras is None or cameras <= {camera for d in found for camera in d.cameras}
-    record_row("D6", f"{name}: {', '.join(sorted({d.code for d in estimate.diagnoses}))}", int(right), 1)
+    record_row(
+        "D6", f"{name}: {', '.join(sorted({d.code for d in estimate.diagnoses}))}", int(right), 1
+    )
     assert right, estimate.diagnoses
     assert all(len(d.text) > 40 for d in found)
 
@@ -100,7 +126,9 @@ def test_d6_two_views_are_warned_of():
 def test_d6_good_rigs_are_not_slandered(scene, nightly, record_row):
     total, alarms = 100 if nightly else 4, []
     for seed in range(total):
-        estimate = people(scene, 40 + 20 * (seed % 3), 0.004 * (1 + seed % 4), seed).calibrate(CALIBRATE)
+        estimate = people(scene, 40 + 20 * (seed % 3), 0.004 * (1 + seed % 4), seed).calibrate(
+            CALIBRATE
+        )
         if estimate.diagnoses or not estimate.succeeded:
             alarms.append((seed, estimate.diagnoses))
     record_row("D6", f"good rigs on {scene} without an alarm", total - len(alarms), total)
@@ -112,13 +140,26 @@ def test_d6_30_percent_outliers_still_work(far, record_row):
     scene = people()
     generator = torch.Generator().manual_seed(3)
     out = torch.rand(scene.seen.shape, generator=generator) < 0.3
-    anywhere = torch.rand(scene.key_points.shape, generator=generator, dtype=torch.float64) * scene.sizes[:, None]
-    near = scene.key_points + 80 * torch.randn(anywhere.shape, generator=generator, dtype=torch.float64)
+    anywhere = (
+        torch.rand(scene.key_points.shape, generator=generator, dtype=torch.float64)
+        * scene.sizes[:, None]
+    )
+    near = scene.key_points + 80 * torch.randn(
+        anywhere.shape, generator=generator, dtype=torch.float64
+    )
     key_points = torch.where(out[..., None], anywhere if far else near, scene.key_points)
     estimate = replace(scene, key_points=key_points).calibrate(CALIBRATE)
-    turns = [torch.stack([relative(rig, 0, v)[0] for v in (1, 2, 3)]) for rig in (estimate.cameras, scene.cameras)]
+    turns = [
+        torch.stack([relative(rig, 0, v)[0] for v in (1, 2, 3)])
+        for rig in (estimate.cameras, scene.cameras)
+    ]
     worst = float(rotation_deg(*turns).max())
-    record_row("D6", f"30 % outliers: rotations within {worst:.2f} degrees", int(estimate.succeeded and worst < 0.5), 1)
+    record_row(
+        "D6",
+        f"30 % outliers: rotations within {worst:.2f} degrees",
+        int(estimate.succeeded and worst < 0.5),
+        1,
+    )
     assert estimate.succeeded
     assert worst < 0.5
     assert ((estimate.inliers > 0.6) & (estimate.inliers < 0.85)).all()
@@ -129,12 +170,17 @@ def test_d6_a_wrong_unit_of_the_scale_is_warned_of():
     lengths = torch.tensor(BodyHeight(1750.0).lengths, dtype=torch.float64)
     right = float(body_scale(estimate.points, estimate.estimated, lengths))
     found = {off: estimate.scaled(off * right).diagnoses for off in (0.001, 0.1, 0.5, 1.0)}
-    severities = {off: [d.severity for d in diagnoses if d.code == "stature"] for off, diagnoses in found.items()}
+    severities = {
+        off: [d.severity for d in diagnoses if d.code == "stature"]
+        for off, diagnoses in found.items()
+    }
     assert severities == {0.001: ["error"], 0.1: ["error"], 0.5: ["warning"], 1.0: []}
 
 
 def test_d6_no_success_with_a_wrong_scale(nightly, record_row):
-    """Short, noisy recordings of two to four views, scaled by the person: 5 % off only with a warning."""
+    """Short, noisy recordings of two to four views, scaled by the person: 5 % off only with a
+    warning.
+    """
     total, silent, off = 300 if nightly else 16, [], 0
     for seed in range(total):
         scene = people("h36m", (3, 6, 12, 40)[seed % 4], 0.01 * (1 + seed % 3), seed)
@@ -148,13 +194,23 @@ def test_d6_no_success_with_a_wrong_scale(nightly, record_row):
         true = scene.points[estimate.frames]
         one, other = torch.tensor(BONES).T
         bones = (true[:, one] - true[:, other]).norm(dim=-1).median(0).values
-        factor = float(body_scale(estimate.points, known, bones * (torch.tensor(average_lengths()) > 0)))
+        factor = float(
+            body_scale(estimate.points, known, bones * (torch.tensor(average_lengths()) > 0))
+        )
         pairs = [(a, b) for b in range(len(scene.names)) for a in range(b)]
-        lengths = [[float(relative(rig, *p)[1].norm()) for p in pairs] for rig in (estimate.cameras, scene.cameras)]
+        lengths = [
+            [float(relative(rig, *p)[1].norm()) for p in pairs]
+            for rig in (estimate.cameras, scene.cameras)
+        ]
         ratio = [factor * a / b for a, b in zip(*lengths, strict=True)]
         if max(abs(r - 1) for r in ratio) > 0.05:
             off += 1
             if estimate.succeeded and not estimate.scaled(factor).diagnoses:
                 silent.append((seed, ratio))
-    record_row("D6", f"scale off > 5 % without a warning ({off} of {total} were off)", total - len(silent), total)
+    record_row(
+        "D6",
+        f"scale off > 5 % without a warning ({off} of {total} were off)",
+        total - len(silent),
+        total,
+    )
     assert not silent

@@ -39,15 +39,47 @@ def npy_header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
 
 def archive(path: Path, name: str, packed: bytes, size: int, members: int = 1) -> None:
     """A zip whose entries all claim to be this packed member, wherever they say it is."""
-    local = struct.pack("<4s5H3I2H", b"PK\x03\x04", 20, 0, 8, 0, 33, 0, len(packed), size, len(name), 0) + name.encode()
+    local = (
+        struct.pack("<4s5H3I2H", b"PK\x03\x04", 20, 0, 8, 0, 33, 0, len(packed), size, len(name), 0)
+        + name.encode()
+    )
     names = [name, *(f"{name[:-4]}{i}.npy" for i in range(1, members))]
     listed = b"".join(
-        struct.pack("<4s6H3I5H2I", b"PK\x01\x02", 20, 20, 0, 8, 0, 33, 0, len(packed), size, len(n), 0, 0, 0, 0, 0, 0)
+        struct.pack(
+            "<4s6H3I5H2I",
+            b"PK\x01\x02",
+            20,
+            20,
+            0,
+            8,
+            0,
+            33,
+            0,
+            len(packed),
+            size,
+            len(n),
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+        )
         + n.encode()
         for n in names
     )
     start = len(local) + len(packed)
-    end = struct.pack("<4s4H2IH", b"PK\x05\x06", 0, 0, min(members, 65535), min(members, 65535), len(listed), start, 0)
+    end = struct.pack(
+        "<4s4H2IH",
+        b"PK\x05\x06",
+        0,
+        0,
+        min(members, 65535),
+        min(members, 65535),
+        len(listed),
+        start,
+        0,
+    )
     path.write_bytes(local + packed + listed + end)
 
 
@@ -85,7 +117,10 @@ def npz_overlapping(path: Path) -> None:
 def yaml_laughs(path: Path) -> None:
     lines = ["%YAML:1.0", "---", "a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]" for i in range(1, 10)]
-    path.write_text("\n".join([*lines, "names: *a9", "K_x: {rows: 3, cols: 3, data: *a9}"]) + "\n", encoding="utf-8")
+    path.write_text(
+        "\n".join([*lines, "names: *a9", "K_x: {rows: 3, cols: 3, data: *a9}"]) + "\n",
+        encoding="utf-8",
+    )
 
 
 def sparse(path: Path, start: bytes, size: int, end: bytes = b"") -> None:
@@ -139,7 +174,9 @@ def colmap_of_many_images(path: Path) -> None:
 def labels_1e9(path: Path) -> None:
     descr = "[" + ", ".join(f"('x{i}', '<f4', (1000000000,))" for i in range(2)) + "]"
     text = f"{{'descr': {descr}, 'fortran_order': False, 'shape': (), }}"
-    path.write_bytes(b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) + 1) + text.encode() + b"\n" + bytes(100))
+    path.write_bytes(
+        b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) + 1) + text.encode() + b"\n" + bytes(100)
+    )
 
 
 def written(text: str | bytes) -> Callable[[Path], None]:
@@ -156,63 +193,137 @@ BOMBS: dict[str, Bomb] = {
     "npz of 1e5 members": ("p.npz", npz_1e5_members, read_people),
     "npz of overlapping members": ("p.npz", npz_overlapping, read_people),
     "npy with a header of 4 GiB": (
-        "all_2d_preds.npy", written(b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b" " * 100), read_people,
+        "all_2d_preds.npy",
+        written(b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b" " * 100),
+        read_people,
     ),
-    "npy of 1e12 elements": ("all_2d_preds.npy", written(npy_header((10**12, 4, 17, 2), "<f4")), read_people),
+    "npy of 1e12 elements": (
+        "all_2d_preds.npy",
+        written(npy_header((10**12, 4, 17, 2), "<f4")),
+        read_people,
+    ),
     "COCO of depth 2e5": ("a.json", written(OF_COCO + DEEP), read_people),
     "COCO with an integer of 2e6 digits": ("a.json", written(OF_COCO + LONG + "]}]"), read_people),
-    "COCO with a frame number of 4,000 digits": ("a.json", written('[{"image_id": ' + LONG[:4000] + "}]"), read_people),
+    "COCO with a frame number of 4,000 digits": (
+        "a.json",
+        written('[{"image_id": ' + LONG[:4000] + "}]"),
+        read_people,
+    ),
     "MMPose of depth 2e5": ("a.json", written('{"instance_info": ' + DEEP), read_people),
-    "JSON of 1 GB in a line": ("a.json", lambda path: sparse(path, b'[{"image_id": 1, "x": "', 1 << 30), read_people),
-    "CSV of 1 GB in a line": ("xy.csv", lambda path: sparse(path, CALISCOPE, 1 << 30, b"\n"), read_people),
+    "JSON of 1 GB in a line": (
+        "a.json",
+        lambda path: sparse(path, b'[{"image_id": 1, "x": "', 1 << 30),
+        read_people,
+    ),
+    "CSV of 1 GB in a line": (
+        "xy.csv",
+        lambda path: sparse(path, CALISCOPE, 1 << 30, b"\n"),
+        read_people,
+    ),
     "cameras JSON of depth 2e5": ("c.json", written('{"cameras": ' + DEEP), read_cameras),
-    "cameras JSON with an integer of 2e6 digits": ("c.json", written('{"cameras": ' + LONG + "}"), read_cameras),
-    "cameras JSON of 1 GB": ("c.json", lambda path: sparse(path, b'{"cameras": "', 1 << 30), read_cameras),
+    "cameras JSON with an integer of 2e6 digits": (
+        "c.json",
+        written('{"cameras": ' + LONG + "}"),
+        read_cameras,
+    ),
+    "cameras JSON of 1 GB": (
+        "c.json",
+        lambda path: sparse(path, b'{"cameras": "', 1 << 30),
+        read_cameras,
+    ),
     "YAML that laughs": ("intri.yml", yaml_laughs, read_cameras),
-    "YAML of depth 5e3": ("intri.yml", written("%YAML:1.0\nnames: " + "[" * 5000 + "]" * 5000 + "\n"), read_cameras),
+    "YAML of depth 5e3": (
+        "intri.yml",
+        written("%YAML:1.0\nnames: " + "[" * 5000 + "]" * 5000 + "\n"),
+        read_cameras,
+    ),
     "YAML of 1 GB": ("intri.yml", lambda path: sparse(path, b"%YAML:1.0\n", 1 << 30), read_cameras),
     "TOML of depth 5e3": ("c.toml", written("a = " + "[" * 5000 + "]" * 5000), read_cameras),
     "TOML with a key of 1e5 parts": ("c.toml", written("a." * 100_000 + "a = 1"), read_cameras),
     "TOML with an integer of 2e6 digits": ("c.toml", written(f"a = {LONG}"), read_cameras),
     "TOML of 1 GB": ("c.toml", lambda path: sparse(path, b"a = 1\n", 1 << 30), read_cameras),
-    "OpenPose of 200,000 people": ("o", openpose('{"pose_keypoints_2d": [1, 2, 1]}', 200_000), read_people),
+    "OpenPose of 200,000 people": (
+        "o",
+        openpose('{"pose_keypoints_2d": [1, 2, 1]}', 200_000),
+        read_people,
+    ),
     "OpenPose of as many people as a file may hold": ("o", openpose("{}", 24_000), read_people),
     "COCO of 20 million lists": ("a.json", repeated("[", "[],", 20_000_000, "[]]"), read_people),
     "COCO of 20 million objects": ("a.json", repeated("[", "{},", 20_000_000, "{}]"), read_people),
-    "COCO of 30 million numbers": ("a.json", repeated(OF_COCO, "0,", 30_000_000, "0]}]"), read_people),
+    "COCO of 30 million numbers": (
+        "a.json",
+        repeated(OF_COCO, "0,", 30_000_000, "0]}]"),
+        read_people,
+    ),
     "MMPose of 700,000 people": (
-        "a.json", repeated('{"instance_info": [{"frame_id": 1, "instances": [',
-                           '{"keypoints": [[1, 2]], "keypoint_scores": [1]},', 700_000, "{}]}]}"), read_people,
+        "a.json",
+        repeated(
+            '{"instance_info": [{"frame_id": 1, "instances": [',
+            '{"keypoints": [[1, 2]], "keypoint_scores": [1]},',
+            700_000,
+            "{}]}]}",
+        ),
+        read_people,
     ),
     "Panoptic of 200,000 cameras": (
-        "c.json", repeated('{"cameras": [', f'{{"name": "a", "K": {MATRIX}, "distCoef": [0, 0, 0, 0, 0]}},', 200_000,
-                           "{}]}"), read_cameras,
+        "c.json",
+        repeated(
+            '{"cameras": [',
+            f'{{"name": "a", "K": {MATRIX}, "distCoef": [0, 0, 0, 0, 0]}},',
+            200_000,
+            "{}]}",
+        ),
+        read_cameras,
     ),
     "Panoptic of as many lists as a file may hold": (
-        "c.json", repeated('{"cameras": [', "[],", 90_000, "[]]}"), read_cameras,
+        "c.json",
+        repeated('{"cameras": [', "[],", 90_000, "[]]}"),
+        read_cameras,
     ),
     "TOML of 8,000 cameras": (
-        "c.toml", numbered("", f"[c{{0}}]\nmatrix = {MATRIX}\ndistortions = [0, 0, 0, 0]\n", 8000), read_cameras,
+        "c.toml",
+        numbered("", f"[c{{0}}]\nmatrix = {MATRIX}\ndistortions = [0, 0, 0, 0]\n", 8000),
+        read_cameras,
     ),
-    "TOML of as many tables as a file may hold": ("c.toml", numbered("", "[c{0}]\n", 9_900), read_cameras),
+    "TOML of as many tables as a file may hold": (
+        "c.toml",
+        numbered("", "[c{0}]\n", 9_900),
+        read_cameras,
+    ),
     "YAML of 80,000 names": (
-        "intri.yml", repeated("%YAML:1.0\n---\nnames: [", "a, ", 80_000, "a]\n"), read_cameras,
+        "intri.yml",
+        repeated("%YAML:1.0\n---\nnames: [", "a, ", 80_000, "a]\n"),
+        read_cameras,
     ),
     "YAML of 3,500 matrices": (
-        "intri.yml", numbered("%YAML:1.0\n---\n", "K_{0}: {{rows: 3, cols: 3, dt: d, data: [1,0,0,0,1,0,0,0,1]}}\n",
-                              3500), read_cameras,
+        "intri.yml",
+        numbered(
+            "%YAML:1.0\n---\n",
+            "K_{0}: {{rows: 3, cols: 3, dt: d, data: [1,0,0,0,1,0,0,0,1]}}\n",
+            3500,
+        ),
+        read_cameras,
     ),
     "YAML of depth 2e5 by indentation": (
-        "intri.yml", repeated("%YAML:1.0\n---\nnames:\n  ", "- ", 200_000, "a\n"), read_cameras,
+        "intri.yml",
+        repeated("%YAML:1.0\n---\nnames:\n  ", "- ", 200_000, "a\n"),
+        read_cameras,
     ),
     "npz of 1e5 views": ("p.npz", many_views, read_people),
     "npz of 1e5 views, in parts": ("p.npz", many_views, lambda path: open_stored(path, None, None)),
     "authors' npy of 1e5 views": ("o", authors_of_many_views, read_people),
-    "COLMAP of 3e5 images": ("o", colmap_of_many_images, lambda path: read_cameras(path, unit_mm=1)),
+    "COLMAP of 3e5 images": (
+        "o",
+        colmap_of_many_images,
+        lambda path: read_cameras(path, unit_mm=1),
+    ),
     "labels with a dtype of 1e9 elements": ("labels.npy", labels_1e9, read_labels),
-    "labels that declare 1e12 elements": ("labels.npy", written(npy_header((10**12,), "|O") + b"\x80\x04N."),
-                                          read_labels),
-}  # fmt: skip
+    "labels that declare 1e12 elements": (
+        "labels.npy",
+        written(npy_header((10**12,), "|O") + b"\x80\x04N."),
+        read_labels,
+    ),
+}
 
 
 def tried(path: Path, read: Callable[[Path], Any]) -> dict[str, Any]:
@@ -237,7 +348,9 @@ def main(folder: Path) -> dict[str, Any]:
         write(path)
         # the better of two: what else the machine does is not the reader's doing
         runs = [forked(lambda path=path, read=read: tried(path, read), 20) for _ in range(2)]
-        found[name] = min(runs, key=lambda run: run["notes"][0] if len(run["notes"]) == 2 else np.inf)
+        found[name] = min(
+            runs, key=lambda run: run["notes"][0] if len(run["notes"]) == 2 else np.inf
+        )
         shutil.rmtree(path.parent)
     return found
 
@@ -248,11 +361,21 @@ def test_bombs_are_refused(tmp_path, record_row):
     assert done.returncode == 0, done.stderr[-2000:]
     found = json.loads(done.stdout)
     bad = {
-        name: run for name, run in found.items()
-        if run["outcomes"] != {"named": 1} or run["notes"][0] > SECONDS or run["notes"][1] > MEBIBYTES
-    }  # fmt: skip
-    slowest, largest = (max(run["notes"][i] for run in found.values() if len(run["notes"]) == 2) for i in (0, 1))
-    record_row("A4", f"bombs refused, at most {slowest:.2f} s and {largest:.0f} MiB", len(found) - len(bad), len(found))
+        name: run
+        for name, run in found.items()
+        if run["outcomes"] != {"named": 1}
+        or run["notes"][0] > SECONDS
+        or run["notes"][1] > MEBIBYTES
+    }
+    slowest, largest = (
+        max(run["notes"][i] for run in found.values() if len(run["notes"]) == 2) for i in (0, 1)
+    )
+    record_row(
+        "A4",
+        f"bombs refused, at most {slowest:.2f} s and {largest:.0f} MiB",
+        len(found) - len(bad),
+        len(found),
+    )
     assert len(found) == len(BOMBS)
     assert not bad
 

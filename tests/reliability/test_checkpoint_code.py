@@ -25,8 +25,15 @@ from ghpt.models.checkpoint import FIELD, load_model
 from signing import checkpoint_around, save_pickle, save_signed, signed, text
 
 WATCHED = (
-    "os.", "subprocess.", "socket.", "shutil.", "ctypes.", "signal.", "tempfile.", "code.__new__",
-)  # fmt: skip
+    "os.",
+    "subprocess.",
+    "socket.",
+    "shutil.",
+    "ctypes.",
+    "signal.",
+    "tempfile.",
+    "code.__new__",
+)
 HARMLESS = ("os.listdir", "os.scandir", "os.walk", "os.fwalk", "os.getxattr", "os.listxattr")
 attempts: list[str] = []
 watching = False
@@ -35,7 +42,12 @@ watching = False
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if watching and event.startswith(WATCHED) and not event.startswith(HARMLESS):
         attempts.append(f"{event} {arguments[:2]!r:.200}")
-    if watching and event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax+"):
+    if (
+        watching
+        and event == "open"
+        and isinstance(arguments[1], str)
+        and set(arguments[1]) & set("wax+")
+    ):
         attempts.append(f"open {arguments[:2]!r:.200}")
 
 
@@ -100,13 +112,20 @@ def lay_out(folder: Path) -> None:
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    return {str(path): path.read_bytes() if path.is_file() else b"" for path in sorted(folder.rglob("*"))}
+    return {
+        str(path): path.read_bytes() if path.is_file() else b""
+        for path in sorted(folder.rglob("*"))
+    }
 
 
 def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
     """Name -> what stands in place of the model's problem."""
     touch = ["touch", str(victim / "ran")]
-    order = b'{"_target_": "subprocess.call", "args": ["touch", "' + str(victim / "ran").encode() + b'"]}'
+    order = (
+        b'{"_target_": "subprocess.call", "args": ["touch", "'
+        + str(victim / "ran").encode()
+        + b'"]}'
+    )
     evil = {"_target_": "evil_module.Evil"}
     folder = str(victim)
     listed: dict[str, dict[str, Any]] = {
@@ -126,7 +145,9 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.files.os.getcwd": {},
         "ghpt.provenance.subprocess.call": {"args": touch},
         "ghpt.config.importlib.import_module": {"name": "evil_module"},
-        "ghpt.config.functools.partial": {"func": {"_target_": "ghpt.config.suggest", "_partial_": True}},
+        "ghpt.config.functools.partial": {
+            "func": {"_target_": "ghpt.config.suggest", "_partial_": True}
+        },
         "torch.optim.adam.torch.load": {"f": str(ckpt)},
         "ghpt.models.registry.sys.exit": {},
         # ours, which read
@@ -145,14 +166,26 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.models.pose.evaluation.write_metrics": {"path": f"{folder}/keep.txt", "metrics": {}},
         "ghpt.report.tables.write_report": {"path": f"{folder}/keep.txt", "metrics": {}},
         "ghpt.report.tensorboard.write_parts": {"folder": f"{folder}/events", "parts": {}},
-        "ghpt.models.pose.predictions.PredictionWriter": {"folder": folder, "count": 1, "names": ["weight"]},
-        "ghpt.data.datasets.store.write_store": {"folder": f"{folder}/store", "recordings": [], "provenance": {}},
+        "ghpt.models.pose.predictions.PredictionWriter": {
+            "folder": folder,
+            "count": 1,
+            "names": ["weight"],
+        },
+        "ghpt.data.datasets.store.write_store": {
+            "folder": f"{folder}/store",
+            "recordings": [],
+            "provenance": {},
+        },
         # ours, which build, start or change something
-        "ghpt.config.build": {"config": {"_target_": "ghpt.commands.prediction.shards._parsed", "line": order}},
+        "ghpt.config.build": {
+            "config": {"_target_": "ghpt.commands.prediction.shards._parsed", "line": order}
+        },
         "ghpt.config._is_module": {"name": "evil_module"},
         "ghpt.models.registry.check_trust": {"trust": ["mine"]},
         "ghpt.models.registry.register": {"part": "model.problem"},
-        "ghpt.models.registry.Part": {"kind": {"_target_": "ghpt.config.suggest", "_partial_": True}},
+        "ghpt.models.registry.Part": {
+            "kind": {"_target_": "ghpt.config.suggest", "_partial_": True}
+        },
         "ghpt.provenance.commit": {},
         "ghpt.provenance.provenance": {"seed": 0},
         "ghpt.commands.app._quieten": {},
@@ -162,7 +195,11 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.commands.train.train": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
         "ghpt.commands.test.test": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
         "ghpt.paper.engine.cells.read_json": {"path": {"_target_": "ghpt.files.Path"}},
-        "ghpt.paper.engine.setup.compose": {"conf": {"_target_": "ghpt.files.Path"}, "name": "x", "overrides": []},
+        "ghpt.paper.engine.setup.compose": {
+            "conf": {"_target_": "ghpt.files.Path"},
+            "name": "x",
+            "overrides": [],
+        },
         # our classes, and torch's, that no checkpoint has a use for
         "ghpt.models.checkpoint.AtomicCheckpointIO": {},
         "ghpt.models.callbacks.Progress": {},
@@ -174,14 +211,19 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "torch.nn.Identity": {},
         "torch.nn.modules.module.Module": {},
         "torch.optim.Optimizer": {"params": [], "defaults": {}},
-    }  # fmt: skip
-    found = {f"_target_ {name}": {"_target_": name, **arguments} for name, arguments in listed.items()}
+    }
+    found = {
+        f"_target_ {name}": {"_target_": name, **arguments} for name, arguments in listed.items()
+    }
     good = toys.MODEL["problem"]
     found |= {
         "evil as an argument": good | {"coordinates": evil},
         "evil in a list of an argument": good | {"lengths": [evil]},
         "evil in a group of an argument": good | {"lengths": {"a": {"b": evil}}},
-        "evil for another part's class": {"_target_": "ghpt.models.loss.StochasticLoss", "alpha": evil},
+        "evil for another part's class": {
+            "_target_": "ghpt.models.loss.StochasticLoss",
+            "alpha": evil,
+        },
         "evil, partial": evil | {"_partial_": True},
     }
     return found
@@ -226,7 +268,9 @@ def test_every_payload_would_be_called_if_any_target_could_be_named(
 
     monkeypatch.setattr(ghpt.config, "check_arguments", passed)
     monkeypatch.setattr(ghpt.models.checkpoint, "check_plain", lambda *_: None)
-    monkeypatch.setattr(ghpt.models.checkpoint, "build_registered", lambda config, trust=(): build(config, "model"))
+    monkeypatch.setattr(
+        ghpt.models.checkpoint, "build_registered", lambda config, trust=(): build(config, "model")
+    )
     path = tmp_path / "evil.ckpt"
     reached, changed, cases = [], [], targets(victim, trained)
     for name, problem in cases.items():
@@ -248,7 +292,9 @@ def test_every_payload_would_be_called_if_any_target_could_be_named(
 
 
 def pickles(trained: Path, sentinel: Path) -> dict[str, Callable[[Path], Any]]:
-    """Name -> function that writes a checkpoint that would run a command when unpickled by a reader that lets it."""
+    """Name -> function that writes a checkpoint that would run a command when unpickled by a reader
+    that lets it.
+    """
     command = f"touch {sentinel}"
     evil = Call(os.system, command)
 
@@ -273,7 +319,9 @@ def pickles(trained: Path, sentinel: Path) -> dict[str, Callable[[Path], Any]]:
     found |= {
         "zip": saved({"state_dict": {}, FIELD: evil}),
         "legacy tar": saved({"state_dict": {}, FIELD: evil}, _use_new_zipfile_serialization=False),
-        "eval": saved({"state_dict": {"x": Call(eval, f"__import__('os').system('{command}')")}, FIELD: {}}),
+        "eval": saved(
+            {"state_dict": {"x": Call(eval, f"__import__('os').system('{command}')")}, FIELD: {}}
+        ),
         "nested": saved({"state_dict": {"a": [{"b": (evil,)}]}, FIELD: {}}),
         "hyper_parameters": saved({"state_dict": {}, FIELD: {}, "hyper_parameters": evil}),
         "data.pkl swapped": swapped_pickle,
@@ -283,7 +331,9 @@ def pickles(trained: Path, sentinel: Path) -> dict[str, Callable[[Path], Any]]:
     return found
 
 
-@pytest.mark.filterwarnings("ignore:.torch.jit")  # deprecated, first as one category, then as another
+@pytest.mark.filterwarnings(
+    "ignore:.torch.jit"
+)  # deprecated, first as one category, then as another
 def test_a5_no_pickle_runs(tmp_path: Path, trained: Path, record_row: Callable[..., None]) -> None:
     """They are signed: whoever can write a checkpoint can sign it."""
     sentinel, path = tmp_path / "sentinel", tmp_path / "evil.ckpt"
@@ -308,7 +358,9 @@ SHAPES = {
     "target is empty": {"problem": {"_target_": ""}},
     "target of dots": {"problem": {"_target_": "..."}},
     "target is a module": {"problem": {"_target_": "ghpt.files"}},
-    "target with a newline": {"problem": {"_target_": "ghpt.models.pose.problem.PoseTriangulation\n"}},
+    "target with a newline": {
+        "problem": {"_target_": "ghpt.models.pose.problem.PoseTriangulation\n"}
+    },
     "target with a space": {"problem": {"_target_": " ghpt.models.pose.problem.PoseTriangulation"}},
     "target relative": {"problem": {"_target_": ".pose.PoseTriangulation"}},
     "registered for another part": {"problem": toys.MODEL["loss"]},
@@ -339,7 +391,9 @@ SHAPES = {
 
 
 @pytest.mark.parametrize("shape", SHAPES)
-def test_a_configuration_of_another_shape_is_refused(tmp_path: Path, trained: Path, shape: str) -> None:
+def test_a_configuration_of_another_shape_is_refused(
+    tmp_path: Path, trained: Path, shape: str
+) -> None:
     path = tmp_path / "evil.ckpt"
     save_with(trained, path, **SHAPES[shape])
     with pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: ") as caught:
@@ -352,12 +406,17 @@ def test_a_configuration_of_another_shape_is_refused(tmp_path: Path, trained: Pa
     ("shape", "reason"),
     [
         ("a class under a name of nobody", r"model\.another: is no place for a class"),
-        ("registered for another part", r"model\.problem\._target_: .* is no class that a checkpoint may name here"),
+        (
+            "registered for another part",
+            r"model\.problem\._target_: .* is no class that a checkpoint may name here",
+        ),
         ("not partial", r"model\.scorer\._partial_: is not True"),
         ("partial", r"model\.problem\._partial_: is not False"),
     ],
 )
-def test_a_class_stands_only_in_its_place(tmp_path: Path, trained: Path, shape: str, reason: str) -> None:
+def test_a_class_stands_only_in_its_place(
+    tmp_path: Path, trained: Path, shape: str, reason: str
+) -> None:
     path = tmp_path / "evil.ckpt"
     save_with(trained, path, **SHAPES[shape])
     with pytest.raises(GhptCheckpointError, match=reason):

@@ -1,4 +1,6 @@
-"""A2, A3 and B6: a damaged checkpoint is seen before it is read, and the one before it is there to go on from."""
+"""A2, A3 and B6: a damaged checkpoint is seen before it is read, and the one before it is there to
+go on from.
+"""
 
 import copy
 import importlib
@@ -76,7 +78,9 @@ def stop_after(patch: pytest.MonkeyPatch, step: int) -> None:
     """Have the next training end at once when it has saved this step."""
     save = AtomicCheckpointIO.save_checkpoint
 
-    def saved(self: Any, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+    def saved(
+        self: Any, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
         save(self, checkpoint, path, storage_options)
         if checkpoint["global_step"] == step:
             raise Stopped
@@ -101,10 +105,17 @@ def test_a2_no_flipped_bit_is_read(
     refused = 0
     for bit in bits:
         path.write_bytes(flipped(whole, bit))
-        with pytest.raises(GhptCheckpointError, match=r"last\.ckpt: (cannot be read|has no digest)"):
+        with pytest.raises(
+            GhptCheckpointError, match=r"last\.ckpt: (cannot be read|has no digest)"
+        ):
             read_checkpoint(path)
         refused += 1
-    record_row("A2", f"{len(bits)} flipped bits of a checkpoint: {len(bits) - refused} read", refused, len(bits))
+    record_row(
+        "A2",
+        f"{len(bits)} flipped bits of a checkpoint: {len(bits) - refused} read",
+        refused,
+        len(bits),
+    )
 
 
 def test_a3_no_part_of_a_checkpoint_is_read(
@@ -112,22 +123,33 @@ def test_a3_no_part_of_a_checkpoint_is_read(
 ) -> None:
     whole, other = (trained / LAST).read_bytes(), (trained / PREVIOUS).read_bytes()
     path, half = tmp_path / LAST, len(whole) // 2
-    spoilt = [whole[:size] for size in (*range(0, len(whole), 211), *range(len(whole) - 300, len(whole)))]
+    spoilt = [
+        whole[:size] for size in (*range(0, len(whole), 211), *range(len(whole) - 300, len(whole)))
+    ]
     spoilt += [whole + b"\0", whole + whole, whole[1:], whole[half:] + whole[:half]]
-    spoilt += [whole[:size] + other[size:] for size in (half, len(whole) // 3, len(whole) - 76, len(whole) - 200)]
+    spoilt += [
+        whole[:size] + other[size:]
+        for size in (half, len(whole) // 3, len(whole) - 76, len(whole) - 200)
+    ]
     monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("it was unpickled"))
     for data in spoilt:
         path.write_bytes(data)
-        with pytest.raises(GhptCheckpointError, match=r"last\.ckpt: (cannot be read|has no digest)"):
+        with pytest.raises(
+            GhptCheckpointError, match=r"last\.ckpt: (cannot be read|has no digest)"
+        ):
             read_checkpoint(path)
-    record_row("A3", f"{len(spoilt)} cut or joined checkpoints: none read", len(spoilt), len(spoilt))
+    record_row(
+        "A3", f"{len(spoilt)} cut or joined checkpoints: none read", len(spoilt), len(spoilt)
+    )
 
 
 def test_torch_and_zip_read_a_checkpoint_too(trained: Path) -> None:
     plain = torch.load(trained / LAST, weights_only=True)
     ours = read_checkpoint(trained / LAST)
     assert plain.keys() == ours.keys()
-    assert all(torch.equal(plain["state_dict"][name], value) for name, value in ours["state_dict"].items())
+    assert all(
+        torch.equal(plain["state_dict"][name], value) for name, value in ours["state_dict"].items()
+    )
     with zipfile.ZipFile(trained / LAST) as archive:
         assert archive.testzip() is None
         assert re.fullmatch(rb"ghpt sha256 [0-9a-f]{64}", archive.comment)
@@ -135,11 +157,15 @@ def test_torch_and_zip_read_a_checkpoint_too(trained: Path) -> None:
 
 def test_a_checkpoint_of_the_first_version_says_how_to_go_on(tmp_path: Path, trained: Path) -> None:
     torch.save(torch.load(trained / LAST, weights_only=True), tmp_path / LAST)
-    with pytest.raises(GhptCheckpointError, match=r"format version 1.*Train again, or use it with ghpt 0\.1\."):
+    with pytest.raises(
+        GhptCheckpointError, match=r"format version 1.*Train again, or use it with ghpt 0\.1\."
+    ):
         load_model(tmp_path / LAST)
 
 
-def test_a_save_is_read_back_before_it_replaces(tmp_path: Path, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_save_is_read_back_before_it_replaces(
+    tmp_path: Path, trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The disk gives back something else than was written."""
     path = tmp_path / LAST
     shutil.copy(trained / LAST, path)
@@ -155,7 +181,9 @@ def test_a_save_is_read_back_before_it_replaces(tmp_path: Path, trained: Path, m
         pytest.skip("needs Linux to write behind the writer's back")
     monkeypatch.setattr(files.os, "fsync", spoiling)
     with pytest.raises(GhptCheckpointError, match="cannot be read"):
-        AtomicCheckpointIO().save_checkpoint(read_checkpoint(path), path, {"previous": tmp_path / PREVIOUS})
+        AtomicCheckpointIO().save_checkpoint(
+            read_checkpoint(path), path, {"previous": tmp_path / PREVIOUS}
+        )
     assert path.read_bytes() == before
     assert os.listdir(tmp_path) == [LAST]
 
@@ -172,7 +200,12 @@ def test_at_every_instant_of_a_save_there_are_two_good_checkpoints(
         AtomicCheckpointIO().save_checkpoint(checkpoint | {"global_step": step}, path, options)
 
     def look() -> None:
-        found.append((read_checkpoint(path)["global_step"], read_checkpoint(options["previous"])["global_step"]))
+        found.append(
+            (
+                read_checkpoint(path)["global_step"],
+                read_checkpoint(options["previous"])["global_step"],
+            )
+        )
 
     def watched(change: Callable[..., None]) -> Callable[..., None]:
         def changed(*names: Any) -> None:
@@ -209,7 +242,9 @@ def test_without_hard_links_the_previous_one_is_a_copy(
 
 def mutated(whole: bytes, chance: random.Random) -> bytes | None:
     """A checkpoint as disks and people spoil it; None is one that is gone."""
-    kind = chance.choice(("bit", "cut", "zeros", "empty", "text", "foreign", "no state", "version", "gone"))
+    kind = chance.choice(
+        ("bit", "cut", "zeros", "empty", "text", "foreign", "no state", "version", "gone")
+    )
     place = chance.randrange(len(whole))
     if kind == "bit":
         return flipped(whole, 8 * place)
@@ -227,7 +262,9 @@ def mutated(whole: bytes, chance: random.Random) -> bytes | None:
     if kind == "foreign":
         checkpoint = {"state_dict": checkpoint["state_dict"], "pytorch-lightning_version": "2.5.0"}
     elif kind == "no state":
-        del checkpoint[chance.choice(("optimizer_states", "loops", "epoch", "global_step", "state_dict"))]
+        del checkpoint[
+            chance.choice(("optimizer_states", "loops", "epoch", "global_step", "state_dict"))
+        ]
     else:
         checkpoint[FIELD]["format_version"] = chance.choice((1, 3, "2", 2.5, None, True))
     content = io.BytesIO()
@@ -235,7 +272,9 @@ def mutated(whole: bytes, chance: random.Random) -> bytes | None:
     return signed(content.getvalue())
 
 
-def test_b6_the_previous_checkpoint_is_gone_on_from(stopped: Path, record_row: Callable[..., None]) -> None:
+def test_b6_the_previous_checkpoint_is_gone_on_from(
+    stopped: Path, record_row: Callable[..., None]
+) -> None:
     config, model = settings(resume=True), build(toys.MODEL, "model")
     path, chance, passed = stopped / LAST, random.Random(0), 0
     whole = path.read_bytes()
@@ -247,9 +286,13 @@ def test_b6_the_previous_checkpoint_is_gone_on_from(stopped: Path, record_row: C
             path.write_bytes(data)
         start, said = resumable(stopped, config, model)
         assert start.name == PREVIOUS
-        assert re.search(r"last\.ckpt: .+\. Going on from previous\.ckpt, which holds training step 6\.$", said), said
+        assert re.search(
+            r"last\.ckpt: .+\. Going on from previous\.ckpt, which holds training step 6\.$", said
+        ), said
         passed += 1
-    record_row("B6", "100 damaged last checkpoints: each refused, the previous one taken", passed, 100)
+    record_row(
+        "B6", "100 damaged last checkpoints: each refused, the previous one taken", passed, 100
+    )
 
 
 @pytest.mark.parametrize("damage", ["bit", "empty", "gone"])
@@ -268,7 +311,10 @@ def test_b6_a_run_with_a_damaged_checkpoint_ends_with_the_same_numbers(
     assert said[0].endswith("Going on from previous.ckpt, which holds training step 6.")
     expected, found = read_checkpoint(trained / LAST), read_checkpoint(path)
     assert found["global_step"] == expected["global_step"] == 10
-    assert all(torch.equal(found["state_dict"][name], value) for name, value in expected["state_dict"].items())
+    assert all(
+        torch.equal(found["state_dict"][name], value)
+        for name, value in expected["state_dict"].items()
+    )
 
 
 def test_b6_a_damaged_checkpoint_does_not_become_the_previous_one(
@@ -285,7 +331,10 @@ def test_b6_without_a_good_one_there_is_no_silent_start(stopped: Path) -> None:
     for name in (LAST, PREVIOUS):
         (stopped / name).write_bytes(b"damaged")
     before = {path: path.read_bytes() for path in stopped.iterdir()}
-    with pytest.raises(GhptCheckpointError, match=r"last\.ckpt: cannot.*; previous\.ckpt: cannot.*without resume=true"):
+    with pytest.raises(
+        GhptCheckpointError,
+        match=r"last\.ckpt: cannot.*; previous\.ckpt: cannot.*without resume=true",
+    ):
         train(settings(resume=True), stopped)
     assert {path: path.read_bytes() for path in stopped.iterdir()} == before
 
@@ -294,7 +343,9 @@ def test_b6_the_previous_one_is_of_the_same_settings_too(stopped: Path) -> None:
     (stopped / LAST).unlink()
     config = settings(resume=True)
     config["model"]["temperature"] = 2.0
-    with pytest.raises(GhptCheckpointError, match=r"previous\.ckpt: was made with other settings of 'model'"):
+    with pytest.raises(
+        GhptCheckpointError, match=r"previous\.ckpt: was made with other settings of 'model'"
+    ):
         train(config, stopped)
 
 
@@ -371,12 +422,16 @@ BAD: dict[str, Bad] = {
     "a number": saved(3),
     "null": saved(None),
     "weights alone": saved({"x": torch.zeros(3)}),
-    "of another Lightning module": saved({"state_dict": {"x": torch.zeros(3)}, "epoch": 1, "global_step": 5}),
+    "of another Lightning module": saved(
+        {"state_dict": {"x": torch.zeros(3)}, "epoch": 1, "global_step": 5}
+    ),
     "no state_dict": changed(lambda c: c.pop("state_dict")),
     "no ghpt": changed(lambda c: c.pop(FIELD)),
     "ghpt is a list": changed(lambda c: c.update({FIELD: [1]})),
     "state_dict is a list": changed(lambda c: c.update(state_dict=[torch.zeros(1)])),
-    "state_dict of text": changed(lambda c: c.update(state_dict=dict.fromkeys(c["state_dict"], "x"))),
+    "state_dict of text": changed(
+        lambda c: c.update(state_dict=dict.fromkeys(c["state_dict"], "x"))
+    ),
     "state_dict by number": changed(lambda c: c.update(state_dict={1: torch.zeros(1)})),
     "a weight too few": changed(lambda c: c["state_dict"].popitem()),
     "a weight too many": changed(lambda c: c["state_dict"].update(more=torch.zeros(1))),
@@ -431,12 +486,16 @@ def test_a_checkpoint_that_may_not_be_read_is_refused(
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr(module_of_checkpoints, "open", refused, raising=False)
-    with pytest.raises(GhptCheckpointError, match=r"last\.ckpt: cannot be read \(.*Permission denied\)"):
+    with pytest.raises(
+        GhptCheckpointError, match=r"last\.ckpt: cannot be read \(.*Permission denied\)"
+    ):
         load_model(trained / LAST)
 
 
 @pytest.mark.parametrize("path", ["a\0b", "x" * 5000, "last.ckpt/below"])
-def test_a_path_that_cannot_be_is_refused(path: str, trained: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_path_that_cannot_be_is_refused(
+    path: str, trained: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(trained)
     with pytest.raises(GhptCheckpointError):
         load_model(path)
@@ -445,7 +504,11 @@ def test_a_path_that_cannot_be_is_refused(path: str, trained: Path, monkeypatch:
 @pytest.mark.parametrize("command", ["test", "predict"])
 @pytest.mark.parametrize("name", ["a list", "config is text", "a weight that is NaN"])
 def test_a_command_ends_in_one_line(
-    tmp_path: Path, trained: Path, typed: Callable[..., tuple[int, str, str]], command: str, name: str
+    tmp_path: Path,
+    trained: Path,
+    typed: Callable[..., tuple[int, str, str]],
+    command: str,
+    name: str,
 ) -> None:
     path = tmp_path / "bad.ckpt"
     BAD[name](path, (trained / LAST).read_bytes())

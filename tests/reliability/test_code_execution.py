@@ -1,7 +1,7 @@
 """A5: nothing that a data file holds is ever run.
 
-Each payload creates a sentinel file if it runs, in whatever way; an audit hook notes every attempt to reach the
-system while the file is read.
+Each payload creates a sentinel file if it runs, in whatever way; an audit hook notes every attempt
+to reach the system while the file is read.
 """
 
 import codecs
@@ -23,8 +23,21 @@ from ghpt.data.datasets.labels import read_labels
 from ghpt.data.formats.validate import read_npy, read_npz
 from ghpt.errors import GhptDataError
 
-WATCHED = ("exec", "import", "subprocess.", "socket.", "os.system", "os.exec", "os.posix_spawn", "os.fork",
-           "os.remove", "os.rename", "ctypes.", "shutil.", "pickle.find_class")  # fmt: skip
+WATCHED = (
+    "exec",
+    "import",
+    "subprocess.",
+    "socket.",
+    "os.system",
+    "os.exec",
+    "os.posix_spawn",
+    "os.fork",
+    "os.remove",
+    "os.rename",
+    "ctypes.",
+    "shutil.",
+    "pickle.find_class",
+)
 attempts: list[str] = []
 watching = False
 
@@ -32,7 +45,12 @@ watching = False
 def _hook(event: str, arguments: tuple[Any, ...]) -> None:
     if watching and event.startswith(WATCHED):
         attempts.append(f"{event} {arguments[:2]!r:.200}")
-    if watching and event == "open" and isinstance(arguments[1], str) and set(arguments[1]) & set("wax+"):
+    if (
+        watching
+        and event == "open"
+        and isinstance(arguments[1], str)
+        and set(arguments[1]) & set("wax+")
+    ):
         attempts.append(f"open {arguments[:2]!r:.200}")
 
 
@@ -97,7 +115,7 @@ def payloads(sentinel: Path) -> dict[str, bytes]:
         "metadata of a dtype": (np.dtype("f4", metadata={"x": Call(os.system, shell)}), 4),
         "getattr chain": (Call(getattr, Call(__import__, "os"), "system"), 4),
         "codecs of code": (Call(codecs.decode, b"x", "unicode_escape"), 4),
-    }  # fmt: skip
+    }
     written = {
         "numpy f2py": raw(f"os.system('{shell}')", "numpy.f2py.crackfortran", "getlincoef"),
         "numpy runstring": raw(python, "numpy.testing._private.utils", "runstring"),
@@ -111,14 +129,18 @@ def payloads(sentinel: Path) -> dict[str, bytes]:
         "persistent id": b"P" + shell.encode() + b"\n.",
         "extension code": b"\x80\x02\x82\x01.",
         "attributes of a stand-in": b"\x80\x02cnumpy\ndtype\nN}X\x08\x00\x00\x00__code__K\x01s\x86b.",
-        "global by memo": b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94h\x00h\x01\x93" + text(shell) + b"\x85R.",
-    }  # fmt: skip
+        "global by memo": b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94h\x00h\x01\x93"
+        + text(shell)
+        + b"\x85R.",
+    }
     dumped = {}
     for name, (value, protocol) in objects.items():
         buffer = io.BytesIO()
         box = np.empty((), object)
         box[()] = value
-        pickle.dump(box if "array" not in name or name == "in an object array" else value, buffer, protocol)
+        pickle.dump(
+            box if "array" not in name or name == "in an object array" else value, buffer, protocol
+        )
         dumped[name] = buffer.getvalue()
     return dumped | written
 
@@ -127,20 +149,30 @@ def test_labels_run_nothing(tmp_path: Path, record_row: Callable[..., None]) -> 
     sentinel, file = tmp_path / "sentinel", tmp_path / "labels.npy"
     layout.write_pickle(file, {})
     header = file.read_bytes()[:128]
-    codecs.lookup("raw_unicode_escape")  # what Python imports at the first use is not the payload's doing
+    codecs.lookup(
+        "raw_unicode_escape"
+    )  # what Python imports at the first use is not the payload's doing
     with pytest.raises(GhptDataError):
         read_labels(file)
     assert header.endswith(b"\n")
     refused, cases = [], payloads(sentinel)
     for name, pickled in cases.items():
         file.write_bytes(header + pickled)
-        with watch() as seen, pytest.raises(GhptDataError, match=r"is not a labels file|is missing") as caught:
+        with (
+            watch() as seen,
+            pytest.raises(GhptDataError, match=r"is not a labels file|is missing") as caught,
+        ):
             read_labels(file)
         if not sentinel.exists() and not seen and str(file) in str(caught.value):
             refused.append(name)
         else:
             print(name, seen)
-    record_row("A5", f"labels: {len(cases)} payloads, none run, all refused by GhptDataError", len(refused), len(cases))
+    record_row(
+        "A5",
+        f"labels: {len(cases)} payloads, none run, all refused by GhptDataError",
+        len(refused),
+        len(cases),
+    )
     assert refused == list(cases)
 
 
@@ -154,7 +186,9 @@ def test_the_payloads_do_run_when_they_are_let(tmp_path: Path) -> None:
                 pickle.loads(pickled)
         except Exception:
             pass
-        if sentinel.exists() or any(not attempt.startswith("pickle.find_class") for attempt in seen):
+        if sentinel.exists() or any(
+            not attempt.startswith("pickle.find_class") for attempt in seen
+        ):
             ran.append(name)
         sentinel.unlink(missing_ok=True)
     print("ran:", ran)
@@ -162,14 +196,18 @@ def test_the_payloads_do_run_when_they_are_let(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["preds.npy", "keypoints.npz"])
-def test_arrays_of_objects_run_nothing(tmp_path: Path, name: str, record_row: Callable[..., None]) -> None:
+def test_arrays_of_objects_run_nothing(
+    tmp_path: Path, name: str, record_row: Callable[..., None]
+) -> None:
     import os
 
     sentinel, file = tmp_path / "sentinel", tmp_path / name
     array = np.array([Call(os.system, f"touch {sentinel}")], object)
     np.savez(file, x=array) if name.endswith("z") else np.save(file, array, allow_pickle=True)
     read = (
-        partial(read_npz, file, {"x": ((None,), "f")}) if name.endswith("z") else partial(read_npy, file, (None,), "f")
+        partial(read_npz, file, {"x": ((None,), "f")})
+        if name.endswith("z")
+        else partial(read_npy, file, (None,), "f")
     )
     with pytest.raises(GhptDataError):
         read()  # what Python imports at the first use is not the file's doing

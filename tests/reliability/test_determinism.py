@@ -19,7 +19,12 @@ from ghpt.models.checkpoint import read_checkpoint
 SCRIPT = Path(__file__).with_name("run_toy.py")
 BASELINES = {
     "linear": {"_target_": "ghpt.models.estimators.classical.Linear"},
-    "ransac": {"_target_": "ghpt.models.estimators.ransac.Ransac", "threshold": 0.02, "pairs": 4, "seed": 0},
+    "ransac": {
+        "_target_": "ghpt.models.estimators.ransac.Ransac",
+        "threshold": 0.02,
+        "pairs": 4,
+        "seed": 0,
+    },
 }
 
 
@@ -35,17 +40,23 @@ def test_c1_the_same_command_twice(tmp_path, record_row):
         folder, cwd = tmp_path / f"run{number}", tmp_path / f"cwd{number}"
         cwd.mkdir()
         environment = os.environ | {
-            "PYTHONPATH": str(SCRIPT.parents[1]), "PYTHONHASHSEED": hash_seed, "OMP_NUM_THREADS": "1",
+            "PYTHONPATH": str(SCRIPT.parents[1]),
+            "PYTHONHASHSEED": hash_seed,
+            "OMP_NUM_THREADS": "1",
             "GHPT_CACHE": str(tmp_path / f"cache{number}"),
-        }  # fmt: skip
+        }
         command = [sys.executable, str(SCRIPT), str(folder), json.dumps({"test": True})]
-        subprocess.run(command, cwd=cwd, env=environment, check=True, capture_output=True, timeout=300)
+        subprocess.run(
+            command, cwd=cwd, env=environment, check=True, capture_output=True, timeout=300
+        )
         results.append((read_checkpoint(folder / "last.ckpt")["state_dict"], arrays(folder)))
     (weights, first), (again, second) = results
     same = sum(torch.equal(v, again[k]) for k, v in weights.items())
     same += sum(v.tobytes() == second[k].tobytes() for k, v in first.items())
     total = len(weights) + len(first)
-    record_row("C1", f"the same command twice: {same} of {total} arrays identical to the bit", same, total)
+    record_row(
+        "C1", f"the same command twice: {same} of {total} arrays identical to the bit", same, total
+    )
     assert same == total
 
 
@@ -57,7 +68,11 @@ def checkpoint(tmp_path_factory):
 
 
 def predictions_of(checkpoint, folder, threads, **data):
-    config = copy.deepcopy(toys.TRAIN) | {"ckpt": str(checkpoint), "hypotheses": None, "baselines": BASELINES}
+    config = copy.deepcopy(toys.TRAIN) | {
+        "ckpt": str(checkpoint),
+        "hypotheses": None,
+        "baselines": BASELINES,
+    }
     config["data"] |= data
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
@@ -82,12 +97,12 @@ def test_c4_batch_size_threads_and_workers_do_not_matter(tmp_path, checkpoint, r
                 "points_worst",
             ):
                 assert np.array_equal(np.isnan(value), np.isnan(found[name]))
-                worst = max(worst, np.nanmax(np.abs(value.astype(np.float64) - found[name]), initial=0))
+                worst = max(
+                    worst, np.nanmax(np.abs(value.astype(np.float64) - found[name]), initial=0)
+                )
             else:
                 differing += value.tobytes() != found[name].tobytes()
-    figure = (
-        f"{len(runs)} ways to batch: {differing} masks or learning-free arrays differ, learned ones by {worst:.2g} mm"
-    )
+    figure = f"{len(runs)} ways to batch: {differing} masks or learning-free arrays differ, learned ones by {worst:.2g} mm"
     record_row("C4", figure, len(runs) if worst < 1e-2 and not differing else 0, len(runs))
     assert differing == 0
     assert worst < 1e-2  # the scorer is float32, and matrix products round by their shape

@@ -1,4 +1,6 @@
-"""B4: what a writer leaves was on the disk before it got its name, and its name was before the writer went on."""
+"""B4: what a writer leaves was on the disk before it got its name, and its name was before the
+writer went on.
+"""
 
 import hashlib
 import os
@@ -25,7 +27,9 @@ from ghpt.skeleton import JOINTS
 from reconstructions import about, in_parts, random_reconstruction, rig
 from toys import recording
 
-pytestmark = pytest.mark.skipif(not Path("/proc/self/fd").is_dir(), reason="asks Linux what a handle is of")
+pytestmark = pytest.mark.skipif(
+    not Path("/proc/self/fd").is_dir(), reason="asks Linux what a handle is of"
+)
 
 
 def digest(path: str | Path) -> str:
@@ -70,7 +74,11 @@ class Diary:
 
     def check(self, path: Path) -> None:
         """The file, or a file in a folder that was written as a whole, is durable."""
-        (moved,) = [(time, target, node) for time, target, node, _ in self.renamed if target in (path, *path.parents)]
+        (moved,) = [
+            (time, target, node)
+            for time, target, node, _ in self.renamed
+            if target in (path, *path.parents)
+        ]
         time, target, node = moved
         assert node == inode(target)
         before = [content for at, node, content in self.synced if node == inode(path) and at < time]
@@ -120,12 +128,24 @@ def save_rig(folder: Path) -> None:
 def save_key_points(folder: Path) -> None:
     values = np.ones((3, 2, len(JOINTS), 2))
     shape = values.shape[:-1]
-    points = KeyPoints("", ("a", "b"), JOINTS, np.arange(3), values, np.ones(shape), np.ones(shape, bool), 10.0, (0, 0))
+    points = KeyPoints(
+        "",
+        ("a", "b"),
+        JOINTS,
+        np.arange(3),
+        values,
+        np.ones(shape),
+        np.ones(shape, bool),
+        10.0,
+        (0, 0),
+    )
     write_key_points(folder / "points.npz", points)
 
 
 def save_store(folder: Path) -> None:
-    write_store(folder / "store", [recording("S1/a", "S1", 5, 3, 0.1, np.random.default_rng(0))], {})
+    write_store(
+        folder / "store", [recording("S1/a", "S1", 5, 3, 0.1, np.random.default_rng(0))], {}
+    )
 
 
 def save_cell(folder: Path) -> None:
@@ -166,7 +186,9 @@ def test_every_file_is_synced_then_named_and_its_name_is_synced(tmp_path, monkey
         diary.check(path)
 
 
-def test_a_shard_is_durable_before_the_manifest_lists_it_and_the_line_is_synced(tmp_path, monkeypatch, record_row):
+def test_a_shard_is_durable_before_the_manifest_lists_it_and_the_line_is_synced(
+    tmp_path, monkeypatch, record_row
+):
     shards = Shards(tmp_path, "key", 20, 10)
     manifest = tmp_path / MANIFEST
     diary = Diary(monkeypatch, watched=(manifest,))
@@ -174,22 +196,33 @@ def test_a_shard_is_durable_before_the_manifest_lists_it_and_the_line_is_synced(
         before = manifest.read_bytes()
         shards.write(number, random_reconstruction(10))
         diary.check(shards.path(number))
-        renamed, _, _, held = next(entry for entry in diary.renamed if entry[1] == shards.path(number))
+        renamed, _, _, held = next(
+            entry for entry in diary.renamed if entry[1] == shards.path(number)
+        )
         assert held[manifest] == before
         named = min(at for at, folder in diary.folders if folder == tmp_path and at > renamed)
-        listed = [content for at, node, content in diary.synced if node == inode(manifest) and at > named]
+        listed = [
+            content for at, node, content in diary.synced if node == inode(manifest) and at > named
+        ]
         assert listed[-1] == digest(manifest)
         assert manifest.read_bytes().count(b"\n") == 2 + number
-    record_row("B4", f"{len(SAVERS)} writers and the shards: synced before and after the rename", 1, 1)
+    record_row(
+        "B4", f"{len(SAVERS)} writers and the shards: synced before and after the rename", 1, 1
+    )
 
 
 CHECKED = {
-    "a checkpoint": "last.ckpt", "predictions of a test": "predictions.npz", "npz": "poses.npz", "a rig": "intri.yml",
-}  # fmt: skip
+    "a checkpoint": "last.ckpt",
+    "predictions of a test": "predictions.npz",
+    "npz": "poses.npz",
+    "a rig": "intri.yml",
+}
 
 
 @pytest.mark.parametrize("what", CHECKED)
-def test_what_the_disk_spoils_is_seen_before_it_takes_the_old_file_s_place(tmp_path, monkeypatch, what):
+def test_what_the_disk_spoils_is_seen_before_it_takes_the_old_file_s_place(
+    tmp_path, monkeypatch, what
+):
     folder = tmp_path / "out"
     folder.mkdir()
     SAVERS[what](folder)

@@ -1,4 +1,6 @@
-"""B5: where a file cannot be written, a command says which, in one line, and what was there before is whole."""
+"""B5: where a file cannot be written, a command says which, in one line, and what was there before
+is whole.
+"""
 
 import errno
 import os
@@ -25,9 +27,13 @@ from toy_cells import cell
 resource = pytest.importorskip("resource", reason="limits the size of files")
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = (
-    "data=toy", "model.hypotheses=5", "model.scorer.layers=[4]", "trainer.accelerator=cpu", "progress_bar=false",
+    "data=toy",
+    "model.hypotheses=5",
+    "model.scorer.layers=[4]",
+    "trainer.accelerator=cpu",
+    "progress_bar=false",
     "trainer.max_epochs=1",
-)  # fmt: skip
+)
 
 
 @contextmanager
@@ -76,16 +82,28 @@ def test_command(typed, conf, tmp_path, train_command):
 @pytest.fixture
 def predict_command(typed, tmp_path, monkeypatch):
     monkeypatch.setattr(prediction, "_from_data", lambda _: frames_of(400))
-    words = ("triangulation=linear", "shard_frames=100", "formats=[npz,csv]", "evaluated_frames=4", "data=cmu1")
+    words = (
+        "triangulation=linear",
+        "shard_frames=100",
+        "formats=[npz,csv]",
+        "evaluated_frames=4",
+        "data=cmu1",
+    )
     quiet = ("progress_bar=false", "trainer.accelerator=cpu", f"output={tmp_path / 'out'}")
     return lambda *more: typed(ROOT / "conf", prediction.COMMAND, [*words, *quiet, *more])
 
 
-LIMITS = {"train_command": (12_000,), "test_command": (12_000,), "predict_command": (12_000, 60_000)}
+LIMITS = {
+    "train_command": (12_000,),
+    "test_command": (12_000,),
+    "predict_command": (12_000, 60_000),
+}
 """Bytes: the first file of each command is too long for the first, another for the second."""
 
 
-@pytest.mark.parametrize(("name", "size"), [(name, size) for name, sizes in LIMITS.items() for size in sizes])
+@pytest.mark.parametrize(
+    ("name", "size"), [(name, size) for name, sizes in LIMITS.items() for size in sizes]
+)
 def test_a_command_names_the_file_and_keeps_what_was_there(request, tmp_path, name, size):
     command = request.getfixturevalue(name)
     status, _, said = command()
@@ -98,7 +116,9 @@ def test_a_command_names_the_file_and_keeps_what_was_there(request, tmp_path, na
         status, _, said = command()
     error = said.splitlines()[-1]
     assert status == 1, said
-    assert error.startswith(f"error: [Errno {errno.EFBIG}] File too large: '{tmp_path / 'out'}"), said
+    assert error.startswith(f"error: [Errno {errno.EFBIG}] File too large: '{tmp_path / 'out'}"), (
+        said
+    )
     assert "Traceback" not in said
     assert contents(tmp_path / "out") == before
     left = [path.name for path in (tmp_path / "out").rglob("*") if path.name.endswith(".tmp")]
@@ -189,4 +209,6 @@ def test_training_without_tensorboard(train_command, tmp_path, monkeypatch, writ
         assert read_checkpoint(tmp_path / "out" / "last.ckpt")["global_step"] == 5
     else:
         assert status == 1
-        assert said.splitlines() == [f"error: [Errno 28] No space left on device: '{tmp_path / 'out'}'"]
+        assert said.splitlines() == [
+            f"error: [Errno 28] No space left on device: '{tmp_path / 'out'}'"
+        ]

@@ -34,7 +34,9 @@ def ones(scene):
 
 
 def cut(scene, joints):
-    return replace(scene, points=scene.points[:, :joints], key_points=scene.key_points[:, :, :joints].clone())
+    return replace(
+        scene, points=scene.points[:, :joints], key_points=scene.key_points[:, :, :joints].clone()
+    )
 
 
 def random_lens(rng, frames, views, count):
@@ -49,7 +51,9 @@ def test_d1_exact_key_points_through_any_lens_give_the_truth(nightly, record_row
         views, scale = int(rng.integers(2, 17)), 10.0 ** rng.uniform(-4.5, 1.5)
         scene = random_scene(seed, rigs // 25, views, scale, place=float(rng.choice([0, 1e4, 1e5])))
         lens = random_lens(rng, rigs // 25, views, (4, 5, 8)[seed % 3])
-        ideal, exists = undistort(distort(scene.key_points, scene.cameras.K, lens), scene.cameras.K, lens)
+        ideal, exists = undistort(
+            distort(scene.key_points, scene.cameras.K, lens), scene.cameras.K, lens
+        )
         result = triangulate(scene.cameras, ideal, exists.double())
         missing += int((~result.ok).sum())
         error = (result.points - scene.points).norm(dim=-1).amax(-1) / (6000 * scale)
@@ -93,7 +97,12 @@ def pure_rotation(scene, weights):
     use(0, 1)(scene, weights)
     angle = torch.tensor(0.1, dtype=torch.float64)
     turn = torch.eye(3, dtype=torch.float64)
-    turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
+    turn[0, 0], turn[0, 1], turn[1, 0], turn[1, 1] = (
+        angle.cos(),
+        -angle.sin(),
+        angle.sin(),
+        angle.cos(),
+    )
     scene.cameras.K[1] = scene.cameras.K[0]
     scene.cameras.R[1], scene.cameras.t[1] = turn @ scene.cameras.R[0], turn @ scene.cameras.t[0]
     see(scene)
@@ -150,7 +159,9 @@ def at_a_centre(scene, weights):
 
 def behind(*views):
     def case(scene, weights):
-        for view in views:  # turned round about its own y axis; the projection's formula does not mind
+        for (
+            view
+        ) in views:  # turned round about its own y axis; the projection's formula does not mind
             place(scene, view, scene.cameras.centre[view], turned_about(1) @ scene.cameras.R[view])
         see(scene)
 
@@ -173,7 +184,9 @@ def in_line(scene, weights):
 def in_one_plane_with_the_points(scene, weights):
     scene.points[:, 2] = 0
     for view in range(4):
-        place(scene, view, scene.cameras.centre[view] * torch.tensor([1.0, 1, 0], dtype=torch.float64))
+        place(
+            scene, view, scene.cameras.centre[view] * torch.tensor([1.0, 1, 0], dtype=torch.float64)
+        )
     aim(scene)
 
 
@@ -243,10 +256,15 @@ DEGENERATE = {
     "a scaled R": (lambda s, w: s.cameras.R[1].mul_(2), S.NONFINITE_INPUT),
     "focal length 0": (at("K", 1, 0, 0, 0.0), S.NONFINITE_INPUT),
     "negative focal length": (at("K", 1, 1, 1, -1000.0), S.NONFINITE_INPUT),
-    "transposed K": (lambda s, w: s.cameras.K[1].copy_(s.cameras.K[1].mT.clone()), S.NONFINITE_INPUT),
+    "transposed K": (
+        lambda s, w: s.cameras.K[1].copy_(s.cameras.K[1].mT.clone()),
+        S.NONFINITE_INPUT,
+    ),
     "all zero": (nothing_at_all, S.NONFINITE_INPUT),
 }
-ONE_BAD_VIEW = {name for name, (_, status) in DEGENERATE.items() if status == S.NONFINITE_INPUT} - {"all zero"}
+ONE_BAD_VIEW = {name for name, (_, status) in DEGENERATE.items() if status == S.NONFINITE_INPUT} - {
+    "all zero"
+}
 
 
 def degenerate(name, seed=0):
@@ -264,8 +282,12 @@ def put(large, weights, at, scene, own):
     def into(x, y):
         return torch.cat((x[:at], y[None], x[at + 1 :]))
 
-    cameras = Cameras(*(into(getattr(large.cameras, f), getattr(scene.cameras, f)) for f in ("K", "R", "t")))
-    mixed = Scene(cameras, into(large.points, scene.points), into(large.key_points, scene.key_points))
+    cameras = Cameras(
+        *(into(getattr(large.cameras, f), getattr(scene.cameras, f)) for f in ("K", "R", "t"))
+    )
+    mixed = Scene(
+        cameras, into(large.points, scene.points), into(large.key_points, scene.key_points)
+    )
     return mixed, into(weights, own)
 
 
@@ -285,10 +307,16 @@ def test_d2_degenerate_frames_have_the_right_status_and_spoil_no_other(thousand,
         alone = triangulate(scene.cameras, scene.key_points, own)
         mixed, all_weights = put(large, weights, 500, scene, own)
         result = triangulate(mixed.cameras, mixed.key_points, all_weights)
-        for points, found in ((alone.points, alone.status), (result.points[500], result.status[500])):
+        for points, found in (
+            (alone.points, alone.status),
+            (result.points[500], result.status[500]),
+        ):
             right = (found == status).all() and torch.isfinite(points).all()
-            right = right and ((points - scene.points).abs().max() < 1e-3 * scene.points.abs().max()
-                               if status == S.OK else (points == 0).all())  # fmt: skip
+            right = right and (
+                (points - scene.points).abs().max() < 1e-3 * scene.points.abs().max()
+                if status == S.OK
+                else (points == 0).all()
+            )
             if not right:
                 wrong.append((name, found.tolist(), points.tolist()))
         for field in ("points", "status", "angle", "depth_min", "cond"):
@@ -297,12 +325,16 @@ def test_d2_degenerate_frames_have_the_right_status_and_spoil_no_other(thousand,
             if getattr(result, field).isnan().any():
                 wrong.append((name, field, "is NaN"))
     total = 2 * len(DEGENERATE)
-    record_row("D2", f"triangulate: {len(DEGENERATE)} cases, alone and in 1,000", total - len(wrong), total)
+    record_row(
+        "D2", f"triangulate: {len(DEGENERATE)} cases, alone and in 1,000", total - len(wrong), total
+    )
     assert not wrong
 
 
 def test_d2_no_point_is_found_in_a_camera_s_own_centre(record_row):
-    """Where rays meet in a camera's centre the depth is rounding, of either sign: many times, never ok."""
+    """Where rays meet in a camera's centre the depth is rounding, of either sign: many times, never
+    ok.
+    """
     scene = random_scene(1, 300, 2, place=1e4)
     doubled = scene.cameras.index((slice(None), [0, 0]))
     noise = np.random.default_rng(1).normal(0, 5, tuple(scene.key_points.shape))
@@ -358,8 +390,13 @@ def test_d2_classical_estimators_invent_nothing_and_spoil_no_other(name, nightly
         scene, own = degenerate(case)
         mixed, visible = put(large, seen, 50, scene, own > 0)
         estimate = BASELINES[name](mixed.batch(visible))
-        # with one bad view of four a robust estimator may go on without it; behind a camera it may leave that out
-        undefined = status in (S.FEW_VIEWS, S.PARALLEL) or case in ("all zero", "diverging rays", "behind all")
+        # with one bad view of four a robust estimator may go on without it; behind a camera it may
+        # leave that out
+        undefined = status in (S.FEW_VIEWS, S.PARALLEL) or case in (
+            "all zero",
+            "diverging rays",
+            "behind all",
+        )
         if undefined and estimate.estimated[50].any():
             wrong.append((case, "invented"))
         if status == S.OK and not estimate.estimated[50].all():
@@ -368,10 +405,17 @@ def test_d2_classical_estimators_invent_nothing_and_spoil_no_other(name, nightly
             error = (estimate.points - mixed.points)[50].norm(dim=-1)[estimate.estimated[50]]
             if error.max() > 1:
                 wrong.append((case, "used the bad view"))
-        if not torch.isfinite(estimate.points).all() or not torch.equal(estimate.points[others], good.points[others]):
+        if not torch.isfinite(estimate.points).all() or not torch.equal(
+            estimate.points[others], good.points[others]
+        ):
             wrong.append((case, "neighbours"))
     total = sum("weight" not in case for case in DEGENERATE)
-    record_row("D2", f"{name}: {total} cases in a batch of {frames}", total - len({w[0] for w in wrong}), total)
+    record_row(
+        "D2",
+        f"{name}: {total} cases in a batch of {frames}",
+        total - len({w[0] for w in wrong}),
+        total,
+    )
     assert not wrong
 
 
@@ -381,14 +425,24 @@ tally = {"examples": 0}
 noisy_scene = cache(lambda seed, views: cut(random_scene(seed, 2, views), 5).noisy(2, seed))
 
 
-@settings(max_examples=500, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(
+    max_examples=500, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+)
 @given(
-    slot=st.sampled_from(list(SIZES)), value=st.sampled_from(BROKEN), place=st.tuples(*[st.integers(0, 1000)] * 4),
-    density=st.floats(0, 1), views=st.integers(2, 5), seed=st.integers(0, 9),
-)  # fmt: skip
-def test_d3_a_broken_number_changes_only_what_is_made_of_it(slot, value, place, density, views, seed):
+    slot=st.sampled_from(list(SIZES)),
+    value=st.sampled_from(BROKEN),
+    place=st.tuples(*[st.integers(0, 1000)] * 4),
+    density=st.floats(0, 1),
+    views=st.integers(2, 5),
+    seed=st.integers(0, 9),
+)
+def test_d3_a_broken_number_changes_only_what_is_made_of_it(
+    slot, value, place, density, views, seed
+):
     scene = noisy_scene(seed, views)
-    weights = (torch.rand(2, views, 5, generator=torch.Generator().manual_seed(seed)) < density).double()
+    weights = (
+        torch.rand(2, views, 5, generator=torch.Generator().manual_seed(seed)) < density
+    ).double()
     inputs = {f: getattr(scene.cameras, f).clone() for f in ("K", "R", "t")}
     inputs |= {"key_points": scene.key_points.clone(), "weights": weights.clone()}
     frame, view = place[0] % 2, place[1] % views
@@ -401,7 +455,9 @@ def test_d3_a_broken_number_changes_only_what_is_made_of_it(slot, value, place, 
 
     touched = torch.zeros(2, 5, dtype=torch.bool)
     touched[frame, inner[0] if slot in ("key_points", "weights") else slice(None)] = True
-    if slot != "weights":  # of a view that is not used nothing matters but where the camera places the origin
+    if (
+        slot != "weights"
+    ):  # of a view that is not used nothing matters but where the camera places the origin
         touched[frame] &= weights[frame, view] > 0
     same = ~touched
     assert torch.equal(before.status[same], after.status[same])
@@ -423,14 +479,22 @@ def test_d3_a_broken_number_changes_only_what_is_made_of_it(slot, value, place, 
         return
     used = weights > 0
     points, ok = triangulate_subsets(cameras, key_points.detach(), used, used.mT[:, None])
-    assert torch.equal(ok[:, 0] | (after.status == S.NONFINITE_INPUT), after.ok | (after.status == S.NONFINITE_INPUT))
+    assert torch.equal(
+        ok[:, 0] | (after.status == S.NONFINITE_INPUT),
+        after.ok | (after.status == S.NONFINITE_INPUT),
+    )
     assert torch.isfinite(points).all()
 
 
 def test_d3_is_recorded(record_row):
     if not tally["examples"]:
         pytest.skip("the fuzzing itself did not run")
-    record_row("D3", "broken number in any slot, random masks, gradients", tally["examples"], tally["examples"])
+    record_row(
+        "D3",
+        "broken number in any slot, random masks, gradients",
+        tally["examples"],
+        tally["examples"],
+    )
     assert tally["examples"] >= 500
 
 
@@ -458,7 +522,11 @@ def test_c4_a_frame_s_geometry_is_the_same_in_any_batch_on_any_threads(views, ni
     try:
         torch.set_num_threads(1)
         whole = everything(scene, seen)
-        for threads, size, frames in ((2, 64, 64), (1, 1, 64 if nightly else 3), (2, 7, 64 if nightly else 21)):
+        for threads, size, frames in (
+            (2, 64, 64),
+            (1, 1, 64 if nightly else 3),
+            (2, 7, 64 if nightly else 21),
+        ):
             torch.set_num_threads(threads)
             for start in range(0, frames, size):
                 part = slice(start, start + size)
@@ -496,7 +564,9 @@ def test_c5_types_and_layouts_give_the_same(record_row):
     worst = float((single.points - exact.points).abs().max())
     assert worst < 0.1  # mm: float32 pixels are 6e-5 pixels off
     assert single.points.dtype == torch.float64
-    rounded = triangulate(scene.cameras.to(torch.float32), scene.key_points.float(), weights.float())
+    rounded = triangulate(
+        scene.cameras.to(torch.float32), scene.key_points.float(), weights.float()
+    )
     worst = max(worst, float((rounded.points - exact.points).abs().max()))
     assert worst < 0.1
     halves = triangulate(scene.cameras, scene.key_points, weights.half())
@@ -506,13 +576,24 @@ def test_c5_types_and_layouts_give_the_same(record_row):
     record_row("C5", f"geometry: float32 against float64 {worst:.1e} mm, layouts equal", 7, 7)
 
 
-@pytest.mark.parametrize(("frames", "joints", "hypotheses"), [(0, 17, 5), (2, 0, 5), (2, 17, 0), (0, 0, 0)])
+@pytest.mark.parametrize(
+    ("frames", "joints", "hypotheses"), [(0, 17, 5), (2, 0, 5), (2, 17, 0), (0, 0, 0)]
+)
 @pytest.mark.parametrize("views", [1, 4, 31])
 def test_c5_nothing_in_gives_nothing_out(frames, joints, hypotheses, views):
     scene = random_scene(0, 2, views)
-    scene = cut(Scene(scene.cameras.index(slice(0, frames)), scene.points[:frames], scene.key_points[:frames]), joints)
+    scene = cut(
+        Scene(
+            scene.cameras.index(slice(0, frames)), scene.points[:frames], scene.key_points[:frames]
+        ),
+        joints,
+    )
     seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
-    assert triangulate(scene.cameras, scene.key_points, seen.double()).points.shape == (frames, joints, 3)
+    assert triangulate(scene.cameras, scene.key_points, seen.double()).points.shape == (
+        frames,
+        joints,
+        3,
+    )
     subsets = torch.ones(frames, hypotheses, joints, views, dtype=torch.bool)
     points, ok = triangulate_subsets(scene.cameras, scene.key_points, seen, subsets)
     assert points.shape == (frames, hypotheses, joints, 3)

@@ -1,4 +1,5 @@
-"""A1, A2, A3: whatever happened to a file, it is read or named, in little time and memory; a cut file never passes.
+"""A1, A2, A3: whatever happened to a file, it is read or named, in little time and memory; a cut
+file never passes.
 
 Each file is read in a child process with a limit of memory and a timer (``hostile.py``).
 """
@@ -11,7 +12,19 @@ from pathlib import Path
 import pytest
 
 WORKER = Path(__file__).with_name("hostile.py")
-FORMATS = ("openpose", "mmpose", "coco", "caliscope", "npz", "npy", "toml", "yaml", "panoptic", "human36m", "colmap")
+FORMATS = (
+    "openpose",
+    "mmpose",
+    "coco",
+    "caliscope",
+    "npz",
+    "npy",
+    "toml",
+    "yaml",
+    "panoptic",
+    "human36m",
+    "colmap",
+)
 
 
 def measured(row, formats, count, seed):
@@ -31,11 +44,17 @@ def test_a_mutated_file_is_read_or_named(formats, nightly, record_row):
     for name, form in found.items():
         bad = {kind: n for kind, n in form["outcomes"].items() if kind in ("crash", "hang", "leak")}
         total = sum(form["outcomes"].values())
-        record_row("A1", f"{name}: 0 crashes, hangs, leaks; RSS + {form['grown_kib'] / 1024:.0f} MiB",
-                   total - sum(bad.values()), total)  # fmt: skip
+        record_row(
+            "A1",
+            f"{name}: 0 crashes, hangs, leaks; RSS + {form['grown_kib'] / 1024:.0f} MiB",
+            total - sum(bad.values()),
+            total,
+        )
         assert not bad, (name, form["notes"])
         assert total == form["total"]
-        assert form["outcomes"]["named"] > 0.3 * total  # most of what is spoilt is not a file of this kind any more
+        assert (
+            form["outcomes"]["named"] > 0.3 * total
+        )  # most of what is spoilt is not a file of this kind any more
         assert form["grown_kib"] <= 64 * 1024 + 8 * form["file_kib"]
 
 
@@ -49,16 +68,25 @@ def test_our_own_key_points_never_come_back_different(nightly, record_row):
 
 @pytest.mark.parametrize("formats", [FORMATS[:4], FORMATS[4:]], ids="-".join)
 def test_a_file_that_ends_early_is_named(formats, record_row):
-    """Cut at every byte. Tables and texts that end between two lines are shorter recordings or rigs without poses;
-    nothing that is read is any other than in the whole file."""
+    """Cut at every byte. Tables and texts that end between two lines are shorter recordings or rigs
+    without poses; nothing that is read is any other than in the whole file.
+    """
     found = measured("A3", formats, 0, 0)
     for name, form in found.items():
         accepted = form["outcomes"].get("part", 0) if name in ("caliscope", "toml", "yaml") else 0
-        spaces = 12 if name in ("toml", "yaml", "caliscope") else 0  # the whole without what ends it
+        spaces = (
+            12 if name in ("toml", "yaml", "caliscope") else 0
+        )  # the whole without what ends it
         bad = form["total"] - form["outcomes"]["named"] - accepted
         record_row(
-            "A3", f"{name}: 0 read with other values, {accepted} cut between lines", form["total"] - bad, form["total"]
+            "A3",
+            f"{name}: 0 read with other values, {accepted} cut between lines",
+            form["total"] - bad,
+            form["total"],
         )
-        assert of_all({name: form}, "different", "leak", "hang", "crash") == 0, (name, form["notes"])
+        assert of_all({name: form}, "different", "leak", "hang", "crash") == 0, (
+            name,
+            form["notes"],
+        )
         assert bad <= spaces
         assert accepted < 0.05 * form["total"]

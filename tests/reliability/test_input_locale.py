@@ -48,6 +48,8 @@ def test_decimal_commas_are_named(part, tmp_path, record_row):
     """What a spreadsheet of another country makes of the table."""
     target = hostile.caliscope(tmp_path)
     target.write_text(target.read_text().replace(",", part).replace(".", ","))
-    with pytest.raises(GhptDataError, match=r"columns that commas do not part.*commas between the columns"):
+    with pytest.raises(
+        GhptDataError, match=r"columns that commas do not part.*commas between the columns"
+    ):
         hostile.FORMATS["caliscope"].read(tmp_path)
     record_row("C6", f"columns parted by {part!r}, decimal commas: named", 1, 1)

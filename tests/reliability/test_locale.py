@@ -34,17 +34,26 @@ def test_c6_outputs_are_the_same_in_every_locale(tmp_path, record_row):
         folder.mkdir()
         environment = os.environ | {"LOCPATH": str(tmp_path), "OMP_NUM_THREADS": "1"} | changes
         if not made:
-            environment["LC_ALL"] = "C.UTF-8"  # setlocale would fail; the other changes are still tried
+            environment["LC_ALL"] = (
+                "C.UTF-8"  # setlocale would fail; the other changes are still tried
+            )
         command = [sys.executable, str(SCRIPT), str(folder)]
-        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=True, timeout=300)
+        run = subprocess.run(
+            command, env=environment, capture_output=True, text=True, check=True, timeout=300
+        )
         points[name] = run.stdout.strip()
         assert points[name] == ("," if made and name != "C" else ".")
         written[name] = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert len(written["C"]) == 6
     differ = [
-        f"{name}/{file}" for name in written for file in written["C"] if written[name][file] != written["C"][file]
+        f"{name}/{file}"
+        for name in written
+        for file in written["C"]
+        if written[name][file] != written["C"][file]
     ]
     commas = sum(point == "," for point in points.values())
     figure = f"6 formats in {len(written)} environments, {commas} of them with decimal commas: {len(differ)} differ"
-    record_row("C6", figure, len(written) - len({name.split("/")[0] for name in differ}), len(written))
+    record_row(
+        "C6", figure, len(written) - len({name.split("/")[0] for name in differ}), len(written)
+    )
     assert differ == []

@@ -1,4 +1,6 @@
-"""E3 and B8: a long training holds what it held at its start, and a kill leaves no process and loses no logged step."""
+"""E3 and B8: a long training holds what it held at its start, and a kill leaves no process and
+loses no logged step.
+"""
 
 import ctypes
 import gc
@@ -19,7 +21,9 @@ TESTS = Path(__file__).resolve().parents[1]
 
 
 def held() -> dict[str, float]:
-    """MiB of private memory, open files, threads and processes; what glibc keeps of freed memory is given back."""
+    """MiB of private memory, open files, threads and processes; what glibc keeps of freed memory is
+    given back.
+    """
     gc.collect()
     ctypes.CDLL(None).malloc_trim(0)
     lines = dict(line.split(":", 1) for line in STATUS.read_text(encoding="utf-8").splitlines())
@@ -32,7 +36,9 @@ def held() -> dict[str, float]:
 
 
 def child(folder: str, steps: int) -> None:
-    """Train until killed; print what is held after a third of the steps and after all, and the worker's number."""
+    """Train until killed; print what is held after a third of the steps and after all, and the
+    worker's number.
+    """
     import lightning as L
 
     import toys
@@ -42,7 +48,10 @@ def child(folder: str, steps: int) -> None:
         def on_train_batch_end(self, trainer, *_):
             if trainer.global_step in (steps // 3, steps):
                 workers = [process.pid for process in multiprocessing.active_children()]
-                print(json.dumps({"held": held(), "workers": workers, "step": trainer.global_step}), flush=True)
+                print(
+                    json.dumps({"held": held(), "workers": workers, "step": trainer.global_step}),
+                    flush=True,
+                )
 
     training.progress = lambda config: [Probe()]
     data = toys.DATA | {"batch_size": 1, "workers": 1}
@@ -61,11 +70,16 @@ def test_e3_and_b8_a_long_training(tmp_path, nightly, record_row):
     steps = 20_000 if nightly else 600
     path = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {
-        "PYTHONPATH": path, "OMP_NUM_THREADS": "1", "PYTHONWARNINGS": "ignore", "MALLOC_ARENA_MAX": "1",
+        "PYTHONPATH": path,
+        "OMP_NUM_THREADS": "1",
+        "PYTHONWARNINGS": "ignore",
+        "MALLOC_ARENA_MAX": "1",
         "MALLOC_MMAP_THRESHOLD_": "65536",
-    }  # fmt: skip
+    }
     command = [sys.executable, __file__, str(tmp_path), str(steps)]
-    with subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as run:
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as run:
         start, end = (json.loads(run.stdout.readline()) for _ in range(2))
         run.send_signal(signal.SIGKILL)
     deadline = time.monotonic() + 60
@@ -79,7 +93,9 @@ def test_e3_and_b8_a_long_training(tmp_path, nightly, record_row):
     lost = max(0, end["step"] - 1 - logged)  # Lightning counts from 0
     figure = f"{steps - steps // 3} steps: {growth:+.2f} MiB, {end['held']}, 0 orphans"
     record_row("E3", figure, 1, 1)
-    record_row("B8", f"killed after step {end['step']}: {lost} logged steps lost", int(lost <= 1), 1)
+    record_row(
+        "B8", f"killed after step {end['step']}: {lost} logged steps lost", int(lost <= 1), 1
+    )
     assert end["workers"]
     assert start["held"] == end["held"]
     assert growth <= 1.0

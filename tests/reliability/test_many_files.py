@@ -1,4 +1,6 @@
-"""E4: very many files are read in time that grows with their number, and in memory that their content needs."""
+"""E4: very many files are read in time that grows with their number, and in memory that their
+content needs.
+"""
 
 import json
 import subprocess
@@ -24,7 +26,13 @@ def recording(folder: Path, frames: int, padding: int) -> int:
     total = 0
     for frame in range(frames):
         joints = np.column_stack([rng.uniform(0, 1900, (25, 2)).round(3), rng.random(25).round(4)])
-        people = [{"person_id": [-1], "pose_keypoints_2d": joints.ravel().tolist(), "face_keypoints_2d": [0] * padding}]
+        people = [
+            {
+                "person_id": [-1],
+                "pose_keypoints_2d": joints.ravel().tolist(),
+                "face_keypoints_2d": [0] * padding,
+            }
+        ]
         text = json.dumps({"version": 1.3, "people": people})
         (folder / "a" / f"a_{frame:012d}_keypoints.json").write_text(text)
         total += len(text)
@@ -32,7 +40,9 @@ def recording(folder: Path, frames: int, padding: int) -> int:
 
 
 def measured(folder: Path) -> tuple[float, float, int, int]:
-    done = subprocess.run([sys.executable, "-c", READ, str(folder)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", READ, str(folder)], capture_output=True, text=True, check=True
+    )
     seconds, grown, people, size = map(float, done.stdout.split())
     return seconds, grown / 1024, int(people), int(size)
 
@@ -40,7 +50,10 @@ def measured(folder: Path) -> tuple[float, float, int, int]:
 def test_time_and_memory_grow_with_the_files(tmp_path, nightly, record_row):
     frames, padding = (50_000, 3000) if nightly else (1000, 100)
     total = [recording(tmp_path / str(n), n * frames, padding) for n in (1, 2)]
-    found = [min((measured(tmp_path / str(n)) for _ in range(1 if nightly else 2)), key=lambda f: f[0]) for n in (1, 2)]
+    found = [
+        min((measured(tmp_path / str(n)) for _ in range(1 if nightly else 2)), key=lambda f: f[0])
+        for n in (1, 2)
+    ]
     ratio = found[1][0] / found[0][0]
     figure = f"{2 * frames} files, {total[1] / 1e9:.3f} GB: {found[1][0]:.1f} s, x {ratio:.2f} for twice as many"
     record_row("E4", f"{figure}, RSS + {found[1][1]:.0f} MiB", 1, 1)

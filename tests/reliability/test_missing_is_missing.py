@@ -1,4 +1,6 @@
-"""D7: missing is missing. No number without a mask that says observed or filled; nothing is filled unless asked."""
+"""D7: missing is missing. No number without a mask that says observed or filled; nothing is filled
+unless asked.
+"""
 
 import numpy as np
 import pytest
@@ -27,7 +29,9 @@ ABOUT = About("walk", "embedded", "linear", JOINTS, RIG.names, 50.0, False, {})
 
 
 def pattern(rng: np.random.Generator) -> np.ndarray:
-    """Which views see each joint, [T, V, J]: from nothing to everything missing, in single frames and in bursts."""
+    """Which views see each joint, [T, V, J]: from nothing to everything missing, in single frames
+    and in bursts.
+    """
     share = rng.uniform(0, 1, (1, V, J)) ** rng.uniform(0.3, 3)
     length = rng.integers(1, 12)
     draws = rng.uniform(size=(T // length + 2, V, J)).repeat(length, axis=0)
@@ -40,25 +44,36 @@ def batch(seen: np.ndarray, rng: np.random.Generator) -> KeyPointBatch:
     pixels = project(RIG.cameras, walk()[:T])[0]
     spoilt = torch.tensor([0.0, np.nan, 1e6])[rng.integers(0, 3, seen.shape)].double()[..., None]
     there = torch.from_numpy(seen)
-    cameras = Cameras(*(x.expand(T, *x.shape) for x in (RIG.cameras.K, RIG.cameras.R, RIG.cameras.t)))
+    cameras = Cameras(
+        *(x.expand(T, *x.shape) for x in (RIG.cameras.K, RIG.cameras.R, RIG.cameras.t))
+    )
     return KeyPointBatch(
-        sample=torch.arange(T), recording=torch.zeros(T, dtype=torch.int64), cameras=cameras,
-        key_points=torch.where(there[..., None], pixels, spoilt), confidence=there.double(), seen=there,
-        truth=torch.zeros(T, J, 3), truth_seen=torch.zeros(T, J, dtype=torch.bool),
-    )  # fmt: skip
+        sample=torch.arange(T),
+        recording=torch.zeros(T, dtype=torch.int64),
+        cameras=cameras,
+        key_points=torch.where(there[..., None], pixels, spoilt),
+        confidence=there.double(),
+        seen=there,
+        truth=torch.zeros(T, J, 3),
+        truth_seen=torch.zeros(T, J, dtype=torch.bool),
+    )
 
 
 def cells(path) -> np.ndarray:
     """Which joints have three numbers in a TRC file, [T, J]; each has all of them or none."""
     lines = path.read_text().splitlines()[6:]
-    rows = np.array([[cell != "" for cell in line.split("\t")[2 : 2 + 3 * J]] for line in lines]).reshape(T, J, 3)
+    rows = np.array(
+        [[cell != "" for cell in line.split("\t")[2 : 2 + 3 * J]] for line in lines]
+    ).reshape(T, J, 3)
     assert (rows.all(-1) == rows.any(-1)).all()
     return rows.all(-1)
 
 
 def test_d7_no_value_without_its_state(tmp_path, record_row):
     rng, checked, violations, filled = np.random.default_rng(0), 0, 0, 0
-    predictor = Classical(Linear(), Quality(noise=None, prior=10.0, shared=0.0), swaps=None, reject=None)
+    predictor = Classical(
+        Linear(), Quality(noise=None, prior=10.0, shared=0.0), swaps=None, reject=None
+    )
     for number in range(FILES):
         seen = pattern(rng)
         folder = tmp_path / str(number)
@@ -66,7 +81,9 @@ def test_d7_no_value_without_its_state(tmp_path, record_row):
         whole = predictor(batch(seen, rng))
         for shard in shards.missing():
             rows = slice(shards.rows(shard).start, shards.rows(shard).stop)
-            shards.write(shard, type(whole)(**{name: value[rows] for name, value in vars(whole).items()}))
+            shards.write(
+                shard, type(whole)(**{name: value[rows] for name, value in vars(whole).items()})
+            )
         longest = None if number % 2 else int(rng.integers(1, 12))
         with after(Gaps(longest, "pchip", None, 50.0), shards, J, folder) as chunks:
             for name in ("npz", "trc", "c3d"):
@@ -81,7 +98,9 @@ def test_d7_no_value_without_its_state(tmp_path, record_row):
         placed = state <= State.FILLED
         violations += int((expected & ~two).sum())
         # an estimator may set a key point aside, and then says so
-        violations += int((two & ~expected & ~np.isin(state, (State.FILLED, State.BAD_INPUT))).sum())
+        violations += int(
+            (two & ~expected & ~np.isin(state, (State.FILLED, State.BAD_INPUT))).sum()
+        )
         violations += int((np.isfinite(raw["points"]).all(-1) != placed).sum())
         violations += int((np.isnan(raw["points"]).all(-1) == placed).sum())
         violations += int((np.isfinite(raw["error"]) != expected).sum())
@@ -99,7 +118,9 @@ def test_d7_no_value_without_its_state(tmp_path, record_row):
 
 
 def between(observed: np.ndarray, longest: int | None) -> np.ndarray:
-    """The slow way: which joints lie in a gap of at most ``longest`` frames with something observed on both sides."""
+    """The slow way: which joints lie in a gap of at most ``longest`` frames with something observed
+    on both sides.
+    """
     inside = np.zeros(observed.shape, bool)
     for joint in range(J if longest else 0):
         last = None

@@ -8,15 +8,40 @@ from ghpt.export import WRITERS, Scene, read_reconstruction
 from reconstructions import about, in_parts, random_reconstruction, rig
 
 NAMES = [
-    "..", ".", "../up", "/absolute", "\\\\server\\share", "C:\\windows", "line\nbreak", "tab\there", "nul\0byte", "a b",
-    "x" * 255, "é" * 127, "膝", "=1+1", "-rf", "%s%n", "'; drop", "</script>", "{brace}", "~", "con", "a:b", "*?",
-]  # fmt: skip
+    "..",
+    ".",
+    "../up",
+    "/absolute",
+    "\\\\server\\share",
+    "C:\\windows",
+    "line\nbreak",
+    "tab\there",
+    "nul\0byte",
+    "a b",
+    "x" * 255,
+    "é" * 127,
+    "膝",
+    "=1+1",
+    "-rf",
+    "%s%n",
+    "'; drop",
+    "</script>",
+    "{brace}",
+    "~",
+    "con",
+    "a:b",
+    "*?",
+]
 PACKAGE = {"parquet": "pyarrow", "rerun": "rerun"}
 
 
 def tree(folder):
     """All files below a folder and their content."""
-    return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    return {
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
 
 
 @pytest.mark.parametrize("format", list(WRITERS))
@@ -33,7 +58,9 @@ def test_a6_names_never_write_outside_the_output(tmp_path, monkeypatch, format, 
     settings = {"scene": Scene(rig(len(NAMES)))} if format in ("html", "rerun") else {}
     WRITERS[format].write(inside / WRITERS[format].file, who, in_parts(made), **settings)
     outside = set(tree(tmp_path)) - {f"a/out/{WRITERS[format].file}", "a/up"}
-    record_row("A6", f"{format}: {len(NAMES)} names, {len(outside)} files outside", int(not outside), 1)
+    record_row(
+        "A6", f"{format}: {len(NAMES)} names, {len(outside)} files outside", int(not outside), 1
+    )
     assert outside == set()
     assert (elsewhere / "up").read_text(encoding="utf-8") == "mine"
 

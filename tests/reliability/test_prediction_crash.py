@@ -29,7 +29,11 @@ def forked(output: Path, frames: int, settings: dict, seconds: float | None = No
     child = os.fork()
     if child == 0:
         try:
-            with open(os.devnull, "w", encoding="utf-8") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+            with (
+                open(os.devnull, "w", encoding="utf-8") as nowhere,
+                redirect_stdout(nowhere),
+                redirect_stderr(nowhere),
+            ):
                 predict(output, frames, settings)
             os._exit(0)
         except BaseException:
@@ -40,7 +44,9 @@ def forked(output: Path, frames: int, settings: dict, seconds: float | None = No
         time.sleep(seconds)
         os.kill(child, signal.SIGKILL)
     status = os.waitpid(child, 0)[1]
-    assert not os.WIFEXITED(status) or os.WEXITSTATUS(status) == 0, (output.parent / "trace").read_text()
+    assert not os.WIFEXITED(status) or os.WEXITSTATUS(status) == 0, (
+        output.parent / "trace"
+    ).read_text()
     return os.WIFEXITED(status)
 
 
@@ -57,8 +63,12 @@ def digests(output: Path) -> dict[str, str]:
 def test_b3_killed_predictions_end_in_the_same_bytes(tmp_path, nightly, record_row, monkeypatch):
     frames, shard, kills = (100_000, 1000, 200) if nightly else (5_000, 100, 20)
     monkeypatch.setattr(sys, "argv", ["predict.py"])  # it is in the files
-    monkeypatch.setattr(command, "provenance", lambda seed: {"ghpt": "0", "commit": "", "seed": seed, "command": ""})
-    settings = config("triangulation=linear", f"shard_frames={shard}", "batch=100", "formats=[npz,csv,trc]")
+    monkeypatch.setattr(
+        command, "provenance", lambda seed: {"ghpt": "0", "commit": "", "seed": seed, "command": ""}
+    )
+    settings = config(
+        "triangulation=linear", f"shard_frames={shard}", "batch=100", "formats=[npz,csv,trc]"
+    )
     started = time.perf_counter()
     assert forked(tmp_path / "whole", frames, settings)
     took = time.perf_counter() - started
@@ -68,7 +78,9 @@ def test_b3_killed_predictions_end_in_the_same_bytes(tmp_path, nightly, record_r
     for kill in range(kills):
         before = listed(output)
         # half of them early, where shards are written; the others anywhere up to the end
-        finished = forked(output, frames, settings, float(random.uniform(0.1, 0.5 if kill % 2 else 1.0) * took))
+        finished = forked(
+            output, frames, settings, float(random.uniform(0.1, 0.5 if kill % 2 else 1.0) * took)
+        )
         assert listed(output) >= before  # nothing that was listed is lost
         there = len(list((output / command.SHARDS).glob("[0-9]*.npz")))
         redone = max(redone, there - listed(output))

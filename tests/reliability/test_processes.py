@@ -16,7 +16,11 @@ SCRIPT = Path(__file__).with_name("run_toy.py")
 def run(folder, processes, samples, **changes):
     wanted = {
         "data": {"train_samples": samples, "missing": 0.3, "batch_size": 16},
-        "trainer": {"devices": processes, "strategy": "ddp" if processes > 1 else "auto", "max_epochs": 7},
+        "trainer": {
+            "devices": processes,
+            "strategy": "ddp" if processes > 1 else "auto",
+            "max_epochs": 7,
+        },
         "model": {"optimizer": {"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.1}},
         **changes,
     }
@@ -29,7 +33,9 @@ def run(folder, processes, samples, **changes):
 
 @pytest.fixture(scope="module")
 def pairs(tmp_path_factory):
-    """97 samples in batches of 16: the last batch is one sample, and the second process has none of it."""
+    """97 samples in batches of 16: the last batch is one sample, and the second process has none of
+    it.
+    """
     folders = {n: tmp_path_factory.mktemp(f"processes{n}") for n in (1, 2)}
     return {n: (run(folder, n, 97, test=True), folder) for n, folder in folders.items()}
 
@@ -44,7 +50,10 @@ def test_training_is_the_same_on_two_processes(pairs, record_row):
     )
     moved = (one["state_dict"]["scorer.network.0.weight"] - initial()).norm()
     record_row(
-        "C2", f"weights after 49 steps, 1 against 2 processes: relative difference {worst:.2g}", worst <= 1e-6, 1
+        "C2",
+        f"weights after 49 steps, 1 against 2 processes: relative difference {worst:.2g}",
+        worst <= 1e-6,
+        1,
     )
     assert moved > 1e-3
     assert worst <= 1e-6
@@ -61,15 +70,24 @@ def test_validation_and_predictions_are_the_same_on_two_processes(pairs, record_
     (one, first), (two, second) = pairs[1], pairs[2]
     a, b = (json.loads((folder / "metrics.json").read_text()) for folder in (first, second))
     assert a["frames"] == b["frames"] == 30
-    # the weights differ in their last digits, so the learned selections do; what does not use them is identical
+    # the weights differ in their last digits, so the learned selections do; what does not use them
+    # is identical
     with np.load(first / "predictions.npz") as x, np.load(second / "predictions.npz") as y:
         assert x.files == y.files
         same = [
             name
             for name in x.files
-            if name != "meta" and np.array_equal(x[name], y[name], equal_nan=x[name].dtype.kind == "f")
+            if name != "meta"
+            and np.array_equal(x[name], y[name], equal_nan=x[name].dtype.kind == "f")
         ]
-        for name in ("points_linear", "points_random", "points_best", "frame", "recording", "truth"):
+        for name in (
+            "points_linear",
+            "points_random",
+            "points_best",
+            "frame",
+            "recording",
+            "truth",
+        ):
             assert name in same
         for name in x.files:
             if name.startswith("points_weight"):
@@ -78,9 +96,15 @@ def test_validation_and_predictions_are_the_same_on_two_processes(pairs, record_
         abs(a["selections"][name]["mpjpe_relative"] / b["selections"][name]["mpjpe_relative"] - 1)
         for name in ("weight", "average", "random", "best", "worst", "linear")
     )
-    record_row("C3", f"test metrics, 1 against 2 processes: relative difference {worst:.2g}", int(worst <= 1e-6), 1)
+    record_row(
+        "C3",
+        f"test metrics, 1 against 2 processes: relative difference {worst:.2g}",
+        int(worst <= 1e-6),
+        1,
+    )
     assert worst <= 1e-6
     scores = [
-        next(v for k, v in c["callbacks"].items() if "ModelCheckpoint" in k)["best_model_score"] for c in (one, two)
+        next(v for k, v in c["callbacks"].items() if "ModelCheckpoint" in k)["best_model_score"]
+        for c in (one, two)
     ]
     assert scores[0].item() == pytest.approx(scores[1].item(), rel=1e-6)

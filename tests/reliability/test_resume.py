@@ -18,7 +18,10 @@ class Crash(Exception):
 
 def settings(workers=0, **changes):
     config = copy.deepcopy(toys.TRAIN) | {"save_every": 1} | changes
-    config["data"] |= {"workers": workers, "train_samples": 70}  # 5 steps an epoch, the last one short
+    config["data"] |= {
+        "workers": workers,
+        "train_samples": 70,
+    }  # 5 steps an epoch, the last one short
     config["trainer"]["max_epochs"] = 3
     return config
 
@@ -28,15 +31,22 @@ def result(folder):
 
 
 def difference(a, b):
-    """Largest absolute difference over weights, optimiser moments and the best validation error; inf if they
-    differ in kind."""
+    """Largest absolute difference over weights, optimiser moments and the best validation error;
+    inf if they differ in kind.
+    """
     if a["global_step"] != b["global_step"] or a["epoch"] != b["epoch"]:
         return float("inf")
-    worst = max((a["state_dict"][k].double() - b["state_dict"][k].double()).abs().max() for k in a["state_dict"])
+    worst = max(
+        (a["state_dict"][k].double() - b["state_dict"][k].double()).abs().max()
+        for k in a["state_dict"]
+    )
     for i, state in a["optimizer_states"][0]["state"].items():
         other = b["optimizer_states"][0]["state"][i]
         worst = max(worst, *((state[k] - other[k]).abs().max() for k in state))
-    best = [next(v for k, v in c["callbacks"].items() if "ModelCheckpoint" in k)["best_model_score"] for c in (a, b)]
+    best = [
+        next(v for k, v in c["callbacks"].items() if "ModelCheckpoint" in k)["best_model_score"]
+        for c in (a, b)
+    ]
     return max(float(worst), abs(float(best[0] - best[1])))
 
 
@@ -70,9 +80,17 @@ def uninterrupted(tmp_path_factory):
 
 @pytest.mark.parametrize(
     ("where", "workers"),
-    [("step 7", 0), ("step 7", 2), ("step 5", 0), ("step 10", 2), ("step 15", 0), ("step 1", 0),
-     ("validation 0", 0), ("validation 1", 0)],
-)  # fmt: skip
+    [
+        ("step 7", 0),
+        ("step 7", 2),
+        ("step 5", 0),
+        ("step 10", 2),
+        ("step 15", 0),
+        ("step 1", 0),
+        ("validation 0", 0),
+        ("validation 1", 0),
+    ],
+)
 def test_resumed_equals_uninterrupted(tmp_path, uninterrupted, where, workers, record_row):
     kind, number = where.split()
     with pytest.MonkeyPatch.context() as patch:

@@ -1,4 +1,6 @@
-"""E1: what is written is read back by two independent readers of each format: numbers, names, rate, units, gaps."""
+"""E1: what is written is read back by two independent readers of each format: numbers, names, rate,
+units, gaps.
+"""
 
 import json
 import struct
@@ -38,7 +40,9 @@ def written(path, format, who, made, **settings):
 
 
 def opensim_table(path):
-    """A TRC file as OpenSim's reader demands it, each rule an assertion: header, times, points [T, J, 3]."""
+    """A TRC file as OpenSim's reader demands it, each rule an assertion: header, times, points [T,
+    J, 3].
+    """
     text = path.read_bytes().decode("utf-8")
     assert "\r" not in text
     assert "nan" not in text.lower()
@@ -57,7 +61,9 @@ def opensim_table(path):
     assert labels[:2] == ["Frame#", "Time"]
     assert len(labels) == markers + 2
     assert cells(lines[3])[2::3] == labels[2:]
-    assert [c for c in cells(lines[4]) if c] == [f"{a}{j}" for j in range(1, markers + 1) for a in "XYZ"]
+    assert [c for c in cells(lines[4]) if c] == [
+        f"{a}{j}" for j in range(1, markers + 1) for a in "XYZ"
+    ]
     assert lines[5] == ""
     assert lines[-1] == ""
     rows = [cells(line) for line in lines[6:-1]]
@@ -75,12 +81,20 @@ def ezc3d_table(path):
     ezc3d = pytest.importorskip("ezc3d", reason="ezc3d reads C3D; it comes with ghpt[test]")
     file = ezc3d.c3d(str(path))
     point = file["parameters"]["POINT"]
-    labels = [label for key in sorted(k for k in point if k.startswith("LABELS")) for label in point[key]["value"]]
+    labels = [
+        label
+        for key in sorted(k for k in point if k.startswith("LABELS"))
+        for label in point[key]["value"]
+    ]
     meta = file["data"]["meta_points"]
     return {
-        "points": file["data"]["points"][:3].transpose(2, 1, 0), "labels": labels, "units": point["UNITS"]["value"],
-        "rate": point["RATE"]["value"][0], "missing": meta["residuals"][0].T < 0, "parameters": file["parameters"],
-    }  # fmt: skip
+        "points": file["data"]["points"][:3].transpose(2, 1, 0),
+        "labels": labels,
+        "units": point["UNITS"]["value"],
+        "rate": point["RATE"]["value"][0],
+        "missing": meta["residuals"][0].T < 0,
+        "parameters": file["parameters"],
+    }
 
 
 def py_c3d_table(path):
@@ -91,20 +105,27 @@ def py_c3d_table(path):
         frames = np.stack([points for _, points, _ in reader.read_frames()])
         labels = reader.get("POINT:LABELS").bytes_array
         found = {
-            "labels": [bytes(label).decode().rstrip() for label in labels], "rate": reader.point_rate,
-            "units": [reader.get("POINT:UNITS").string_value.strip()], "residual": frames[..., 3],
-            "missing": frames[..., 3] < 0, "mask": frames[..., 4],
-        }  # fmt: skip
+            "labels": [bytes(label).decode().rstrip() for label in labels],
+            "rate": reader.point_rate,
+            "units": [reader.get("POINT:UNITS").string_value.strip()],
+            "residual": frames[..., 3],
+            "missing": frames[..., 3] < 0,
+            "mask": frames[..., 4],
+        }
     found["points"] = np.where(frames[..., 3:4] < 0, np.nan, frames[..., :3])
     return found
 
 
 def check_c3d(path, who, made):
-    """Both readers' findings against what was written; the greatest error over float32's of the value."""
+    """Both readers' findings against what was written; the greatest error over float32's of the
+    value.
+    """
     worst = 0.0
     expected = truth(made)
     observed = (made.state == State.OBSERVED).numpy()
-    residual = np.where(observed, np.clip(np.round(made.error.numpy() / RESIDUAL_STEP), 1, 255) * RESIDUAL_STEP, 0)
+    residual = np.where(
+        observed, np.clip(np.round(made.error.numpy() / RESIDUAL_STEP), 1, 255) * RESIDUAL_STEP, 0
+    )
     residual = np.where(made.placed.numpy(), residual, -1)
     for found in (ezc3d_table(path), py_c3d_table(path)):
         error = np.abs(found["points"] - expected) / (EPSILON * np.maximum(np.abs(expected), 1e-30))
@@ -114,7 +135,8 @@ def check_c3d(path, who, made):
         assert list(found["labels"]) == list(who.joints)
         assert list(found["units"]) == ["mm"]
         assert found["rate"] == pytest.approx(who.rate_hz, rel=1e-7)
-    # ezc3d 1.7 takes the high byte for the residual and the low one for the mask; c3d.org has it the other way round.
+    # ezc3d 1.7 takes the high byte for the residual and the low one for the mask; c3d.org has it
+    # the other way round.
     np.testing.assert_array_equal(found["residual"], residual)
     bits = (made.views[:, :7] * 2 ** torch.arange(made.views[:, :7].shape[1])[:, None]).sum(1)
     np.testing.assert_array_equal(found["mask"], np.where(made.placed.numpy(), bits.numpy(), 127))
@@ -150,7 +172,13 @@ def test_e1_c3d_long_recordings_with_the_second_reader(tmp_path, frames):
 
 @pytest.mark.parametrize(
     "joints",
-    [("a",), tuple(f"j{i}" for i in range(255)), ("x" * 255, "y"), ("колено", "膝", "genou gauche"), ("é" * 127, "b")],
+    [
+        ("a",),
+        tuple(f"j{i}" for i in range(255)),
+        ("x" * 255, "y"),
+        ("колено", "膝", "genou gauche"),
+        ("é" * 127, "b"),
+    ],
     ids=["one", "255", "255 bytes", "UTF-8", "254 bytes of UTF-8"],
 )
 def test_e1_labels(tmp_path, joints):
@@ -198,17 +226,23 @@ def test_e1_npz_by_numpy_and_by_its_own_reader(tmp_path):
     parts = list(parts)
     assert [len(p) for p in parts] == [7] * 7 + [1]
     for field in ("frame", "state", "error", "views", "covariance", "score", "swapped"):
-        assert torch.equal(torch.cat([getattr(p, field) for p in parts]), getattr(made, field)), field
+        assert torch.equal(torch.cat([getattr(p, field) for p in parts]), getattr(made, field)), (
+            field
+        )
     points = torch.cat([p.points for p in parts])
     assert torch.equal(points, torch.where(made.placed[..., None], made.points, 0.0))
 
 
 def test_e1_parquet(tmp_path):
-    parquet = pytest.importorskip("pyarrow.parquet", reason="pyarrow reads Parquet; it comes with ghpt[io]")
+    parquet = pytest.importorskip(
+        "pyarrow.parquet", reason="pyarrow reads Parquet; it comes with ghpt[io]"
+    )
     made, who = random_reconstruction(50, seed=7), about()
     table = parquet.read_table(written(tmp_path, "parquet", who, made))
     columns = [table[f"{joint}_{axis}_mm"] for joint in JOINTS for axis in "xyz"]
-    found = np.array([[np.nan if v is None else v for v in c.to_pylist()] for c in columns]).T.reshape(50, 17, 3)
+    found = np.array(
+        [[np.nan if v is None else v for v in c.to_pylist()] for c in columns]
+    ).T.reshape(50, 17, 3)
     assert difference(found, truth(made)) == 0
     assert sum(c.null_count for c in columns) == 3 * int((~made.placed).sum())
     notes = json.loads(table.schema.metadata[b"ghpt"])
@@ -237,7 +271,12 @@ def test_e1_nightly_a_million_frames(tmp_path, nightly, record_row):
     worst = difference(found["points"], truth(made))
     _, _, _, points = opensim_table(written(tmp_path, "trc", who, made))
     trc = difference(points, truth(made))
-    record_row("E1", f"1e6 frames: C3D {worst:.2g} mm, TRC {trc:.2g} mm", int(worst == 0 and trc <= 1e-3), 1)
+    record_row(
+        "E1",
+        f"1e6 frames: C3D {worst:.2g} mm, TRC {trc:.2g} mm",
+        int(worst == 0 and trc <= 1e-3),
+        1,
+    )
     assert worst == 0
     assert trc <= 1e-3
 

@@ -16,11 +16,15 @@ SPOILT = (math.nan, math.inf, -math.inf, 1e308, 1e30, 0.0)
 
 
 def random_problem(rng: np.random.Generator) -> tuple[Observations, Rig]:
-    """2 to 4 cameras around a cloud, any start from near the truth to nonsense, every third with broken numbers."""
+    """2 to 4 cameras around a cloud, any start from near the truth to nonsense, every third with
+    broken numbers.
+    """
     views, joints = int(rng.integers(2, 5)), 17
     points = torch.from_numpy(rng.normal(0, 1, (joints, 3)))
     R = vector_to_matrix(torch.from_numpy(rng.normal(0, rng.choice([0.3, 1.5]), (views, 3))))
-    t = torch.tensor([0, 0, 5.0], dtype=torch.float64) + torch.from_numpy(rng.normal(0, 0.5, (views, 3)))
+    t = torch.tensor([0, 0, 5.0], dtype=torch.float64) + torch.from_numpy(
+        rng.normal(0, 0.5, (views, 3))
+    )
     x = points @ R.mT + t[:, None]
     noise = torch.full((views, joints), 0.003, dtype=torch.float64)
     xy = x[..., :2] / x[..., 2:] + 0.003 * torch.from_numpy(rng.normal(0, 1, (views, joints, 2)))
@@ -39,11 +43,19 @@ def random_problem(rng: np.random.Generator) -> tuple[Observations, Rig]:
 
 
 def residuals(seen_by: Observations, rig: Rig, step: torch.Tensor) -> torch.Tensor:
-    """Of the used observations, in units of noise, after a step (rotation vectors, translations, points)."""
+    """Of the used observations, in units of noise, after a step (rotation vectors, translations,
+    points).
+    """
     views = len(rig.R)
-    w, t, x = step[: 3 * views].view(-1, 3), step[3 * views : 6 * views].view(-1, 3), step[6 * views :].view(-1, 3)
+    w, t, x = (
+        step[: 3 * views].view(-1, 3),
+        step[3 * views : 6 * views].view(-1, 3),
+        step[6 * views :].view(-1, 3),
+    )
     zero = torch.zeros_like(w[:, 0])
-    skew = torch.stack((zero, -w[:, 2], w[:, 1], w[:, 2], zero, -w[:, 0], -w[:, 1], w[:, 0], zero), -1).view(-1, 3, 3)
+    skew = torch.stack(
+        (zero, -w[:, 2], w[:, 1], w[:, 2], zero, -w[:, 0], -w[:, 1], w[:, 0], zero), -1
+    ).view(-1, 3, 3)
     R = rig.R + skew @ rig.R  # exp to first order: enough for derivatives at 0
     in_camera = (rig.points + x) @ R.mT + (rig.t + t)[:, None]
     error = (in_camera[..., :2] / in_camera[..., 2:] - seen_by.xy) / seen_by.noise[..., None]
@@ -51,7 +63,9 @@ def residuals(seen_by: Observations, rig: Rig, step: torch.Tensor) -> torch.Tens
 
 
 def independent(seen_by: Observations, rig: Rig, scale: float) -> tuple[float, float, bool]:
-    """Cost, what a Newton step could gain (dense, by automatic derivatives), and whether all is in front."""
+    """Cost, what a Newton step could gain (dense, by automatic derivatives), and whether all is in
+    front.
+    """
     depth = (rig.points @ rig.R.mT + rig.t[:, None])[..., 2]
     start = torch.zeros(6 * len(rig.R) + rig.points.numel(), dtype=torch.float64)
     r = residuals(seen_by, rig, start)
@@ -65,7 +79,11 @@ def independent(seen_by: Observations, rig: Rig, scale: float) -> tuple[float, f
     values, vectors = torch.linalg.eigh(H * unit * unit[:, None])
     along = vectors.T @ (unit * gradient)
     known = values > 1e-9 * values[-1]
-    return cost, float((along[known] ** 2 / values[known]).sum() / 2), bool((depth[rig.inlier] > 0).all())
+    return (
+        cost,
+        float((along[known] ** 2 / values[known]).sum() / 2),
+        bool((depth[rig.inlier] > 0).all()),
+    )
 
 
 def test_d5_converged_is_never_claimed_falsely(nightly, record_row):
@@ -87,7 +105,12 @@ def test_d5_converged_is_never_claimed_falsely(nightly, record_row):
         small = gain <= 1.1 * ADJUST.tolerance * cost + 1e-9
         if not (in_front and small and abs(cost - found.final.cost) <= 1e-9 * cost + 1e-9):
             wrong.append((seed, cost, found.final.cost, gain, in_front))
-    record_row("D5", f"bundle adjustment: {claims} claims of {total} starts", total - len({w[0] for w in wrong}), total)
+    record_row(
+        "D5",
+        f"bundle adjustment: {claims} claims of {total} starts",
+        total - len({w[0] for w in wrong}),
+        total,
+    )
     assert not wrong
     assert claims > total / 5  # a solver that never claims anything would pass
 
@@ -97,7 +120,11 @@ def test_d5_the_cap_holds_and_is_not_called_convergence(iterations):
     for seed in range(100):
         seen_by, rig = random_problem(np.random.default_rng(seed))
         whole = ADJUST(seen_by, rig)
-        if whole.converged and whole.iterations > 2 * iterations and whole.start_cost > 100 * whole.final.cost:
+        if (
+            whole.converged
+            and whole.iterations > 2 * iterations
+            and whole.start_cost > 100 * whole.final.cost
+        ):
             break
     else:
         pytest.fail("no start needs that many steps")

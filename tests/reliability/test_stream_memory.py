@@ -36,11 +36,19 @@ print("figures", max(seen[-third:]) - max(seen[third:-third]), anonymous()["VmHW
 
 def test_e2_memory_is_flat_over_the_frames(tmp_path, nightly, record_row):
     frames = 1_000_000 if nightly else 24_000
-    script = SCRIPT.format(tests=str(Path(__file__).parents[1]), frames=frames, output=str(tmp_path / "out"))
-    run = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=1200)
+    script = SCRIPT.format(
+        tests=str(Path(__file__).parents[1]), frames=frames, output=str(tmp_path / "out")
+    )
+    run = subprocess.run(
+        [sys.executable, "-c", script], capture_output=True, text=True, timeout=1200
+    )
     assert run.returncode == 0, run.stderr
     growth, peak = map(int, run.stdout.split("figures")[1].split())
-    record_row("E2", f"{frames} frames: {growth} KiB more in the last third than in the one before, peak {peak} KiB",
-               int(growth <= 1024), 1)  # fmt: skip
+    record_row(
+        "E2",
+        f"{frames} frames: {growth} KiB more in the last third than in the one before, peak {peak} KiB",
+        int(growth <= 1024),
+        1,
+    )
     assert growth <= 1024
     assert peak <= (512 + 300) * 1024  # with torch itself

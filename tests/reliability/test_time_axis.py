@@ -1,4 +1,6 @@
-"""E5: whatever is missing, doubled or out of order, a frame's pose stands at its own number, or an error says why."""
+"""E5: whatever is missing, doubled or out of order, a frame's pose stands at its own number, or an
+error says why.
+"""
 
 import json
 import re
@@ -89,7 +91,9 @@ def nobody(folder: Path) -> None:
 def other_names(folder: Path) -> None:
     """Numbers in the camera's name do not count, the last one does."""
     for path in list((folder / "cam3_json").iterdir()):
-        path.rename(path.with_name(f"2024-05-{path.stem[-2:]}_run7_{path.stem[-6:]}_keypoints.json"))
+        path.rename(
+            path.with_name(f"2024-05-{path.stem[-2:]}_run7_{path.stem[-6:]}_keypoints.json")
+        )
 
 
 ALL = [(view, 6) for view in range(4)]
@@ -121,15 +125,19 @@ REFUSED: dict[str, tuple[Case, str]] = {
     "a name without a number": (unnumbered, "no frame number"),
     "another number of joints in a frame": (people(0, 6, [PIXELS[6, 0][:14]]), "joints"),
     "another number of joints in a view": (
-        lambda folder: [people(2, f, [PIXELS[f, 2][:14]])(folder) for f in FRAMES], "joints",
+        lambda folder: [people(2, f, [PIXELS[f, 2][:14]])(folder) for f in FRAMES],
+        "joints",
     ),
     "a truncated file": (truncated, "cam1_000007.json"),
     "nobody anywhere": (nobody, "empty|no key point"),
-}  # fmt: skip
+}
 
 
 def predicted(folder: Path, keypoints: Path, *words: str):
-    predict(config(f"keypoints={keypoints}", f"cameras={cameras_file(folder)}", *WORDS, *words), folder / "out")
+    predict(
+        config(f"keypoints={keypoints}", f"cameras={cameras_file(folder)}", *WORDS, *words),
+        folder / "out",
+    )
     _, parts = read_reconstruction(folder / "out" / "poses.npz")
     return next(iter(parts))
 
@@ -167,7 +175,8 @@ def arrays(frame: list[int]) -> dict[str, np.ndarray]:
 
 @pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
 @pytest.mark.parametrize(
-    ("frame", "said"), [([3, 4, 9, 10, 40], None), ([3, 4, 4, 5], "rise"), ([3, 5, 4], "rise"), ([9, 8, 7], "rise")]
+    ("frame", "said"),
+    [([3, 4, 9, 10, 40], None), ([3, 4, 4, 5], "rise"), ([3, 5, 4], "rise"), ([9, 8, 7], "rise")],
 )
 def test_e5_numbers_in_an_npz_file(tmp_path, save, frame, said):
     save(tmp_path / "points.npz", **arrays(frame))

@@ -38,7 +38,9 @@ for line in sys.stdin:  # one fork for each kill: torch is imported once
 
 
 def kill_while_saving(saver, number, delay):
-    """Let the saver save on and on, kill it ``delay`` seconds after its first save; the last number it saved."""
+    """Let the saver save on and on, kill it ``delay`` seconds after its first save; the last number
+    it saved.
+    """
     print(number, file=saver.stdin, flush=True)
     pid = int(saver.stdout.readline().split()[1])
     saved = saver.stdout.readline()
@@ -50,7 +52,9 @@ def kill_while_saving(saver, number, delay):
 
 
 def test_b1_kill_while_saving(tmp_path, nightly, record_row):
-    """24 MB checkpoints, saved without a pause, the system's temporary folder on another file system."""
+    """24 MB checkpoints, saved without a pause, the system's temporary folder on another file
+    system.
+    """
     other = Path("/dev/shm") if Path("/dev/shm").is_dir() else tmp_path
     environment = os.environ | {"TMPDIR": str(other), "OMP_NUM_THREADS": "1"}
     path, kills, number = tmp_path / "last.ckpt", 300 if nightly else 20, 0
@@ -58,7 +62,12 @@ def test_b1_kill_while_saving(tmp_path, nightly, record_row):
     rng = random.Random(0)
     bad = left_over = 0
     with subprocess.Popen(
-        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+        command,
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        bufsize=1,
     ) as saver:
         for _ in range(kills):
             saved = kill_while_saving(saver, number, rng.uniform(0, 0.2))
@@ -71,7 +80,12 @@ def test_b1_kill_while_saving(tmp_path, nightly, record_row):
             left_over += len(list(tmp_path.iterdir())) - 1
             number = saved + 1
         saver.stdin.close()
-    record_row("B1", f"{kills} kills while saving: {bad} unreadable or lost, {left_over} left over", kills - bad, kills)
+    record_row(
+        "B1",
+        f"{kills} kills while saving: {bad} unreadable or lost, {left_over} left over",
+        kills - bad,
+        kills,
+    )
     assert (bad, left_over) == (0, 0)
 
 
@@ -84,7 +98,9 @@ def test_b1_and_b2_kill_training_and_resume(tmp_path, nightly, record_row):
     def start(folder, resume):
         wanted = {**changes, "train": changes["train"] | {"resume": resume}}
         command = [sys.executable, str(SCRIPT), str(folder), json.dumps(wanted)]
-        return subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        return subprocess.Popen(
+            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
 
     assert start(tmp_path / "whole", False).wait(timeout=300) == 0
     expected = read_checkpoint(tmp_path / "whole" / "last.ckpt")["state_dict"]
@@ -103,12 +119,19 @@ def test_b1_and_b2_kill_training_and_resume(tmp_path, nightly, record_row):
         found = read_checkpoint(folder / "last.ckpt")["state_dict"]
         same += all(torch.equal(found[k], v) for k, v in expected.items())
         assert not [p for p in folder.iterdir() if p.name.endswith(".tmp")]
-    record_row("B2", f"{runs} killed and resumed training runs: {same} end with identical weights", same, runs)
+    record_row(
+        "B2",
+        f"{runs} killed and resumed training runs: {same} end with identical weights",
+        same,
+        runs,
+    )
     assert same == runs
 
 
 class Failing:
-    """Stands for the ``os`` module and for ``open`` in ghpt.files; the ``fail``-th call of interest raises."""
+    """Stands for the ``os`` module and for ``open`` in ghpt.files; the ``fail``-th call of interest
+    raises.
+    """
 
     def __init__(self, fail, code):
         self.calls, self.fail, self.code = [], fail, code
@@ -157,7 +180,9 @@ def test_b4_any_call_of_a_save_may_fail(tmp_path, monkeypatch, code, record_row)
 
     def save(number):
         state = {"x": torch.full((2000,), float(number))}
-        AtomicCheckpointIO().save_checkpoint({"state_dict": state, FIELD: {"format_version": FORMAT_VERSION}}, path)
+        AtomicCheckpointIO().save_checkpoint(
+            {"state_dict": state, FIELD: {"format_version": FORMAT_VERSION}}, path
+        )
 
     save(1)
     fail = done = 0
@@ -180,4 +205,6 @@ def test_b4_any_call_of_a_save_may_fail(tmp_path, monkeypatch, code, record_row)
         done += 1
     kinds = set(failing.calls)
     assert {"create", "write", "flush", "fsync", "replace", "open"} <= kinds
-    record_row("B4", f"{os.strerror(code)}: each of the {done} calls of a save failed in turn", done, done)
+    record_row(
+        "B4", f"{os.strerror(code)}: each of the {done} calls of a save failed in turn", done, done
+    )

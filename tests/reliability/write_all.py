@@ -16,5 +16,7 @@ if __name__ == "__main__":
     who = about(joints=("İIıi", "hip", *(f"joint_{j}" for j in range(15))))
     for format in FORMATS:
         settings = {"scene": Scene(rig(3))} if format == "html" else {}
-        WRITERS[format].write(Path(sys.argv[1]) / WRITERS[format].file, who, in_parts(made), **settings)
+        WRITERS[format].write(
+            Path(sys.argv[1]) / WRITERS[format].file, who, in_parts(made), **settings
+        )
     print(locale.localeconv()["decimal_point"])

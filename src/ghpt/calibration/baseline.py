@@ -12,13 +12,16 @@ from ghpt.recording import PairBatch, RelativePoseEstimate
 
 
 class RigBaseline:
-    """``baseline(batch)``: the rig of each draw calibrated once, from all views of its frames, gives the relative poses
-    of its pairs, with t of length 1. ``remembered`` draws are kept for the batches to come; ``seed`` is that of the
-    calibration."""
+    """``baseline(batch)``: the rig of each draw calibrated once, from all views of its frames,
+    gives the relative poses of its pairs, with t of length 1. ``remembered`` draws are kept for the
+    batches to come; ``seed`` is that of the calibration.
+    """
 
     def __init__(self, calibration: RigCalibration, remembered: int, seed: int) -> None:
         check(remembered >= 1, "remembered", f"is {remembered}", "It must be >= 1.")
-        self.calibration, self.remembered, self.seed = calibration, remembered, seed
+        self.calibration = calibration
+        self.remembered = remembered
+        self.seed = seed
         self._found: OrderedDict[tuple, RigEstimate] = OrderedDict()
 
     @torch.no_grad()
@@ -42,17 +45,23 @@ class RigBaseline:
         eye = torch.eye(3, dtype=R.dtype)
         turn = torch.where(ok[:, None, None], turn, eye)
         shift = torch.where(ok[:, None], shift / torch.where(ok, length, 1.0)[:, None], 0.0)
-        return RelativePoseEstimate(turn.double().to(device), shift.double().to(device), ok.to(device))
+        return RelativePoseEstimate(
+            turn.double().to(device), shift.double().to(device), ok.to(device)
+        )
 
     def _rig(self, batch: PairBatch, item: int) -> RigEstimate:
         key_points = batch.key_points[item].transpose(0, 1).cpu()
         # the sum tells draws of different data sets apart, whose numbers are the same
         known = int(batch.rig[item]), int(batch.draw[item]), float(key_points.double().sum())
         if known not in self._found:
-            confidence, seen = (x[item].transpose(0, 1).cpu() for x in (batch.confidence, batch.seen))
+            confidence, seen = (
+                x[item].transpose(0, 1).cpu() for x in (batch.confidence, batch.seen)
+            )
             K = batch.cameras.K[item].double().cpu()
             names = [str(view) for view in range(len(K))]
-            self._found[known] = self.calibration(names, K, key_points, confidence, seen, None, self.seed)
+            self._found[known] = self.calibration(
+                names, K, key_points, confidence, seen, None, self.seed
+            )
         self._found.move_to_end(known)
         while len(self._found) > self.remembered:
             self._found.popitem(last=False)

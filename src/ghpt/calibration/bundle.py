@@ -1,4 +1,6 @@
-"""Bundle adjustment of extrinsics and points with constant intrinsics: pycolmap's (Ceres), checked afterwards."""
+"""Bundle adjustment of extrinsics and points with constant intrinsics: pycolmap's (Ceres), checked
+afterwards.
+"""
 
 from __future__ import annotations
 
@@ -27,14 +29,16 @@ class Adjusted:
     iterations: int
     seconds: float
     converged: bool
-    """Finite, in front of every camera, cost not above the start's, and what a Newton step could still gain at most
-    ``tolerance`` of the cost."""
+    """Finite, in front of every camera, cost not above the start's, and what a Newton step could
+    still gain at most ``tolerance`` of the cost.
+    """
 
 
 @dataclass(frozen=True)
 class BundleAdjustment:
-    """Cauchy loss of scale ``loss_scale`` (units of noise); at most ``iterations`` steps and ``seconds``;
-    ``tolerance``: see ``Adjusted.converged``."""
+    """Cauchy loss of scale ``loss_scale`` (units of noise); at most ``iterations`` steps and
+    ``seconds``; ``tolerance``: see ``Adjusted.converged``.
+    """
 
     loss_scale: float
     iterations: int
@@ -46,20 +50,29 @@ class BundleAdjustment:
         check_positive(tolerance=self.tolerance)
 
     def __call__(self, seen_by: Observations, rig: Rig) -> Adjusted:
-        """Adjust the rig's placed views and its points to their inliers. Never raises on values; a rig that could not
-        be improved comes back as it was, with ``converged`` False where it is not at a minimum."""
+        """Adjust the rig's placed views and its points to their inliers. Never raises on values; a
+        rig that could not be improved comes back as it was, with ``converged`` False where it is
+        not at a minimum.
+        """
         used = rig.inlier
         rig = replace(rig, points=torch.where(used.any(0)[:, None], rig.points, 0.0))
         start = self.state(seen_by, rig)
         solved, report = self._solve(seen_by, rig, used) if start.finite else (rig, None)
         final = self.state(seen_by, solved)
         if not (final.finite and final.cost <= start.cost * (1 + 1e-12)):
-            solved, final = rig, start
+            solved = rig
+            final = start
         converged = (
-            final.finite and final.in_front and final.gain <= self.tolerance * max(final.cost, 1e-12 * int(used.sum()))
+            final.finite
+            and final.in_front
+            and final.gain <= self.tolerance * max(final.cost, 1e-12 * int(used.sum()))
         )
         # Ceres counts the start as a successful step
-        steps = 0 if report is None else max(report.num_successful_steps + report.num_unsuccessful_steps - 1, 0)
+        steps = (
+            0
+            if report is None
+            else max(report.num_successful_steps + report.num_unsuccessful_steps - 1, 0)
+        )
         seconds = 0.0 if report is None else report.total_time_in_seconds
         return Adjusted(solved, start.cost, final, steps, seconds, bool(converged))
 
@@ -67,13 +80,17 @@ class BundleAdjustment:
         """Cost and derivatives of a rig as it is."""
         return linearise(seen_by, rig, rig.inlier, self.loss_scale)
 
-    def _solve(self, seen_by: Observations, rig: Rig, used: Bool[Tensor, "V N"]) -> tuple[Rig, object | None]:
+    def _solve(
+        self, seen_by: Observations, rig: Rig, used: Bool[Tensor, "V N"]
+    ) -> tuple[Rig, object | None]:
         views = torch.nonzero(rig.placed & used.any(1))[:, 0].tolist()
         chosen = np.flatnonzero(used.any(0).numpy())
         if len(views) < 2 or not len(chosen):
             return rig, None
-        model, config = pycolmap.Reconstruction(), pycolmap.BundleAdjustmentConfig()
-        mask, slot = used[:, chosen].numpy(), np.zeros(len(chosen), dtype=np.int64)
+        model = pycolmap.Reconstruction()
+        config = pycolmap.BundleAdjustmentConfig()
+        mask = used[:, chosen].numpy()
+        slot = np.zeros(len(chosen), dtype=np.int64)
         joint = seen_by.joint.numpy()[chosen]
         for j in np.unique(joint):
             slot[joint == j] = np.arange((joint == j).sum())
@@ -81,11 +98,16 @@ class BundleAdjustment:
             _add_view(model, config, seen_by, rig, v, chosen, joint)
         ids = []
         for n, point in enumerate(rig.points.numpy()[chosen]):
-            track = [pycolmap.TrackElement(_image(v, joint[n]), slot[n]) for v in np.flatnonzero(mask[:, n])]
+            track = [
+                pycolmap.TrackElement(_image(v, joint[n]), slot[n])
+                for v in np.flatnonzero(mask[:, n])
+            ]
             ids.append(model.add_point3D(point, pycolmap.Track(track)))
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
         report = pycolmap.create_default_bundle_adjuster(self._options(), config, model).solve()
-        R, t, points = rig.R.clone(), rig.t.clone(), rig.points.clone()
+        R = rig.R.clone()
+        t = rig.t.clone()
+        points = rig.points.clone()
         for v in views:
             pose = model.frame(v + 1).rig_from_world
             R[v] = torch.from_numpy(pose.rotation.matrix().copy())
@@ -95,7 +117,9 @@ class BundleAdjustment:
 
     def _options(self) -> pycolmap.BundleAdjustmentOptions:
         options = pycolmap.BundleAdjustmentOptions()
-        options.refine_focal_length = options.refine_principal_point = options.refine_extra_params = False
+        options.refine_focal_length = options.refine_principal_point = (
+            options.refine_extra_params
+        ) = False
         options.refine_sensor_from_rig = False
         options.print_summary = False
         options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -104,7 +128,9 @@ class BundleAdjustment:
         solver.max_num_iterations = self.iterations
         solver.max_solver_time_in_seconds = self.seconds
         solver.num_threads = 1  # sums in one order: the same rig on any machine
-        solver.function_tolerance, solver.gradient_tolerance, solver.parameter_tolerance = 1e-10, 1e-12, 1e-10
+        solver.function_tolerance = 1e-10
+        solver.gradient_tolerance = 1e-12
+        solver.parameter_tolerance = 1e-10
         options.ceres.solver_options = solver
         return options
 
@@ -126,8 +152,9 @@ def _add_view(
     chosen: np.ndarray,
     joint: np.ndarray,
 ) -> None:
-    """A view as a pycolmap rig with one pose and a camera for each joint, whose pixel is that joint's noise: so Ceres
-    weighs joints, which it has no other way to do."""
+    """A view as a pycolmap rig with one pose and a camera for each joint, whose pixel is that
+    joint's noise: so Ceres weighs joints, which it has no other way to do.
+    """
     body = pycolmap.Rig(rig_id=view + 1)
     frame = pycolmap.Frame(frame_id=view + 1, rig_id=view + 1)
     images = []
@@ -135,9 +162,13 @@ def _add_view(
         own = chosen[joint == j]
         focal = 1 / float(seen_by.noise[view, own[0]])
         number = _image(view, j)
-        camera = pycolmap.Camera(camera_id=number, model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0.0, 0.0])
+        camera = pycolmap.Camera(
+            camera_id=number, model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0.0, 0.0]
+        )
         model.add_camera(camera)
-        body.add_sensor(camera.sensor_id, pycolmap.Rigid3d()) if images else body.add_ref_sensor(camera.sensor_id)
+        body.add_sensor(camera.sensor_id, pycolmap.Rigid3d()) if images else body.add_ref_sensor(
+            camera.sensor_id
+        )
         # what is not used may be anything
         xy = torch.where(rig.inlier[view, own][:, None], seen_by.xy[view, own], 0.0).numpy() * focal
         image = pycolmap.Image(name=str(number), keypoints=xy, camera_id=number, image_id=number)
@@ -146,7 +177,9 @@ def _add_view(
         images.append(image)
         config.add_image(number)
         config.set_constant_cam_intrinsics(number)
-    frame.rig_from_world = pycolmap.Rigid3d(pycolmap.Rotation3d(rig.R[view].numpy()), rig.t[view].numpy())
+    frame.rig_from_world = pycolmap.Rigid3d(
+        pycolmap.Rotation3d(rig.R[view].numpy()), rig.t[view].numpy()
+    )
     model.add_rig(body)
     model.add_frame(frame)
     for image in images:

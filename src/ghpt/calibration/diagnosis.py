@@ -1,4 +1,6 @@
-"""What is wrong with a recording or the rig it gave, by name, with the number that shows it and the mend."""
+"""What is wrong with a recording or the rig it gave, by name, with the number that shows it and the
+mend.
+"""
 
 from __future__ import annotations
 
@@ -57,29 +59,47 @@ class Case:
         return None if self.adjusted is None else self.adjusted.rig
 
     def named(self, views: Bool[Tensor, " V"]) -> tuple[str, ...]:
-        return tuple(name for name, chosen in zip(self.names, views.tolist(), strict=True) if chosen)
+        return tuple(
+            name for name, chosen in zip(self.names, views.tolist(), strict=True) if chosen
+        )
 
     def repaired(self, view: int) -> Iterator[Diagnosis]:
         """The user's mistake that explains why a view does not agree with the others, if one does."""
         chosen = self.key_points[self.frames], self.usable[self.frames]
         repair = find_repair(
-            self.names, self.K, *chosen, self.sizes, self.noise, self.table, view, self.resection, self.seed
+            self.names,
+            self.K,
+            *chosen,
+            self.sizes,
+            self.noise,
+            self.table,
+            view,
+            self.resection,
+            self.seed,
         )
         if repair is not None:
             text = f"{repair.text} ({repair.share:.0%} of its key points then agree)"
             yield Diagnosis(repair.code, "error", (self.names[view],), text, repair.share)
 
     def agreement(self, rig: Rig) -> tuple[Float[Tensor, " V"], Float[Tensor, " V"]]:
-        """Median error in pixels, and share of inliers, of each placed view's key points whose point is known."""
+        """Median error in pixels, and share of inliers, of each placed view's key points whose
+        point is known.
+        """
         known = self.seen_by.seen & rig.inlier.any(0) & rig.placed[:, None]
         focal = (self.K[:, 0, 0] * self.K[:, 1, 1]).double().sqrt()[:, None]
         pixels = self.seen_by.error(rig.R, rig.t, rig.points) * self.seen_by.noise * focal
-        median = torch.where(known, pixels, torch.nan).nanmedian(-1).values.nan_to_num(0.0, posinf=0.0)
+        median = (
+            torch.where(known, pixels, torch.nan).nanmedian(-1).values.nan_to_num(0.0, posinf=0.0)
+        )
         return median, rig.inlier.sum(-1) / known.sum(-1).clamp(min=1).double()
 
 
-def of_stature(points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]) -> Iterator[Diagnosis]:
-    """Whether the person in the scaled rig (mm) is of human size: an error for a size that is nobody's."""
+def of_stature(
+    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]
+) -> Iterator[Diagnosis]:
+    """Whether the person in the scaled rig (mm) is of human size: an error for a size that is
+    nobody's.
+    """
     height = float(stature(points, estimated))
     if not height or STATURES[0] <= height <= STATURES[1]:
         return

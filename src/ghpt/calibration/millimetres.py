@@ -1,4 +1,6 @@
-"""What makes millimetres of a calibrated rig: a body height, measured segments, a known distance, or an assumption."""
+"""What makes millimetres of a calibrated rig: a body height, measured segments, a known distance,
+or an assumption.
+"""
 
 from __future__ import annotations
 
@@ -17,24 +19,37 @@ from ghpt.calibration.rig import RigEstimate
 from ghpt.data.formats.names import chosen_name
 from ghpt.errors import GhptConfigError, check
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.relative_pose.scale import SEGMENTS, BodyHeight, SegmentLengths, body_scale, typical_lengths
+from ghpt.models.relative_pose.scale import (
+    SEGMENTS,
+    BodyHeight,
+    SegmentLengths,
+    body_scale,
+    typical_lengths,
+)
 
 UNITS = {"millimetres": 1.0, "centimetres": 10.0, "metres": 1000.0}
 _HEIGHTS = (800.0, 2600.0)
-"""mm. A height in inches lies below the least in centimetres, one in feet between the centimetres and the metres."""
-_STATURES, _PROPORTIONS = (1000.0, 2300.0), (0.7, 1.35)
+"""mm. A height in inches lies below the least in centimetres, one in feet between the centimetres
+and the metres.
+"""
+_STATURES = (1000.0, 2300.0)
+_PROPORTIONS = (0.7, 1.35)
 """Of measured segments: whose (mm), and by what they differ from an average adult's."""
 _APART = (200.0, 20_000.0)
 """mm: how far two cameras of a rig are apart."""
 Person = tuple[Float[Tensor, "T J 3"], Bool[Tensor, "T J"]]
 Measure = Callable[[Cameras], Person]
-"""The joints of the recording as a rig of all cameras gives them, in the rig's unit, and which are estimated."""
+"""The joints of the recording as a rig of all cameras gives them, in the rig's unit, and which are
+estimated.
+"""
 _log = logging.getLogger(__name__)
 
 
 def read_scale(scale: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """The scale with every length in millimetres. A length that can only be of centimetres or metres is taken for one,
-    and that is logged. Raises GhptConfigError for more than one source of scale, or one that cannot be."""
+    """The scale with every length in millimetres. A length that can only be of centimetres or
+    metres is taken for one, and that is logged. Raises GhptConfigError for more than one source of
+    scale, or one that cannot be.
+    """
     given = [key for key in ("height", "segments", "baseline") if scale[key] is not None]
     check(len(given) < 2, "scale", f"has {' and '.join(given)}", "Give one of them.")
     found = dict(scale)
@@ -59,7 +74,8 @@ def _height(key: str, value: Any) -> float:
 
 def _segments(lengths: Mapping[str, Any]) -> dict[str, float]:
     """All in one unit: that in which each of them is the length of such a part of a person."""
-    key, mend = "scale.segments", "Give lengths in millimetres: {thigh: 430}, say."
+    key = "scale.segments"
+    mend = "Give lengths in millimetres: {thigh: 430}, say."
     for name, value in lengths.items():
         check(_is_number(value), key, f"says {name} is {value!r}", mend)
     try:
@@ -71,7 +87,9 @@ def _segments(lengths: Mapping[str, Any]) -> dict[str, float]:
     fits = set(UNITS)
     for name, value in lengths.items():
         share = typical.get(str(name)) or typical[f"right_{name}"]
-        own = {unit for unit, mm in UNITS.items() if low * share <= float(value) * mm <= high * share}
+        own = {
+            unit for unit, mm in UNITS.items() if low * share <= float(value) * mm <= high * share
+        }
         check(bool(own), key, f"says {name} is {value}, which is nobody's in mm, cm or m", mend)
         fits &= own
     check(bool(fits), key, f"has lengths of different units: {dict(lengths)}", mend)
@@ -81,10 +99,16 @@ def _segments(lengths: Mapping[str, Any]) -> dict[str, float]:
 
 def _baseline(baseline: Sequence[Any], names: Sequence[str]) -> list[Any]:
     key = "scale.baseline"
-    mend = f"Give two of {', '.join(names)} and their distance in mm: [{names[0]}, {names[-1]}, 3000]."
-    good = len(baseline) == 3 and len({chosen_name(name, names) for name in baseline[:2]} & set(names)) == 2
+    mend = (
+        f"Give two of {', '.join(names)} and their distance in mm: [{names[0]}, {names[-1]}, 3000]."
+    )
+    good = (
+        len(baseline) == 3
+        and len({chosen_name(name, names) for name in baseline[:2]} & set(names)) == 2
+    )
     check(good and _is_number(baseline[2]), key, f"is {baseline}", mend)
-    length, (least, most) = float(baseline[2]), _APART
+    length = float(baseline[2])
+    (least, most) = _APART
     if length >= least:
         return [*baseline[:2], length]
     metres = least <= length * UNITS["metres"] <= most
@@ -107,15 +131,24 @@ def _in_mm(key: str, value: float, unit: str) -> float:
 def in_millimetres(
     estimate: RigEstimate, scale: Mapping[str, Any], measure: Measure
 ) -> tuple[RigEstimate, dict[str, Any]]:
-    """The rig in millimetres, and what its scale is from; as it was, in a unit of its own, if nothing gives one.
+    """The rig in millimetres, and what its scale is from; as it was, in a unit of its own, if
+    nothing gives one.
 
-    ``scale`` is what ``read_scale`` gives. A body is measured on what ``measure`` gives, so that every command that
-    triangulates the recording with this rig measures the same stature.
+    ``scale`` is what ``read_scale`` gives. A body is measured on what ``measure`` gives, so that
+    every command that triangulates the recording with this rig measures the same stature.
     """
     if scale["baseline"] is not None:
-        a, b = (estimate.names.index(chosen_name(name, estimate.names)) for name in scale["baseline"][:2])
-        centre, mm = estimate.cameras.centre, float(scale["baseline"][2])
-        length = float((centre[a] - centre[b]).norm()) if bool(estimate.calibrated[[a, b]].all()) else 0.0
+        a, b = (
+            estimate.names.index(chosen_name(name, estimate.names))
+            for name in scale["baseline"][:2]
+        )
+        centre = estimate.cameras.centre
+        mm = float(scale["baseline"][2])
+        length = (
+            float((centre[a] - centre[b]).norm())
+            if bool(estimate.calibrated[[a, b]].all())
+            else 0.0
+        )
         factor = mm / length if length > 0 else 0.0
         found = {
             "from": "baseline",
@@ -123,7 +156,9 @@ def in_millimetres(
         }
     elif scale["segments"] is not None:
         lengths = SegmentLengths(scale["segments"]).lengths
-        listed = ", ".join(f"{name.replace('_', ' ')} {mm:g} mm" for name, mm in scale["segments"].items())
+        listed = ", ".join(
+            f"{name.replace('_', ' ')} {mm:g} mm" for name, mm in scale["segments"].items()
+        )
         found = {"from": "segments", "text": f"from measured segments: {listed}"}
         factor = _body_factor(estimate, lengths, measure)
     else:

@@ -21,34 +21,48 @@ class Observations:
     xy: Float[Tensor, "V N 2"]
     """Normalised image coordinates; 0 where not seen."""
     noise: Float[Tensor, "V N"]
-    """Standard deviation that is assumed of x and of y, > 0: errors in units of it compare across views and joints."""
+    """Standard deviation that is assumed of x and of y, > 0: errors in units of it compare across
+    views and joints.
+    """
     seen: Bool[Tensor, "V N"]
     frame: Int[Tensor, " N"]
     """Which of the T frames a point is of."""
     joint: Int[Tensor, " N"]
 
     def focal(self, view: int) -> float:
-        """The focal length of a view whose pixel is its typical noise: what foreign solvers with one threshold need."""
+        """The focal length of a view whose pixel is its typical noise: what foreign solvers with
+        one threshold need.
+        """
         return 1 / float(self.noise[view].median())
 
     def error(
-        self, R: Float[Tensor, "*H V 3 3"], t: Float[Tensor, "*H V 3"], points: Float[Tensor, "*H N 3"]
+        self,
+        R: Float[Tensor, "*H V 3 3"],
+        t: Float[Tensor, "*H V 3"],
+        points: Float[Tensor, "*H N 3"],
     ) -> Float[Tensor, "*H V N"]:
         """Reprojection errors in units of noise; inf behind a camera."""
         cameras = Cameras(torch.eye(3, dtype=R.dtype).expand_as(R), R, t)
-        return reprojection_error(cameras, self.xy.expand(*points.shape[:-2], -1, -1, -1), points) / self.noise
+        return (
+            reprojection_error(cameras, self.xy.expand(*points.shape[:-2], -1, -1, -1), points)
+            / self.noise
+        )
 
 
 def usable(
     K: Float[Tensor, "V 3 3"], key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]
 ) -> Bool[Tensor, "T V J"]:
-    """Seen key points with finite numbers, in views with finite intrinsics and positive focal lengths."""
+    """Seen key points with finite numbers, in views with finite intrinsics and positive focal
+    lengths.
+    """
     focal = torch.stack((K[:, 0, 0], K[:, 1, 1]), dim=-1)
     valid = torch.isfinite(K).all(-1).all(-1) & (focal > 0).all(-1)
     return seen & torch.isfinite(key_points).all(-1) & valid[:, None]
 
 
-def typical_size(key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]) -> Float[Tensor, " V"]:
+def typical_size(
+    key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]
+) -> Float[Tensor, " V"]:
     """Median over the frames of the person's size in each view, pixels; NaN where nobody is seen."""
     size = person_size(key_points, seen)
     missing = torch.full_like(size[:0].sum(0), torch.nan)
@@ -56,13 +70,17 @@ def typical_size(key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J
 
 
 def choose_frames(
-    key_points: Float[Tensor, "T V J 2"], confidence: Float[Tensor, "T V J"], seen: Bool[Tensor, "T V J"], most: int
+    key_points: Float[Tensor, "T V J 2"],
+    confidence: Float[Tensor, "T V J"],
+    seen: Bool[Tensor, "T V J"],
+    most: int,
 ) -> Int[Tensor, " F"]:
     """At most ``most`` frames, in order, that cover the time and the places where the person stood.
 
-    A frame's score is the summed confidence of its joints that two views or more see. The recording is cut into
-    4 x ``most`` equal spans, the best frame of each is a candidate; candidates are put into cells by where the
-    person is in every view (in persons' sizes), and taken best of each cell first, then second best, and so on.
+    A frame's score is the summed confidence of its joints that two views or more see. The recording
+    is cut into 4 x ``most`` equal spans, the best frame of each is a candidate; candidates are put
+    into cells by where the person is in every view (in persons' sizes), and taken best of each cell
+    first, then second best, and so on.
     """
     both = seen & (seen.sum(1, keepdim=True) >= 2)
     score = (confidence.double().nan_to_num(0.0).clamp(0, 1) * both).sum((1, 2))
@@ -93,9 +111,14 @@ def _rank(group: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
 
 
 def observe(
-    K: Float[Tensor, "V 3 3"], key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"], noise: float
+    K: Float[Tensor, "V 3 3"],
+    key_points: Float[Tensor, "T V J 2"],
+    seen: Bool[Tensor, "T V J"],
+    noise: float,
 ) -> Observations:
-    """The chosen frames' key points, with ``noise`` x the median size of the person in the view as their noise."""
+    """The chosen frames' key points, with ``noise`` x the median size of the person in the view as
+    their noise.
+    """
     key_points = torch.where(seen[..., None], key_points.double(), 0.0)
     size = typical_size(key_points, seen)
     known = torch.isfinite(size)
@@ -104,7 +127,8 @@ def observe(
     xy = normalise(sane, key_points.transpose(0, 1).flatten(1, 2))
     mask = (seen & known[:, None]).transpose(0, 1).flatten(1, 2) & (xy.abs() < LARGEST).all(-1)
     unit = torch.where(known, noise * size, 1.0) / focal
-    frames, joints = key_points.shape[0], key_points.shape[2]
+    frames = key_points.shape[0]
+    joints = key_points.shape[2]
     return Observations(
         torch.where(mask[..., None], xy, 0.0),
         unit[:, None].expand_as(mask).clone(),
@@ -118,9 +142,12 @@ LARGEST = 1e6
 """A normalised coordinate beyond this is no key point."""
 
 
-def reweighted(seen_by: Observations, error: Float[Tensor, "V N"], used: Bool[Tensor, "V N"]) -> Observations:
-    """The same with the noise of each view, then of each joint, that the errors (in units of the noise so far) show:
-    by the median over the used observations, where there are ``LEAST`` of them."""
+def reweighted(
+    seen_by: Observations, error: Float[Tensor, "V N"], used: Bool[Tensor, "V N"]
+) -> Observations:
+    """The same with the noise of each view, then of each joint, that the errors (in units of the
+    noise so far) show: by the median over the used observations, where there are ``LEAST`` of them.
+    """
     count = used.sum(0)
     # what the fit of a point to m views takes away: 3 of the 2 m numbers
     error = error * (2 * count / (2 * count - 3).clamp(min=1)).sqrt()
@@ -135,7 +162,9 @@ def reweighted(seen_by: Observations, error: Float[Tensor, "V N"], used: Bool[Te
 
 
 def _spread(error: Float[Tensor, "G N"], used: Bool[Tensor, "G N"]) -> Float[Tensor, " G"]:
-    """Standard deviation of a coordinate from the median length of 2D errors (Rayleigh); 1 where there are few."""
+    """Standard deviation of a coordinate from the median length of 2D errors (Rayleigh); 1 where
+    there are few.
+    """
     spread = error.nanmedian(-1).values.nan_to_num(1.0) / (2 * math.log(2)) ** 0.5
     return torch.where((used.sum(-1) >= LEAST) & (spread > 0), spread, 1.0)
 

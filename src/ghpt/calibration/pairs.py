@@ -17,7 +17,9 @@ from ghpt.geometry.epipolar import cross_matrix, depths, essential, homogeneous
 
 @dataclass(frozen=True)
 class PairTable:
-    """The pairs of views (a, b) with an estimate ``x_b = R x_a + t``, |t| = 1: the edges of the rig's graph."""
+    """The pairs of views (a, b) with an estimate ``x_b = R x_a + t``, |t| = 1: the edges of the
+    rig's graph.
+    """
 
     views: Int[Tensor, "P 2"]
     common: Int[Tensor, " P"]
@@ -26,8 +28,10 @@ class PairTable:
     R: Float[Tensor, "P 3 3"]
     t: Float[Tensor, "P 3"]
     expected: Float[Tensor, " P"]
-    """Expected error (radians) of R and of t's direction together, at noise of one unit: sqrt tr of the inverse normal
-    matrix of the Sampson errors. Two cameras that look at each other have a large one."""
+    """Expected error (radians) of R and of t's direction together, at noise of one unit: sqrt tr of
+    the inverse normal matrix of the Sampson errors. Two cameras that look at each other have a
+    large one.
+    """
     angle: Float[Tensor, " P"]
     """Median angle between corresponding rays, radians in [0, pi/2]."""
     linked: Bool[Tensor, " P"]
@@ -45,15 +49,22 @@ def camera_dict(focal: float) -> dict:
 
 
 def ransac_options(threshold: float, iterations: int, seed: int, kind: str) -> dict:
-    return {kind: threshold, "max_iterations": iterations, "min_iterations": min(100, iterations), "seed": seed}
+    return {
+        kind: threshold,
+        "max_iterations": iterations,
+        "min_iterations": min(100, iterations),
+        "seed": seed,
+    }
 
 
 @dataclass(frozen=True)
 class PairEstimation:
-    """Every pair with at least ``least`` common correspondences, by poselib's LO-RANSAC and refinement.
+    """Every pair with at least ``least`` common correspondences, by poselib's LO-RANSAC and
+    refinement.
 
-    ``threshold``: largest Sampson error of an inlier, in units of noise. A pair is linked if it has ``least`` inliers
-    and they are ``share`` of the common correspondences. ``iterations``: the cap of RANSAC.
+    ``threshold``: largest Sampson error of an inlier, in units of noise. A pair is linked if it has
+    ``least`` inliers and they are ``share`` of the common correspondences. ``iterations``: the cap
+    of RANSAC.
     """
 
     threshold: float
@@ -62,13 +73,17 @@ class PairEstimation:
     share: float
 
     def __post_init__(self) -> None:
-        check_positive(threshold=self.threshold, iterations=self.iterations, least=self.least, share=self.share)
+        check_positive(
+            threshold=self.threshold, iterations=self.iterations, least=self.least, share=self.share
+        )
 
     def __call__(self, seen_by: Observations, seed: int) -> PairTable:
         count = len(seen_by.seen)
         found = (self._pair(seen_by, a, b, seed) for a in range(count) for b in range(a + 1, count))
         rows = [row for row in found if row is not None]
-        return PairTable(*map(torch.stack, zip(*rows, strict=True))) if rows else PairTable(*_NOTHING)
+        return (
+            PairTable(*map(torch.stack, zip(*rows, strict=True))) if rows else PairTable(*_NOTHING)
+        )
 
     def _pair(self, seen_by: Observations, a: int, b: int, seed: int) -> tuple[Tensor, ...] | None:
         both = seen_by.seen[a] & seen_by.seen[b]
@@ -76,13 +91,18 @@ class PairEstimation:
         if common < self.least:
             return None
         focal = [seen_by.focal(v) for v in (a, b)]
-        na, nb = seen_by.xy[a, both], seen_by.xy[b, both]
+        na = seen_by.xy[a, both]
+        nb = seen_by.xy[b, both]
         options = ransac_options(self.threshold, self.iterations, seed, "max_epipolar_error")
         pose, info = poselib.estimate_relative_pose(
-            (na * focal[0]).numpy(), (nb * focal[1]).numpy(), *map(camera_dict, focal), options,
+            (na * focal[0]).numpy(),
+            (nb * focal[1]).numpy(),
+            *map(camera_dict, focal),
+            options,
             {"loss_type": "CAUCHY", "loss_scale": self.threshold / 2},
-        )  # fmt: skip
-        R, t = torch.from_numpy(np.array(pose.R)), torch.from_numpy(np.array(pose.t))
+        )
+        R = torch.from_numpy(np.array(pose.R))
+        t = torch.from_numpy(np.array(pose.t))
         if not (torch.isfinite(R).all() and torch.isfinite(t).all()) or t.norm() < 1e-9:
             return None
         t = t / t.norm()
@@ -91,16 +111,23 @@ class PairEstimation:
         inlier &= (alpha > 0) & (beta > 0)
         count = int(inlier.sum())
         expected, angle = _condition(R, t, na[inlier], nb[inlier], focal)
-        linked = count >= self.least and count >= self.share * common and bool(torch.isfinite(expected))
+        linked = (
+            count >= self.least and count >= self.share * common and bool(torch.isfinite(expected))
+        )
         numbers = torch.tensor([a, b]), torch.tensor(common), torch.tensor(count)
         return *numbers, R, t, expected, angle, torch.tensor(linked)
 
 
 _NOTHING = (
-    torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64),
-    torch.zeros(0, 3, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.float64),
-    torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.float64), torch.zeros(0, dtype=torch.bool),
-)  # fmt: skip
+    torch.zeros(0, 2, dtype=torch.int64),
+    torch.zeros(0, dtype=torch.int64),
+    torch.zeros(0, dtype=torch.int64),
+    torch.zeros(0, 3, 3, dtype=torch.float64),
+    torch.zeros(0, 3, dtype=torch.float64),
+    torch.zeros(0, dtype=torch.float64),
+    torch.zeros(0, dtype=torch.float64),
+    torch.zeros(0, dtype=torch.bool),
+)
 
 
 def _condition(
@@ -114,15 +141,21 @@ def _condition(
     if len(a) < 5:
         return torch.tensor(torch.inf, dtype=a.dtype), torch.tensor(0.0, dtype=a.dtype)
     E = essential(R, t)
-    ha, hb = homogeneous(a), homogeneous(b)
+    ha = homogeneous(a)
+    hb = homogeneous(b)
     # the Sampson error's denominator: unit noise in both images, each with its own focal length
-    slope = ((hb @ E)[:, :2] / focal[0]).square().sum(-1) + ((ha @ E.mT)[:, :2] / focal[1]).square().sum(-1)
+    slope = ((hb @ E)[:, :2] / focal[0]).square().sum(-1) + (
+        (ha @ E.mT)[:, :2] / focal[1]
+    ).square().sum(-1)
     basis = torch.linalg.svd(t[None])[2][1:]
     turns = cross_matrix(torch.eye(3, dtype=E.dtype))
     moved = torch.cat((E @ turns, cross_matrix(basis) @ R))
     J = torch.einsum("ni,kij,nj->nk", hb, moved, ha) / slope.clamp_min(1e-30).sqrt()[:, None]
     values = torch.linalg.eigvalsh(J.mT @ J)
-    expected = torch.where(values[0] > 1e-12 * values[-1], (1 / values.clamp_min(1e-300)).sum().sqrt(), torch.inf)
-    u, v = ha @ R.mT, hb
+    expected = torch.where(
+        values[0] > 1e-12 * values[-1], (1 / values.clamp_min(1e-300)).sum().sqrt(), torch.inf
+    )
+    u = ha @ R.mT
+    v = hb
     sine = torch.linalg.cross(u, v).norm(dim=-1) / (u.norm(dim=-1) * v.norm(dim=-1))
     return expected, sine.clamp(max=1).asin().median()

@@ -1,4 +1,6 @@
-"""A first rig: the best-conditioned pair, then view after view against the people that the rig triangulates."""
+"""A first rig: the best-conditioned pair, then view after view against the people that the rig
+triangulates.
+"""
 
 from __future__ import annotations
 
@@ -20,21 +22,26 @@ from ghpt.randomness import key, uniform
 
 @dataclass(frozen=True)
 class Rig:
-    """Extrinsics of the views that are ``placed`` (identity elsewhere) and the people they see, in one world."""
+    """Extrinsics of the views that are ``placed`` (identity elsewhere) and the people they see, in
+    one world.
+    """
 
     R: Float[Tensor, "V 3 3"]
     t: Float[Tensor, "V 3"]
     placed: Bool[Tensor, " V"]
     points: Float[Tensor, "N 3"]
     inlier: Bool[Tensor, "V N"]
-    """Observations in placed views that agree with their point; a point has none or at least two."""
+    """Observations in placed views that agree with their point; a point has none or at least two.
+    """
 
 
 @dataclass(frozen=True)
 class Resection:
-    """How a rig is begun. ``threshold``: largest reprojection error of an inlier, in units of noise; a view is placed
-    if ``least`` of its points and ``share`` of them agree. ``pairs``: pairs of views tried for each point where the
-    placed ones make more. ``iterations``: the cap of poselib's RANSAC."""
+    """How a rig is begun. ``threshold``: largest reprojection error of an inlier, in units of
+    noise; a view is placed if ``least`` of its points and ``share`` of them agree. ``pairs``: pairs
+    of views tried for each point where the placed ones make more. ``iterations``: the cap of
+    poselib's RANSAC.
+    """
 
     threshold: float
     least: int
@@ -43,7 +50,9 @@ class Resection:
     iterations: int
 
     def __post_init__(self) -> None:
-        check_positive(threshold=self.threshold, least=self.least, share=self.share, pairs=self.pairs)
+        check_positive(
+            threshold=self.threshold, least=self.least, share=self.share, pairs=self.pairs
+        )
         check_positive(iterations=self.iterations)
 
     def begin(self, seen_by: Observations, table: PairTable, edge: int, seed: int) -> Rig:
@@ -55,19 +64,25 @@ class Resection:
         placed = torch.zeros(views, dtype=torch.bool)
         R[b], t[b] = table.R[edge], table.t[edge]
         placed[[a, b]] = True
-        nothing = torch.zeros(len(seen_by.frame), 3, dtype=torch.float64), torch.zeros_like(seen_by.seen)
+        nothing = (
+            torch.zeros(len(seen_by.frame), 3, dtype=torch.float64),
+            torch.zeros_like(seen_by.seen),
+        )
         return self.triangulate(seen_by, Rig(R, t, placed, *nothing), seed)
 
     def grow(self, seen_by: Observations, table: PairTable, rig: Rig, seed: int) -> Rig:
-        """Place every view that a chain of linked pairs reaches, the one best bound to the placed ones first; a view
-        that fails is tried again when the rig has grown."""
+        """Place every view that a chain of linked pairs reaches, the one best bound to the placed
+        ones first; a view that fails is tried again when the rig has grown.
+        """
         failed: set[int] = set()
         while (view := self._next(table, rig.placed, failed)) is not None:
             found = self.place(seen_by, rig, view, seed)
             if found is None:
                 failed.add(view)
                 continue
-            R, t, placed = rig.R.clone(), rig.t.clone(), rig.placed.clone()
+            R = rig.R.clone()
+            t = rig.t.clone()
+            placed = rig.placed.clone()
             R[view], t[view] = found
             placed[view] = True
             rig = self.triangulate(seen_by, replace(rig, R=R, t=t, placed=placed), seed)
@@ -86,7 +101,9 @@ class Resection:
     def supported(self, rig: Rig) -> Rig:
         """The rig without the views that fewer than ``least`` inliers hold; a pair at least stays."""
         held = rig.placed & (rig.inlier.sum(1) >= self.least)
-        return replace(rig, placed=held, inlier=rig.inlier & held[:, None]) if held.sum() >= 2 else rig
+        return (
+            replace(rig, placed=held, inlier=rig.inlier & held[:, None]) if held.sum() >= 2 else rig
+        )
 
     def place(
         self, seen_by: Observations, rig: Rig, view: int, seed: int
@@ -98,24 +115,36 @@ class Resection:
         options = ransac_options(self.threshold, self.iterations, seed, "max_reproj_error")
         focal = seen_by.focal(view)
         pose, info = poselib.estimate_absolute_pose(
-            (seen_by.xy[view, used] * focal).numpy(), rig.points[used].numpy(), camera_dict(focal), options,
+            (seen_by.xy[view, used] * focal).numpy(),
+            rig.points[used].numpy(),
+            camera_dict(focal),
+            options,
             {"loss_type": "CAUCHY", "loss_scale": self.threshold / 2},
-        )  # fmt: skip
+        )
         count = sum(info["inliers"])
-        R, t = torch.from_numpy(np.array(pose.R)), torch.from_numpy(np.array(pose.t))
+        R = torch.from_numpy(np.array(pose.R))
+        t = torch.from_numpy(np.array(pose.t))
         enough = count >= max(self.least, self.share * int(used.sum()))
-        return (R, t) if enough and bool(torch.isfinite(R).all() & torch.isfinite(t).all()) else None
+        return (
+            (R, t) if enough and bool(torch.isfinite(R).all() & torch.isfinite(t).all()) else None
+        )
 
     def triangulate(self, seen_by: Observations, rig: Rig, seed: int) -> Rig:
-        """All points anew from the placed views: of each, the pair of views with which most others agree, and its
-        inliers together."""
+        """All points anew from the placed views: of each, the pair of views with which most others
+        agree, and its inliers together.
+        """
         of = Observations(
-            *(getattr(seen_by, f)[rig.placed] for f in ("xy", "noise", "seen")), seen_by.frame, seen_by.joint
+            *(getattr(seen_by, f)[rig.placed] for f in ("xy", "noise", "seen")),
+            seen_by.frame,
+            seen_by.joint,
         )
-        R, t = rig.R[rig.placed], rig.t[rig.placed]
+        R = rig.R[rig.placed]
+        t = rig.t[rig.placed]
         K = torch.eye(3, dtype=torch.float64).expand_as(R)
         subsets = _pairs_of_views(of.seen, self.pairs, seed)
-        points, ok = triangulate_subsets(Cameras(K[None], R[None], t[None]), of.xy[None], of.seen[None], subsets[None])
+        points, ok = triangulate_subsets(
+            Cameras(K[None], R[None], t[None]), of.xy[None], of.seen[None], subsets[None]
+        )
         tried = R.expand(len(subsets), -1, -1, -1), t.expand(len(subsets), -1, -1)
         error = of.error(*tried, points[0]) / self.threshold
         agree = (error <= 1) & of.seen & ok[0][:, None]
@@ -123,12 +152,17 @@ class Resection:
         best = (agree.sum(1) - rest).argmax(0)
         agree = agree.gather(0, best[None, None].expand(1, len(of.seen), -1))[0]
         result = triangulate(Cameras(K, R, t), of.xy, agree.double())
-        return self.agreeing(seen_by, replace(rig, points=result.points), result.ok & (agree.sum(0) >= 2))
+        return self.agreeing(
+            seen_by, replace(rig, points=result.points), result.ok & (agree.sum(0) >= 2)
+        )
 
     def agreeing(self, seen_by: Observations, rig: Rig, known: Bool[Tensor, " N"]) -> Rig:
         """The rig with the inliers of its points where they are ``known``."""
         inlier = (
-            (seen_by.error(rig.R, rig.t, rig.points) <= self.threshold) & seen_by.seen & rig.placed[:, None] & known
+            (seen_by.error(rig.R, rig.t, rig.points) <= self.threshold)
+            & seen_by.seen
+            & rig.placed[:, None]
+            & known
         )
         return replace(rig, inlier=inlier & (inlier.sum(0) >= 2))
 

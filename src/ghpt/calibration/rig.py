@@ -1,4 +1,6 @@
-"""A whole rig's extrinsics from the people in view: frames, pairs, resection, bundle adjustment, uncertainty."""
+"""A whole rig's extrinsics from the people in view: frames, pairs, resection, bundle adjustment,
+uncertainty.
+"""
 
 from __future__ import annotations
 
@@ -22,18 +24,26 @@ from ghpt.geometry.cameras import Cameras
 
 @dataclass(frozen=True)
 class RigEstimate:
-    """A calibrated rig. The world is the frame of the first calibrated camera; the unit of length is the rig's size
-    (the root mean square distance of the cameras from their mean) until ``scaled`` makes it millimetres."""
+    """A calibrated rig. The world is the frame of the first calibrated camera; the unit of length
+    is the rig's size (the root mean square distance of the cameras from their mean) until
+    ``scaled`` makes it millimetres.
+    """
 
     names: tuple[str, ...]
     cameras: Cameras
-    """K, R, t with leading dimension V, float64; identity and t = 0 for a camera that is not calibrated."""
+    """K, R, t with leading dimension V, float64; identity and t = 0 for a camera that is not
+    calibrated.
+    """
     calibrated: Bool[Tensor, " V"]
     covariance: Float64[Tensor, "V 6 6"]
-    """Rotation vector about the world's axes (radians; of camera to world), then centre (world), in the gauge of the
-    rig as a whole (``ghpt.calibration.uncertainty.Uncertainty``); 0 for a camera that is not calibrated."""
+    """Rotation vector about the world's axes (radians; of camera to world), then centre (world), in
+    the gauge of the rig as a whole (``ghpt.calibration.uncertainty.Uncertainty``); 0 for a camera
+    that is not calibrated.
+    """
     reprojection: Float64[Tensor, " V"]
-    """Median reprojection error of the key points whose point is known, outliers among them, pixels."""
+    """Median reprojection error of the key points whose point is known, outliers among them,
+    pixels.
+    """
     inliers: Float64[Tensor, " V"]
     """Share of those key points that agree with the rig."""
     pairs: PairTable
@@ -58,10 +68,16 @@ class RigEstimate:
     @property
     def succeeded(self) -> bool:
         """Converged, every camera calibrated, and no diagnosis is an error."""
-        return self.converged and bool(self.calibrated.all()) and all(d.severity != "error" for d in self.diagnoses)
+        return (
+            self.converged
+            and bool(self.calibrated.all())
+            and all(d.severity != "error" for d in self.diagnoses)
+        )
 
     def scaled(self, factor: float) -> RigEstimate:
-        """The rig in millimetres: lengths times ``factor``. Warns of a person who is not of human size."""
+        """The rig in millimetres: lengths times ``factor``. Warns of a person who is not of human
+        size.
+        """
         if not 0 < factor < float("inf"):
             mend = "Give a body height, segment lengths or a baseline that the recording shows."
             raise GhptDataError("rig", "scale", f"{factor} mm per unit of length", mend)
@@ -80,10 +96,11 @@ class RigEstimate:
 class RigCalibration:
     """Key points and known intrinsics to the extrinsics of all cameras.
 
-    ``frames``: most frames used. ``noise``: first guess of the key points' noise, in sizes of the person in the image.
-    ``seeds``: best-conditioned pairs that the rig is begun from in turn, until one places every linked view with a
-    share of ``good`` inliers; the best is kept. ``rounds``: bundle adjustments, each with the noise of views and joints
-    that the one before has shown and points triangulated anew. ``blocks``: see ``uncertainty``.
+    ``frames``: most frames used. ``noise``: first guess of the key points' noise, in sizes of the
+    person in the image. ``seeds``: best-conditioned pairs that the rig is begun from in turn, until
+    one places every linked view with a share of ``good`` inliers; the best is kept. ``rounds``:
+    bundle adjustments, each with the noise of views and joints that the one before has shown and
+    points triangulated anew. ``blocks``: see ``uncertainty``.
     """
 
     frames: int
@@ -98,7 +115,13 @@ class RigCalibration:
     diagnostics: Diagnostics
 
     def __post_init__(self) -> None:
-        check_positive(frames=self.frames, noise=self.noise, seeds=self.seeds, good=self.good, rounds=self.rounds)
+        check_positive(
+            frames=self.frames,
+            noise=self.noise,
+            seeds=self.seeds,
+            good=self.good,
+            rounds=self.rounds,
+        )
         check_positive(blocks=self.blocks)
 
     @torch.no_grad()
@@ -112,9 +135,10 @@ class RigCalibration:
         sizes: Int[Tensor, "V 2"] | None,
         seed: int,
     ) -> RigEstimate:
-        """Calibrate; ``key_points`` are undistorted pixels. Never raises on values: what is wrong is among the
-        diagnoses. Raises GhptDataError for fewer than two cameras, a name that occurs twice, or arrays that do not
-        belong together."""
+        """Calibrate; ``key_points`` are undistorted pixels. Never raises on values: what is wrong
+        is among the diagnoses. Raises GhptDataError for fewer than two cameras, a name that occurs
+        twice, or arrays that do not belong together.
+        """
         _check(names, K, key_points)
         mask = usable(K, key_points, seen)
         frames = choose_frames(key_points, confidence, mask, self.frames)
@@ -125,27 +149,48 @@ class RigCalibration:
         if rig is not None:
             seen_by, adjusted = self.refine(seen_by, table, rig, seed)
         case = Case(
-            tuple(names), K, key_points, mask, sizes, frames, seen_by, table, adjusted, self.resection, self.noise, seed
+            tuple(names),
+            K,
+            key_points,
+            mask,
+            sizes,
+            frames,
+            seen_by,
+            table,
+            adjusted,
+            self.resection,
+            self.noise,
+            seed,
         )
         return self._estimate(case)
 
     def begin(self, seen_by: Observations, table: PairTable, seed: int) -> Rig | None:
-        """The first rig, from the seed with the most views and the largest share of inliers; None without a pair."""
-        best, merit = None, (-1, -1.0)
-        order = torch.sort(torch.where(table.linked, table.expected, torch.inf), stable=True).indices
+        """The first rig, from the seed with the most views and the largest share of inliers; None
+        without a pair.
+        """
+        best = None
+        merit = (-1, -1.0)
+        order = torch.sort(
+            torch.where(table.linked, table.expected, torch.inf), stable=True
+        ).indices
         linked = int(torch.isin(torch.arange(len(seen_by.seen)), table.views[table.linked]).sum())
         for edge in order[: min(self.seeds, int(table.linked.sum()))].tolist():
             rig = self.resection.begin(seen_by, table, edge, seed)
             rig = self.resection.grow(seen_by, table, rig, seed)
             share = rig.inlier.sum() / (seen_by.seen & rig.placed[:, None]).sum().clamp(min=1)
             if (int(rig.placed.sum()), float(share)) > merit:
-                best, merit = rig, (int(rig.placed.sum()), float(share))
+                best = rig
+                merit = (int(rig.placed.sum()), float(share))
             if merit[0] == linked and merit[1] >= self.good:
                 break
         return best
 
-    def refine(self, seen_by: Observations, table: PairTable, rig: Rig, seed: int) -> tuple[Observations, Adjusted]:
-        """Bundle adjustments in turn with new weights and new points; the last result is not touched any more."""
+    def refine(
+        self, seen_by: Observations, table: PairTable, rig: Rig, seed: int
+    ) -> tuple[Observations, Adjusted]:
+        """Bundle adjustments in turn with new weights and new points; the last result is not
+        touched any more.
+        """
         adjusted = self.bundle(seen_by, rig)
         for _ in range(self.rounds - 1):
             error = seen_by.error(adjusted.rig.R, adjusted.rig.t, adjusted.rig.points)
@@ -158,16 +203,24 @@ class RigCalibration:
         return seen_by, replace(adjusted, final=final)
 
     def _estimate(self, case: Case) -> RigEstimate:
-        views, (frames, joints) = len(case.names), case.shape
+        views = len(case.names)
+        (frames, joints) = case.shape
         eye = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
         rig = case.rig or Rig(
-            eye, torch.zeros(views, 3, dtype=torch.float64), torch.zeros(views, dtype=torch.bool),
-            torch.zeros(frames * joints, 3, dtype=torch.float64), torch.zeros_like(case.seen_by.seen),
-        )  # fmt: skip
+            eye,
+            torch.zeros(views, 3, dtype=torch.float64),
+            torch.zeros(views, dtype=torch.bool),
+            torch.zeros(frames * joints, 3, dtype=torch.float64),
+            torch.zeros_like(case.seen_by.seen),
+        )
         placed = rig.placed
         nothing = torch.zeros(views, dtype=torch.float64)
         reprojection, inliers = case.agreement(rig) if placed.any() else (nothing, nothing)
-        spread = None if case.adjusted is None else uncertainty(case.seen_by, rig, case.adjusted.final, self.blocks)
+        spread = (
+            None
+            if case.adjusted is None
+            else uncertainty(case.seen_by, rig, case.adjusted.final, self.blocks)
+        )
         estimated = rig.inlier.any(0)
         return RigEstimate(
             names=case.names,
@@ -177,7 +230,9 @@ class RigCalibration:
                 torch.where(placed[:, None], rig.t, 0.0),
             ),
             calibrated=placed,
-            covariance=torch.zeros(views, 6, 6, dtype=torch.float64) if spread is None else spread.covariance,
+            covariance=torch.zeros(views, 6, 6, dtype=torch.float64)
+            if spread is None
+            else spread.covariance,
             reprojection=reprojection,
             inliers=inliers,
             pairs=case.table,
@@ -212,5 +267,7 @@ def _check(names: Sequence[str], K: Tensor, key_points: Tensor) -> None:
     if twice := [name for name in names if list(names).count(name) > 1]:
         raise GhptDataError("rig", "cameras", f"{twice[0]!r} occurs twice", mend)
     if not len(names) == len(K) == key_points.shape[1]:
-        count = f"{len(names)} names, {len(K)} intrinsics, key points of {key_points.shape[1]} cameras"
+        count = (
+            f"{len(names)} names, {len(K)} intrinsics, key points of {key_points.shape[1]} cameras"
+        )
         raise GhptDataError("rig", "cameras", count, mend)

@@ -16,21 +16,28 @@ from ghpt.geometry.epipolar import cross_matrix
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """In the gauge of the rig as a whole (free network): the similarity that the data cannot know (rotation, place and
-    scale of all cameras together) is that which brings the cameras nearest to the true ones, radians and centres in
-    units of the rig's size counting alike."""
+    """In the gauge of the rig as a whole (free network): the similarity that the data cannot know
+    (rotation, place and scale of all cameras together) is that which brings the cameras nearest to
+    the true ones, radians and centres in units of the rig's size counting alike.
+    """
 
     covariance: Float[Tensor, "V 6 6"]
-    """Rotation vector about the world's axes (radians), then centre (world); 0 for a view that is not placed."""
+    """Rotation vector about the world's axes (radians), then centre (world); 0 for a view that is
+    not placed.
+    """
     condition: float
-    """Smallest eigenvalue of the normal matrix over the largest, gauge left out; 0 is degenerate."""
+    """Smallest eigenvalue of the normal matrix over the largest, gauge left out; 0 is degenerate.
+    """
     inflation: float
-    """Variance of the frames' gradients over what independent unit noise would give: the noise that was assumed too
-    small, and errors that joints of a frame and frames of a time share."""
+    """Variance of the frames' gradients over what independent unit noise would give: the noise that
+    was assumed too small, and errors that joints of a frame and frames of a time share.
+    """
 
 
 def gauge(R: Float[Tensor, "V 3 3"], centre: Float[Tensor, "V 3"]) -> Float[Tensor, "P 7"]:
-    """The changes of the views' parameters that change no image: common rotation, translation, scale."""
+    """The changes of the views' parameters that change no image: common rotation, translation,
+    scale.
+    """
     eye = torch.eye(3, dtype=centre.dtype).expand(len(centre), 3, 3)
     rotation = torch.cat((eye, -cross_matrix(centre)), dim=1)
     translation = torch.cat((torch.zeros_like(eye), eye), dim=1)
@@ -39,10 +46,11 @@ def gauge(R: Float[Tensor, "V 3 3"], centre: Float[Tensor, "V 3"]) -> Float[Tens
 
 
 def uncertainty(seen_by: Observations, rig: Rig, state: Linearised, blocks: int) -> Uncertainty:
-    """``state``: of the rig, whose size (root mean square distance of the centres from their mean) is 1.
+    """``state``: of the rig, whose size (root mean square distance of the centres from their mean)
+    is 1.
 
-    The frames are put into ``blocks`` blocks of neighbours: gradients are summed within a block, so that errors which
-    last as long as a block count as what they are.
+    The frames are put into ``blocks`` blocks of neighbours: gradients are summed within a block, so
+    that errors which last as long as a block count as what they are.
     """
     views = torch.nonzero(rig.placed)[:, 0]
     covariance = torch.zeros(len(rig.R), 6, 6, dtype=torch.float64)
@@ -59,7 +67,10 @@ def uncertainty(seen_by: Observations, rig: Rig, state: Linearised, blocks: int)
     frames = len(state.scores)
     count = min(blocks, frames)
     block = torch.arange(frames) * count // frames
-    scores = torch.zeros(count, len(own), dtype=torch.float64).index_add(0, block, state.scores[:, own]) @ basis
+    scores = (
+        torch.zeros(count, len(own), dtype=torch.float64).index_add(0, block, state.scores[:, own])
+        @ basis
+    )
     scores = scores - scores.mean(0)
     scatter = float((scores @ inverse * scores).sum()) / len(values) * count / max(count - 1, 1)
     error = seen_by.error(rig.R, rig.t, rig.points)[rig.inlier].clamp(max=BEHIND)
@@ -68,7 +79,11 @@ def uncertainty(seen_by: Observations, rig: Rig, state: Linearised, blocks: int)
     model = float((weight * error).square().sum()) / max(freedom, 1) / float(weight.mean())
     inflation = max(scatter, model)
     # the loss's curvature over its weight: along the error it bends more than across
-    curvature = float(((weight + weight.square() * (1 - (error / state.scale) ** 2)) / 2).mean() / weight.mean())
+    curvature = float(
+        ((weight + weight.square() * (1 - (error / state.scale) ** 2)) / 2).mean() / weight.mean()
+    )
     full = basis @ inverse @ basis.T * inflation / max(curvature, 0.1) ** 2
-    covariance[views] = torch.stack([full[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(views))])
+    covariance[views] = torch.stack(
+        [full[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(views))]
+    )
     return Uncertainty(covariance, float(values[0] / values[-1]), inflation)

@@ -35,7 +35,9 @@ from ghpt.files import atomic_write
 from ghpt.signals import stopped_by_signals
 
 USERS_ERRORS = (GhptError, HydraException, OmegaConfBaseException, OSError)
-"""What a user can cause and mend: said in one line. Anything else is a fault of the program, with its trace."""
+"""What a user can cause and mend: said in one line. Anything else is a fault of the program, with
+its trace.
+"""
 _FULL = "HYDRA_FULL_ERROR"
 _CONFIGURATION = ".hydra"
 """Where Hydra's users look for a run's configuration, within its output folder."""
@@ -62,10 +64,10 @@ class Command:
 def run(conf: Path, command: Command) -> None:
     """Compose ``<conf>/<command.name>.yaml`` with the command line and call ``command.task``.
 
-    The output folder is locked and guarded meanwhile, see `ghpt.commands.outputs`. A user's error ends the
-    program with one line, ``error: ...``, and exit status 1; ``HYDRA_FULL_ERROR=1`` shows the trace.
-    In a sweep the other jobs run on, here or in submitit's processes, and the summary of each is
-    printed; a job that finished in an earlier run of the sweep is not done again.
+    The output folder is locked and guarded meanwhile, see `ghpt.commands.outputs`. A user's error
+    ends the program with one line, ``error: ...``, and exit status 1; ``HYDRA_FULL_ERROR=1`` shows
+    the trace. In a sweep the other jobs run on, here or in submitit's processes, and the summary of
+    each is printed; a job that finished in an earlier run of the sweep is not done again.
     """
     trace = os.environ.get(_FULL) == "1"
     os.environ[_FULL] = "1"  # Hydra then lets errors through, to be said here
@@ -73,20 +75,31 @@ def run(conf: Path, command: Command) -> None:
     ended: list[Job] = []
     try:
         arguments = get_args_parser().parse_args()
-        sweep, launcher = bool(arguments.multirun), "basic"
+        sweep = bool(arguments.multirun)
+        launcher = "basic"
         if not (arguments.help or arguments.hydra_help or arguments.info):
             overrides = check_overrides(conf.resolve(), command.name, arguments.overrides)
             launcher = chosen_launcher(overrides, compose_only=bool(arguments.cfg))
             sys.argv += _folder_names(overrides) if sweep else []
         job = _Job(command, script, os.getpid(), sweep, trace, ended)
-        program = hydra.main(version_base="1.3", config_path=str(conf.resolve()), config_name=command.name)(job)
+        program = hydra.main(
+            version_base="1.3", config_path=str(conf.resolve()), config_name=command.name
+        )(job)
         with SweepFolder.released():
             try:
                 with awaited(ended) if launcher != "basic" else nullcontext():
                     program()
             finally:
                 if sweep and ended:
-                    print("\n".join(["", "Jobs of the sweep:", *(f"  {job.name}: {job.said}" for job in ended)]))
+                    print(
+                        "\n".join(
+                            [
+                                "",
+                                "Jobs of the sweep:",
+                                *(f"  {job.name}: {job.said}" for job in ended),
+                            ]
+                        )
+                    )
             if sweep and ended and command.after is not None:
                 command.after(ended)
     except BrokenPipeError:  # whoever read what is printed has had enough, as `head` does
@@ -107,7 +120,9 @@ def run(conf: Path, command: Command) -> None:
 
 @dataclass(frozen=True)
 class _Job:
-    """What Hydra calls for each job: the task, with its errors and end. Also in another process, where it is a copy."""
+    """What Hydra calls for each job: the task, with its errors and end. Also in another process,
+    where it is a copy.
+    """
 
     command: Command
     script: str
@@ -122,7 +137,10 @@ class _Job:
             take_signals()
         _quieten()
         output = Path(HydraConfig.get().runtime.output_dir)
-        settings, result, said, failed = {}, None, "stopped", True
+        settings = {}
+        result = None
+        said = "stopped"
+        failed = True
         with ExitStack() as stack:  # the log is open until the end is in it
             try:
                 settings = plain(config)
@@ -131,13 +149,15 @@ class _Job:
                 folder = stack.enter_context(self._folder(output, settings))
                 before = folder.finished(settings) if folder is not None and self.sweep else None
                 if before is not None and not settings.get("overwrite"):
-                    said, failed = f"{before} (finished before)", False
+                    said = f"{before} (finished before)"
+                    failed = False
                 else:
                     stack.enter_context(self._records(config, output))
                     stack.enter_context(self._as_command(settings))
                     with stopped_by_signals():
                         result = self.command.task(settings, output)
-                    said, failed = self.command.summary(result) if self.sweep else "", False
+                    said = self.command.summary(result) if self.sweep else ""
+                    failed = False
                     if folder is not None:
                         folder.finish(settings, said)
             except Exception as caught:
@@ -158,14 +178,20 @@ class _Job:
                 self.ended.append(Job(output.name, settings, result, said, failed))
         return self.ended[-1]
 
-    def _folder(self, output: Path, settings: dict[str, Any]) -> AbstractContextManager[OutputFolder | None]:
+    def _folder(
+        self, output: Path, settings: dict[str, Any]
+    ) -> AbstractContextManager[OutputFolder | None]:
         """The output folder, locked and guarded; None in a training's other processes."""
         if not is_first_process():
             return nullcontext()
         files = self.command.files(settings)
-        configuration = tuple(f"{_CONFIGURATION}/{name}" for name in ("config.yaml", "hydra.yaml", "overrides.yaml"))
+        configuration = tuple(
+            f"{_CONFIGURATION}/{name}" for name in ("config.yaml", "hydra.yaml", "overrides.yaml")
+        )
         log = f"{HydraConfig.get().job.name}.log"
-        files = replace(files, writes=(*files.writes, *configuration), growing=(*files.growing, log))
+        files = replace(
+            files, writes=(*files.writes, *configuration), growing=(*files.growing, log)
+        )
         return OutputFolder(output, files, bool(settings.get("overwrite")))
 
     @contextmanager
@@ -173,7 +199,11 @@ class _Job:
         """The job's configuration is written, and within the block its log."""
         hydra_config = HydraConfig.get()
         if is_first_process():
-            contents = {"config": config, "hydra": {"hydra": hydra_config}, "overrides": hydra_config.overrides.task}
+            contents = {
+                "config": config,
+                "hydra": {"hydra": hydra_config},
+                "overrides": hydra_config.overrides.task,
+            }
             for name, content in contents.items():
                 with atomic_write(output / _CONFIGURATION / f"{name}.yaml", "w") as handle:
                     handle.write(OmegaConf.to_yaml(content))
@@ -194,7 +224,9 @@ class _Job:
 
 def _folder_names(overrides: Sequence[Override]) -> list[str]:
     """The setting by which a job's folder is named by what the sweep changes, and by nothing else."""
-    fixed = ",".join(o.key_or_group for o in overrides if not o.is_sweep_override() or "/" in o.input_line)
+    fixed = ",".join(
+        o.key_or_group for o in overrides if not o.is_sweep_override() or "/" in o.input_line
+    )
     return [f"hydra.job.config.override_dirname.exclude_keys=[{fixed}]"]
 
 
@@ -204,6 +236,10 @@ def _quieten() -> None:
         logging.getLogger(name).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", r".*treespec, LeafSpec.* is deprecated")
     warnings.filterwarnings("ignore", r".*does not have many workers")  # reading is memory-mapped
-    warnings.filterwarnings("ignore", r"torch\.distributed\.nn\.functional\.all_gather is deprecated")
-    warnings.filterwarnings("ignore", r"It is recommended to use `self\.log\('validation/.*sync_dist=True")  # they are
+    warnings.filterwarnings(
+        "ignore", r"torch\.distributed\.nn\.functional\.all_gather is deprecated"
+    )
+    warnings.filterwarnings(
+        "ignore", r"It is recommended to use `self\.log\('validation/.*sync_dist=True"
+    )  # they are
     warnings.filterwarnings("ignore", r"Checkpoint directory .* exists and is not empty")

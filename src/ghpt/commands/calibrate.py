@@ -36,7 +36,14 @@ from ghpt.provenance import provenance
 from ghpt.recording import Recording
 from ghpt.report.calibration import differences, explains, print_calibration, spread
 from ghpt.report.rig_comparison import Similarity, align, triangulate_recording, upright
-from ghpt.report.rig_files import RIG_FILES, camera_numbers, write_numbers, write_poses, write_rig, write_rig_figure
+from ghpt.report.rig_files import (
+    RIG_FILES,
+    camera_numbers,
+    write_numbers,
+    write_poses,
+    write_rig,
+    write_rig_figure,
+)
 from ghpt.report.tables import words
 
 _log = logging.getLogger(__name__)
@@ -70,7 +77,9 @@ class Case:
     source: str
     views: Views
     reference: str
-    """What ``views.cameras.cameras``, where there are any, are: never used but for the comparison and the gauge."""
+    """What ``views.cameras.cameras``, where there are any, are: never used but for the comparison
+    and the gauge.
+    """
     notes: tuple[Diagnosis, ...] = ()
 
 
@@ -85,28 +94,45 @@ def files(config: dict[str, Any]) -> Files:
 def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     """Calibrate the cameras of ``config["keypoints"]``, or of a recording of ``config["data"]``.
 
-    Writes calibration.json, report.md and the figure into ``output``, and of a usable rig ``RIG_FILES``; prints the
-    table. Raises GhptDataError after writing if a diagnosis is an error: then only the cameras that it does not
-    concern are in the rig's files, and with fewer than two there are none. Returns what calibration.json holds.
+    Writes calibration.json, report.md and the figure into ``output``, and of a usable rig
+    ``RIG_FILES``; prints the table. Raises GhptDataError after writing if a diagnosis is an error:
+    then only the cameras that it does not concern are in the rig's files, and with fewer than two
+    there are none. Returns what calibration.json holds.
     """
     check_type(config, Settings, "")
     check(config["evaluated_frames"] >= 1, "evaluated_frames", "is not positive", "Give 1 or more.")
-    check(config["triangulation"] in config["baselines"], "triangulation", f"is {config['triangulation']!r}",
-          suggest(config["triangulation"], config["baselines"]))  # fmt: skip
+    check(
+        config["triangulation"] in config["baselines"],
+        "triangulation",
+        f"is {config['triangulation']!r}",
+        suggest(config["triangulation"], config["baselines"]),
+    )
     calibration = build(config["calibration"], "calibration")
-    estimator = build(config["baselines"][config["triangulation"]], f"baselines.{config['triangulation']}")
+    estimator = build(
+        config["baselines"][config["triangulation"]], f"baselines.{config['triangulation']}"
+    )
     case = in_unit(from_files(config), estimator) if config["keypoints"] else from_data(config)
-    cameras, views = case.views.cameras, case.views
+    cameras = case.views.cameras
+    views = case.views
     lengths = read_scale(config["scale"], cameras.names)
     sweep_temporaries(output)
     for name in RIG_FILES:  # of an earlier run: they must not pass for this one's
         remove(output / name)
 
     estimate: RigEstimate = calibration(
-        cameras.names, cameras.K, torch.from_numpy(views.key_points).double(),
-        torch.from_numpy(views.confidence).double(), torch.from_numpy(views.seen), cameras.size, config["seed"],
-    )  # fmt: skip
-    placed = torch.nonzero(estimate.calibrated)[:, 0].tolist() if int(estimate.calibrated.sum()) >= 2 else []
+        cameras.names,
+        cameras.K,
+        torch.from_numpy(views.key_points).double(),
+        torch.from_numpy(views.confidence).double(),
+        torch.from_numpy(views.seen),
+        cameras.size,
+        config["seed"],
+    )
+    placed = (
+        torch.nonzero(estimate.calibrated)[:, 0].tolist()
+        if int(estimate.calibrated.sum()) >= 2
+        else []
+    )
 
     def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
         used = torch.nonzero(usable_cameras(estimate))[:, 0].tolist() or placed
@@ -117,20 +143,32 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     chosen = torch.nonzero(usable_cameras(estimate))[:, 0].tolist()
     world, gauge = _gauge(estimate, placed, cameras.cameras, case.reference)
     moved = gauge.cameras(estimate.cameras)
-    rigs = {"estimated": moved} | ({case.reference: cameras.cameras} if cameras.cameras is not None else {})
+    rigs = {"estimated": moved} | (
+        {case.reference: cameras.cameras} if cameras.cameras is not None else {}
+    )
     seen_by = {name: _through(case, placed, rig) for name, rig in rigs.items() if placed}
     numbers = {
-        "data": case.title, "source": case.source, "cameras_file": cameras.path, "frames": len(views),
-        "seed": config["seed"], "scale": scale, "world": world, "reference": case.reference if len(rigs) > 1 else None,
-        "triangulation": config["triangulation"], "converged": estimate.converged,
+        "data": case.title,
+        "source": case.source,
+        "cameras_file": cameras.path,
+        "frames": len(views),
+        "seed": config["seed"],
+        "scale": scale,
+        "world": world,
+        "reference": case.reference if len(rigs) > 1 else None,
+        "triangulation": config["triangulation"],
+        "converged": estimate.converged,
         "usable": [cameras.names[v] for v in chosen],
         "cameras": camera_numbers(estimate, moved, gauge, cameras),
         "difference": differences(*seen_by.values()) if len(seen_by) > 1 else None,
         "explains": explains(seen_by, estimator, config["evaluated_frames"]),
-        "diagnoses": [vars(found) for found in (*case.notes, *estimate.diagnoses, *of_scale(scale))],
+        "diagnoses": [
+            vars(found) for found in (*case.notes, *estimate.diagnoses, *of_scale(scale))
+        ],
         "provenance": provenance(config["seed"]),
-    }  # fmt: skip
-    points, estimated = gauge.points(estimate.points), estimate.estimated
+    }
+    points = gauge.points(estimate.points)
+    estimated = estimate.estimated
     if chosen:
         recording = _through(case, chosen, moved)
         points, estimated = triangulate_recording(recording, estimator)
@@ -138,15 +176,29 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
         write_poses(output / "poses.npz", recording, points, estimated, numbers)
     reference = (case.reference, cameras.cameras) if cameras.cameras is not None else None
     covariance = gauge.covariance(estimate.covariance)
-    write_rig_figure(output, numbers, moved, covariance, points, estimated, estimate.calibrated, reference)
+    write_rig_figure(
+        output, numbers, moved, covariance, points, estimated, estimate.calibrated, reference
+    )
     write_numbers(output, numbers)
     print_calibration(numbers)
-    _log.info("Report: %s, beside it the figure%s.", shown(output / "report.md"), " and the rig" * bool(chosen))
+    _log.info(
+        "Report: %s, beside it the figure%s.",
+        shown(output / "report.md"),
+        " and the rig" * bool(chosen),
+    )
     errors = [d["text"] for d in numbers["diagnoses"] if d["severity"] == "error"]
     if errors:
-        written = f"only {', '.join(numbers['usable'])} are in the rig's files" if chosen else "no rig is written"
-        raise GhptDataError(case.source, "calibration", f"{errors[0].rstrip('.')}; {written}",
-                            f"See {shown(output / 'report.md')}.")  # fmt: skip
+        written = (
+            f"only {', '.join(numbers['usable'])} are in the rig's files"
+            if chosen
+            else "no rig is written"
+        )
+        raise GhptDataError(
+            case.source,
+            "calibration",
+            f"{errors[0].rstrip('.')}; {written}",
+            f"See {shown(output / 'report.md')}.",
+        )
     return numbers
 
 
@@ -158,16 +210,23 @@ def summary(numbers: dict[str, Any]) -> str:
 
 def from_files(config: Mapping[str, Any]) -> Case:
     """The user's own key points and cameras."""
-    cameras, points = own_cameras(config, "intrinsics.toml"), own_key_points(config)
+    cameras = own_cameras(config, "intrinsics.toml")
+    points = own_key_points(config)
     views = look_through(points, cameras, config["match"], config["views"])
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
     return Case(
-        title, str(Path(config["keypoints"]).resolve()), views, "the file's own calibration", people_note(points)
+        title,
+        str(Path(config["keypoints"]).resolve()),
+        views,
+        "the file's own calibration",
+        people_note(points),
     )
 
 
 def in_unit(case: Case, estimator: Baseline) -> Case:
-    """With the file's own extrinsics in mm where the person tells their unit: they are compared with."""
+    """With the file's own extrinsics in mm where the person tells their unit: they are compared
+    with.
+    """
     file = case.views.cameras
     if file.unit_known or file.cameras is None or len(file) < 2:
         return case
@@ -183,7 +242,9 @@ def people_note(points: KeyPoints) -> tuple[Diagnosis, ...]:
         return ()
     text = "several people in " + ", ".join(f"{n} frames of {view}" for view, n in several.items())
     text += "; the one tracked best in each view was followed, and must be the same person in all"
-    return (Diagnosis("several_people", "warning", tuple(several), text, float(max(several.values()))),)
+    return (
+        Diagnosis("several_people", "warning", tuple(several), text, float(max(several.values()))),
+    )
 
 
 def from_data(config: Mapping[str, Any]) -> Case:
@@ -191,16 +252,27 @@ def from_data(config: Mapping[str, Any]) -> Case:
     data, found = recording_of(config)
     rig = found.cameras
     file = CameraFile(
-        path=data.source, format="ghpt", names=found.camera_names, other_names=("",) * len(found.camera_names),
-        K=rig.K, distortion=rig.K.new_zeros(len(rig.K), 5), size=None, R=rig.R, t=rig.t,
-    )  # fmt: skip
-    arrays = (np.array(getattr(found, field)) for field in ("key_points", "confidence", "seen", "frame"))
+        path=data.source,
+        format="ghpt",
+        names=found.camera_names,
+        other_names=("",) * len(found.camera_names),
+        K=rig.K,
+        distortion=rig.K.new_zeros(len(rig.K), 5),
+        size=None,
+        R=rig.R,
+        t=rig.t,
+    )
+    arrays = (
+        np.array(getattr(found, field)) for field in ("key_points", "confidence", "seen", "frame")
+    )
     views = Views(file, *arrays, found.rate_hz)
     return Case(f"{found.name} of {words(data.name, data.source)}", data.source, views, "the truth")
 
 
 def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
-    """Calibrated cameras that no error concerns; an error that names none, or all, concerns all. Two or more."""
+    """Calibrated cameras that no error concerns; an error that names none, or all, concerns all.
+    Two or more.
+    """
     usable = estimate.calibrated.clone()
     for found in estimate.diagnoses:
         if found.severity == "error":
@@ -209,12 +281,21 @@ def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
     return usable if int(usable.sum()) >= 2 else torch.zeros_like(usable)
 
 
-def _gauge(estimate: RigEstimate, placed: list[int], reference: Cameras | None, name: str) -> tuple[str, Similarity]:
+def _gauge(
+    estimate: RigEstimate, placed: list[int], reference: Cameras | None, name: str
+) -> tuple[str, Similarity]:
     """The world that the rig is written in, in words, and the way there."""
     if reference is not None and placed:
-        return f"that of {name}", align(estimate.cameras.index(placed), reference.index(placed), rigid=True)
-    gauge = upright(estimate.points, estimate.estimated, estimate.cameras.index(placed or slice(None)))
-    return "z along the people's upright, x where the first camera looks, the floor at their lowest ankles", gauge
+        return f"that of {name}", align(
+            estimate.cameras.index(placed), reference.index(placed), rigid=True
+        )
+    gauge = upright(
+        estimate.points, estimate.estimated, estimate.cameras.index(placed or slice(None))
+    )
+    return (
+        "z along the people's upright, x where the first camera looks, the floor at their lowest ankles",
+        gauge,
+    )
 
 
 def _through(case: Case, views: list[int], cameras: Cameras) -> Recording:

@@ -1,4 +1,6 @@
-"""The camera doctor: what is wrong with a calibration, from the people in view, and the mended files."""
+"""The camera doctor: what is wrong with a calibration, from the people in view, and the mended
+files.
+"""
 
 from __future__ import annotations
 
@@ -72,10 +74,12 @@ def files(config: dict[str, Any]) -> Files:
 
 
 def examine(config: dict[str, Any], output: Path) -> dict[str, Any]:
-    """Examine the cameras of ``config["cameras"]`` with ``config["keypoints"]``, or a recording of ``config["data"]``.
+    """Examine the cameras of ``config["cameras"]`` with ``config["keypoints"]``, or a recording of
+    ``config["data"]``.
 
-    Writes checkup.json and report.md into ``output`` and, of what can be mended, ``MENDED``; prints what is wrong.
-    Raises GhptDataError after writing if anything is. Returns what checkup.json holds.
+    Writes checkup.json and report.md into ``output`` and, of what can be mended, ``MENDED``; prints
+    what is wrong. Raises GhptDataError after writing if anything is. Returns what checkup.json
+    holds.
     """
     check_type(config, Settings, "")
     doctor = build(config["doctor"], "doctor")
@@ -94,22 +98,31 @@ def examine(config: dict[str, Any], output: Path) -> dict[str, Any]:
     _print(numbers)
     _log.info("Report: %s%s.", shown(output / "report.md"), ", beside it the mended files" * mended)
     if checkup.findings:
-        raise GhptDataError(patient.source, "cameras", summary(numbers), f"See {shown(output / 'report.md')}.")
+        raise GhptDataError(
+            patient.source, "cameras", summary(numbers), f"See {shown(output / 'report.md')}."
+        )
     return numbers
 
 
 def summary(numbers: dict[str, Any]) -> str:
     """What `examine` found, in words."""
-    found = [f"{' and '.join(f['cameras']) or 'all cameras'}: {f['code']}" for f in numbers["findings"]]
+    found = [
+        f"{' and '.join(f['cameras']) or 'all cameras'}: {f['code']}" for f in numbers["findings"]
+    ]
     return ", ".join(found) or f"{numbers['title']}: nothing wrong"
 
 
 def from_files(config: Mapping[str, Any], doctor: Doctor) -> Patient:
     """The user's own key points and cameras."""
     if config["spoil"]:
-        raise GhptConfigError("spoil", "is for demonstrations", "Leave it out, or leave out keypoints.")
-    file, points = own_cameras(config, "Calib.toml"), own_key_points(config)
-    evidence, cameras, at = gather(points, file, config["match"] or {}, config["views"], doctor.frames, doctor.shift)
+        raise GhptConfigError(
+            "spoil", "is for demonstrations", "Leave it out, or leave out keypoints."
+        )
+    file = own_cameras(config, "Calib.toml")
+    points = own_key_points(config)
+    evidence, cameras, at = gather(
+        points, file, config["match"] or {}, config["views"], doctor.frames, doctor.shift
+    )
     for note in people_note(points):
         _log.warning(note.text)
     title = f"{Path(config['cameras']).name} with {Path(config['keypoints']).resolve().name}"
@@ -119,61 +132,104 @@ def from_files(config: Mapping[str, Any], doctor: Doctor) -> Patient:
 def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
     """An embedded recording, spoilt on request."""
     if config["data"]["root"] is not None:
-        raise GhptConfigError("data.root", "is a data set on disk", "Give keypoints and cameras, or the embedded data.")
+        raise GhptConfigError(
+            "data.root",
+            "is a data set on disk",
+            "Give keypoints and cameras, or the embedded data.",
+        )
     data, found = recording_of(config)
     evidence, cameras = from_recording(found, data, doctor, len(found))
     setup = as_filed(cameras)
     if config["spoil"]:
         if config["spoil"] not in BREAKAGES:
-            raise GhptConfigError("spoil", f"there is no {config['spoil']!r}", suggest(config["spoil"], BREAKAGES))
+            raise GhptConfigError(
+                "spoil", f"there is no {config['spoil']!r}", suggest(config["spoil"], BREAKAGES)
+            )
         evidence, setup = BREAKAGES[config["spoil"]].spoil((evidence, setup))
-    title = f"{found.name} of {words(data.name, data.source)}" + f", spoilt: {config['spoil']}" * bool(config["spoil"])
+    title = (
+        f"{found.name} of {words(data.name, data.source)}"
+        + f", spoilt: {config['spoil']}" * bool(config["spoil"])
+    )
     return Patient(title, data.source, evidence, cameras, setup, None, ())
 
 
-def from_recording(recording: Recording, data: Any, doctor: Doctor, frames: int) -> tuple[Evidence, CameraFile]:
+def from_recording(
+    recording: Recording, data: Any, doctor: Doctor, frames: int
+) -> tuple[Evidence, CameraFile]:
     """The middle ``frames`` frames of an embedded recording, as its rig's lenses show them."""
     rig = human36m_rig(recording.subject) if data.name == "h36m" else panoptic_rig(data.cameras)
     first = max(0, (len(recording) - frames) // 2)
     rows = slice(first, first + frames)
     straight = torch.from_numpy(recording.key_points[rows].astype(np.float64)).transpose(0, 1)
-    pixels = distort(straight.flatten(1, 2), rig.cameras.K, rig.distortion).reshape(straight.shape).transpose(0, 1)
+    pixels = (
+        distort(straight.flatten(1, 2), rig.cameras.K, rig.distortion)
+        .reshape(straight.shape)
+        .transpose(0, 1)
+    )
     file = CameraFile(
-        path=recording.name, format="ghpt", names=rig.names, other_names=("",) * len(rig), K=rig.cameras.K,
-        distortion=rig.distortion, size=rig.size, R=rig.cameras.R, t=rig.cameras.t,
-    )  # fmt: skip
-    seen, frame = np.array(recording.seen[rows]), np.array(recording.frame[rows])
-    return choose(rig.names, pixels.numpy(), seen, frame, doctor.frames, doctor.shift, recording.name), file
+        path=recording.name,
+        format="ghpt",
+        names=rig.names,
+        other_names=("",) * len(rig),
+        K=rig.cameras.K,
+        distortion=rig.distortion,
+        size=rig.size,
+        R=rig.cameras.R,
+        t=rig.cameras.t,
+    )
+    seen = np.array(recording.seen[rows])
+    frame = np.array(recording.frame[rows])
+    return choose(
+        rig.names, pixels.numpy(), seen, frame, doctor.frames, doctor.shift, recording.name
+    ), file
 
 
 def report(numbers: dict[str, Any]) -> str:
     """The Markdown report."""
     findings = "\n".join(f"- **{f['code']}**: {escaped(_sentence(f))}" for f in numbers["findings"])
-    return "\n\n".join([
-        f"# Check-up of {escaped(numbers['title'])}",
-        f"{numbers['frames']} frames, {len(numbers['cameras'])} views. {_stature(numbers)}",
-        "## Findings", findings or "Nothing is wrong.",
-        "## Cameras", markdown(_HEADER, _rows(numbers)),
-        "Each view's key points against the joints that the other views triangulate: median distance, pixels, as the "
-        "files have it and with everything mended that can be.",
-    ]) + "\n"  # fmt: skip
+    return (
+        "\n\n".join(
+            [
+                f"# Check-up of {escaped(numbers['title'])}",
+                f"{numbers['frames']} frames, {len(numbers['cameras'])} views. {_stature(numbers)}",
+                "## Findings",
+                findings or "Nothing is wrong.",
+                "## Cameras",
+                markdown(_HEADER, _rows(numbers)),
+                "Each view's key points against the joints that the other views triangulate: median distance, pixels, as the "
+                "files have it and with everything mended that can be.",
+            ]
+        )
+        + "\n"
+    )
 
 
 def _numbers(patient: Patient, checkup: Checkup) -> dict[str, Any]:
-    errors = zip(patient.evidence.names, checkup.given_px.tolist(), checkup.error_px.tolist(), strict=True)
+    errors = zip(
+        patient.evidence.names, checkup.given_px.tolist(), checkup.error_px.tolist(), strict=True
+    )
     return {
-        "title": patient.title, "source": patient.source, "frames": len(patient.evidence.frame),
-        "stature_mm": checkup.stature or None, "unit_mm": checkup.unit_mm,
+        "title": patient.title,
+        "source": patient.source,
+        "frames": len(patient.evidence.frame),
+        "stature_mm": checkup.stature or None,
+        "unit_mm": checkup.unit_mm,
         "findings": [vars(finding) for finding in checkup.findings],
-        "cameras": [{"name": name, "error_px": given, "mended_px": after} for name, given, after in errors],
-    }  # fmt: skip
+        "cameras": [
+            {"name": name, "error_px": given, "mended_px": after} for name, given, after in errors
+        ],
+    }
 
 
 def _print(numbers: dict[str, Any]) -> None:
     console = Console()
     title = plain(f"Check-up of {numbers['title']}", "table.title")
-    table = Table(title=title, caption="median error against the other views",
-                  title_justify="left", caption_justify="left")  # fmt: skip
+    table = Table(
+        title=title,
+        caption="median error against the other views",
+        title_justify="left",
+        caption_justify="left",
+    )
     for i, column in enumerate(_HEADER):
         table.add_column(column, justify="right" if i else "left")
     for row in _rows(numbers):
@@ -188,22 +244,32 @@ def _print(numbers: dict[str, Any]) -> None:
 
 
 def _rows(numbers: dict[str, Any]) -> list[list[str]]:
-    return [[c["name"], f"{c['error_px']:.1f}", f"{c['mended_px']:.1f}"] for c in numbers["cameras"]]
+    return [
+        [c["name"], f"{c['error_px']:.1f}", f"{c['mended_px']:.1f}"] for c in numbers["cameras"]
+    ]
 
 
 def _sentence(finding: Mapping[str, Any]) -> str:
-    before, after = finding["before_px"], finding["after_px"]
+    before = finding["before_px"]
+    after = finding["after_px"]
     if not before:
         return f"{finding['text']}."
-    return f"{finding['text']} ({before:.1f} px" + (f", then {after:.1f} px)." if finding["mended"] else ").")
+    return f"{finding['text']} ({before:.1f} px" + (
+        f", then {after:.1f} px)." if finding["mended"] else ")."
+    )
 
 
 def _stature(numbers: dict[str, Any]) -> str:
-    height, unit = numbers["stature_mm"], numbers["unit_mm"]
+    height = numbers["stature_mm"]
+    unit = numbers["unit_mm"]
     if not height:
         return "The person's size cannot be told."
     said = f"The person measures {height / 1000:.2f} m"
-    return f"{said}, which tells the file's unit: {UNITS_MM[unit]} (unit_mm={unit:g})." if unit else f"{said}."
+    return (
+        f"{said}, which tells the file's unit: {UNITS_MM[unit]} (unit_mm={unit:g})."
+        if unit
+        else f"{said}."
+    )
 
 
 COMMAND = Command("cameras", examine, summary, files)

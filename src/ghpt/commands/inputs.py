@@ -1,4 +1,6 @@
-"""What calibrate.py, cameras.py and predict.py work on: people's own files, or one recording of a data set."""
+"""What calibrate.py, cameras.py and predict.py work on: people's own files, or one recording of a
+data set.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +42,9 @@ def own_cameras(config: Mapping[str, Any], example: str) -> CameraFile:
 
 def own_key_points(config: Mapping[str, Any]) -> KeyPoints:
     """The user's key points, of one person in each view."""
-    return read_key_points(config["keypoints"], config["skeleton"], config["rate_hz"], config["format"])
+    return read_key_points(
+        config["keypoints"], config["skeleton"], config["rate_hz"], config["format"]
+    )
 
 
 def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, Recording]:
@@ -49,7 +53,9 @@ def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, Recordi
     made = {"source": data.source, "split": data.evaluate}
     stored = prepared(data.cache, data.key(data.evaluate), lambda: data.make(data.evaluate), made)
     recordings = {recording.name: recording for recording in stored}
-    name = config["recording"] or ("S9/Walking-1" if "S9/Walking-1" in recordings else next(iter(recordings), ""))
+    name = config["recording"] or (
+        "S9/Walking-1" if "S9/Walking-1" in recordings else next(iter(recordings), "")
+    )
     if name not in recordings:
         raise GhptConfigError("recording", f"there is no {name!r}", suggest(name, recordings))
     return data, recordings[name]

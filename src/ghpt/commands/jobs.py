@@ -1,4 +1,6 @@
-"""The jobs of a sweep, where Hydra's launchers leave something open: one that dies, an interrupt, several processes."""
+"""The jobs of a sweep, where Hydra's launchers leave something open: one that dies, an interrupt,
+several processes.
+"""
 
 import os
 import shutil
@@ -46,26 +48,35 @@ class Job(NamedTuple):
 def chosen_launcher(overrides: Sequence[Override], compose_only: bool) -> str:
     """The launcher of Hydra that the command line names, or ``basic``.
 
-    Raises GhptConfigError for one whose jobs are not reported, that is not installed, or, unless ``compose_only``,
-    that needs a cluster where there is none.
+    Raises GhptConfigError for one whose jobs are not reported, that is not installed, or, unless
+    ``compose_only``, that needs a cluster where there is none.
     """
     name = next((o.value() for o in reversed(overrides) if o.key_or_group == LAUNCHER), "basic")
     if name not in _LAUNCHERS:
-        raise GhptConfigError(LAUNCHER, f"there is no {str(name)!r}", suggest(str(name), _LAUNCHERS))
+        raise GhptConfigError(
+            LAUNCHER, f"there is no {str(name)!r}", suggest(str(name), _LAUNCHERS)
+        )
     if name != "basic" and find_spec("submitit") is None:
-        raise GhptConfigError(LAUNCHER, f"{name} needs hydra-submitit-launcher", "Run: pip install -e '.[slurm]'")
-    if name == "submitit_slurm" and not (compose_only or (shutil.which("sbatch") and shutil.which("srun"))):
+        raise GhptConfigError(
+            LAUNCHER, f"{name} needs hydra-submitit-launcher", "Run: pip install -e '.[slurm]'"
+        )
+    if name == "submitit_slurm" and not (
+        compose_only or (shutil.which("sbatch") and shutil.which("srun"))
+    ):
         mend = f"Start it on a machine of the cluster, or with {LAUNCHER}=submitit_local."
-        raise GhptConfigError(LAUNCHER, "submitit_slurm needs Slurm's sbatch and srun, which are not here", mend)
+        raise GhptConfigError(
+            LAUNCHER, "submitit_slurm needs Slurm's sbatch and srun, which are not here", mend
+        )
     return str(name)
 
 
 @contextmanager
 def awaited(ended: list[Job]) -> Iterator[None]:
-    """Within the block, every job that submitit's launchers start is added to ``ended`` when it ends, however it does.
+    """Within the block, every job that submitit's launchers start is added to ``ended`` when it
+    ends, however it does.
 
-    Hydra's launcher leaves the others alone when one dies without a result, or when it is interrupted; here they are
-    waited for, and stopped.
+    Hydra's launcher leaves the others alone when one dies without a result, or when it is
+    interrupted; here they are waited for, and stopped.
     """
     import submitit
     from submitit.core.utils import FailedJobError
@@ -80,7 +91,10 @@ def awaited(ended: list[Job]) -> Iterator[None]:
         finally:
             signal.signal(signal.SIGINT, previous)
         folder = Path(str(launcher.config.hydra.sweep.dir))
-        submitted = [_Awaited(job, folder, number, ended) for job, number in zip(jobs, columns[2], strict=True)]
+        submitted = [
+            _Awaited(job, folder, number, ended)
+            for job, number in zip(jobs, columns[2], strict=True)
+        ]
         for job in submitted:
             job.others = submitted
         return submitted
@@ -91,7 +105,9 @@ def awaited(ended: list[Job]) -> Iterator[None]:
     except (FailedJobError, ValueError) as error:  # sbatch refuses, or the executor
         if isinstance(error, ValueError) and (isinstance(error, GhptError) or error.__cause__):
             raise
-        raise GhptConfigError("hydra.launcher", str(error).rstrip("."), "--cfg hydra shows its settings.") from None
+        raise GhptConfigError(
+            "hydra.launcher", str(error).rstrip("."), "--cfg hydra shows its settings."
+        ) from None
     finally:
         submitit.AutoExecutor.map_array = submit
 
@@ -100,7 +116,10 @@ class _Awaited:
     """A submitit job whose end is noted; what Hydra's launcher asks of it."""
 
     def __init__(self, job: Any, folder: Path, number: int, ended: list[Job]) -> None:
-        self.job, self.folder, self.number, self.ended = job, folder, number, ended
+        self.job = job
+        self.folder = folder
+        self.number = number
+        self.ended = ended
         self.others: list[_Awaited] = []
 
     def results(self) -> list[JobReturn]:
@@ -109,7 +128,9 @@ class _Awaited:
         except KeyboardInterrupt:
             remaining = [other for other in self.others if other.number >= self.number]
             _stop([other.job for other in remaining])
-            self.ended += [other._end() for other in remaining if other.job.paths.result_pickle.exists()]
+            self.ended += [
+                other._end() for other in remaining if other.job.paths.result_pickle.exists()
+            ]
             raise
         self.ended.append(job)
         return [JobReturn(status=JobStatus.COMPLETED, _return_value=job)]
@@ -120,7 +141,9 @@ class _Awaited:
         try:
             return self.job.results()[0].return_value
         except (FailedJobError, UncompletedJobError):
-            name = next((path.name for path in self.folder.glob(f"{self.number}_*")), str(self.number))
+            name = next(
+                (path.name for path in self.folder.glob(f"{self.number}_*")), str(self.number)
+            )
             said = f"error: it ended without a result; {self.job.paths.stderr} may say why"
             return Job(name, {}, None, said, failed=True)
 
@@ -145,7 +168,9 @@ def _stop(jobs: list[Any]) -> None:
 
 
 def take_signals() -> None:
-    """Within a job of a local pool: an interrupt, or SIGTERM, stops it (`awaited` and submitit have them ignored)."""
+    """Within a job of a local pool: an interrupt, or SIGTERM, stops it (`awaited` and submitit have
+    them ignored).
+    """
     if os.environ.get("SUBMITIT_EXECUTOR") == "local":
         signal.signal(signal.SIGINT, signal.default_int_handler)
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -153,17 +178,22 @@ def take_signals() -> None:
 
 @contextmanager
 def own_command(script: str, added: Sequence[str] = ()) -> Iterator[None]:
-    """Within the block, the running job of a sweep is a command of its own to Lightning, with ``added`` words.
+    """Within the block, the running job of a sweep is a command of its own to Lightning, with
+    ``added`` words.
 
-    Lightning starts a training's other processes with this process's command, which is the whole sweep's; and leaves
-    its variables behind, with which the next job would believe to have been started by the one before.
+    Lightning starts a training's other processes with this process's command, which is the whole
+    sweep's; and leaves its variables behind, with which the next job would believe to have been
+    started by the one before.
     """
     hydra = HydraConfig.get()
     before = list(sys.argv), __main__.__spec__, dict(os.environ)
     with read_write(hydra), open_dict(hydra):
         hydra.run.dir = hydra.runtime.output_dir
     settings = [word for word in hydra.overrides.task if not word.startswith("output=")]
-    sys.argv[:], __main__.__spec__ = [script, *settings, *added, f"output='{hydra.runtime.output_dir}'"], None
+    sys.argv[:], __main__.__spec__ = (
+        [script, *settings, *added, f"output='{hydra.runtime.output_dir}'"],
+        None,
+    )
     try:
         yield
     finally:
@@ -176,12 +206,16 @@ def own_command(script: str, added: Sequence[str] = ()) -> Iterator[None]:
 
 
 def is_first_process() -> bool:
-    """Whether this is the process of a run that writes its files: the only one, or the first of several."""
+    """Whether this is the process of a run that writes its files: the only one, or the first of
+    several.
+    """
     return all(os.environ.get(name, "0") == "0" for name in _RANKS)
 
 
 def first_of_several_ends() -> bool:
-    """Whether this is one of a training's several processes, but the first, and that one ends too: it says why."""
+    """Whether this is one of a training's several processes, but the first, and that one ends too:
+    it says why.
+    """
     if os.environ.get("LOCAL_RANK", "0") == "0":
         return False
     end = time.monotonic() + _PATIENCE / 2

@@ -1,4 +1,6 @@
-"""How a run that ends early tells so: signals by the exit status, lost processes and memory in one line."""
+"""How a run that ends early tells so: signals by the exit status, lost processes and memory in one
+line.
+"""
 
 import os
 import re
@@ -26,7 +28,9 @@ _WHY = "the system does so where memory is short"
 
 
 class OwnSignals(Callback):
-    """Puts our handler back in the place of Lightning's, whose loops of test and predict ignore SIGTERM."""
+    """Puts our handler back in the place of Lightning's, whose loops of test and predict ignore
+    SIGTERM.
+    """
 
     def on_test_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self._put_back()
@@ -35,17 +39,20 @@ class OwnSignals(Callback):
         self._put_back()
 
     def _put_back(self) -> None:
-        # Lightning's handler has several processes wait for each other where they are, which may be for ever.
+        # Lightning's handler has several processes wait for each other where they are, which may be
+        # for ever.
         if signal.getsignal(signal.SIGINT) == stop:
             signal.signal(signal.SIGTERM, stop)
 
 
 @contextmanager
 def told(trainer: L.Trainer) -> Iterator[None]:
-    """Run the trainer within the block: however it ends, the shell and the user are told in the way of all commands.
+    """Run the trainer within the block: however it ends, the shell and the user are told in the way
+    of all commands.
 
-    An interrupt exits with 130, SIGTERM and SIGHUP with 143 (Lightning's statuses are 1 and 0). Raises GhptConfigError
-    where a process that loads data, or another process of the same run, was killed.
+    An interrupt exits with 130, SIGTERM and SIGHUP with 143 (Lightning's statuses are 1 and 0).
+    Raises GhptConfigError where a process that loads data, or another process of the same run, was
+    killed.
     """
     with stopped_by_signals():
         try:
@@ -86,7 +93,9 @@ def _lost_process(ended: tuple[int, int] | None, count: int) -> GhptConfigError:
 
 
 def _ended(processes: Sequence[Popen[Any]], patience: float) -> tuple[int, int] | None:
-    """Number and exit status of a process beside the first that failed, within ``patience`` seconds."""
+    """Number and exit status of a process beside the first that failed, within ``patience``
+    seconds.
+    """
     end = time.monotonic() + patience
     while True:
         for number, process in enumerate(processes, start=1):
@@ -98,8 +107,12 @@ def _ended(processes: Sequence[Popen[Any]], patience: float) -> tuple[int, int] 
 
 
 def _say_and_end(observer: Any) -> None:
-    """What Lightning's thread does when it finds a process dead; its own kills this one without a word."""
-    time.sleep(_WAIT)  # the main thread may be about to say it, and ends this thread with the process
+    """What Lightning's thread does when it finds a process dead; its own kills this one without a
+    word.
+    """
+    time.sleep(
+        _WAIT
+    )  # the main thread may be about to say it, and ends this thread with the process
     processes = observer._child_processes
     error = _lost_process(_ended(processes, 0.0), len(processes) + 1)
     for process in processes:

@@ -1,4 +1,5 @@
-"""A command's output folder: locked while the command runs, with a manifest of what ghpt wrote there.
+"""A command's output folder: locked while the command runs, with a manifest of what ghpt wrote
+there.
 
 A file is replaced or removed only if the manifest lists it, by name and digest. Anything else is
 somebody's work, and an error names it before anything is computed.
@@ -22,7 +23,8 @@ from ghpt.errors import GhptConfigError, GhptDataError, GhptError, one_line
 from ghpt.files import acquire, digest, guarded, sweep_temporaries, write_json
 
 STATE = ".ghpt"
-"""The folder, within the output folder, of the manifest, the lock and the record of a finished run."""
+"""The folder, within the output folder, of the manifest, the lock and the record of a finished run.
+"""
 _MANIFEST = "manifest.json"
 _LOCK = "lock"
 _FINISHED = "finished.json"
@@ -41,17 +43,19 @@ class Files:
     writes: tuple[str, ...] = ()
     """Names of files within the output folder."""
     keeps: tuple[str, ...] = ()
-    """Those of ``writes`` that, once there, are replaced only on request, although ghpt wrote them."""
+    """Those of ``writes`` that, once there, are replaced only on request, although ghpt wrote them.
+    """
     growing: tuple[str, ...] = ()
-    """Names of logs, and of folders of unfinished work: once ghpt made them they are its own, whatever
-    they hold."""
+    """Names of logs, and of folders of unfinished work: once ghpt made them they are its own,
+    whatever they hold.
+    """
 
 
 class OutputFolder:
     """The output folder ``path``, as a context. Entering it creates, locks and checks the folder.
 
-    Raises GhptDataError if another command writes there, if a file that is to be written is an input,
-    or if it was not written by ghpt, or has been changed since (allowed by ``overwrite``).
+    Raises GhptDataError if another command writes there, if a file that is to be written is an
+    input, or if it was not written by ghpt, or has been changed since (allowed by ``overwrite``).
     """
 
     def __init__(self, path: Path, files: Files, overwrite: bool = False) -> None:
@@ -94,7 +98,9 @@ class OutputFolder:
         self._release()
 
     def before_replace(self, path: Path, new: Path) -> None:
-        """Record the digest that ``path`` is about to get. Raises GhptDataError if it is not ghpt's."""
+        """Record the digest that ``path`` is about to get. Raises GhptDataError if it is not
+        ghpt's.
+        """
         name = self._name(path)
         if self._is_work(name):
             return
@@ -195,7 +201,8 @@ class OutputFolder:
             return
         if not isinstance(content, dict) or content.get("version") != _VERSION:
             return
-        files, growing = content.get("files"), content.get("growing")
+        files = content.get("files")
+        growing = content.get("growing")
         if isinstance(files, dict):
             self._digests = {n: d for n, d in files.items() if isinstance(d, list)}
         if isinstance(growing, list):
@@ -265,7 +272,12 @@ def check_apart(settings: Mapping[str, Any]) -> None:
     """Raise GhptConfigError if the output folder is the folder of key points itself."""
     folder = Path(str(settings.get("keypoints") or ""))
     output = settings.get("output")
-    if settings.get("keypoints") and output and folder.is_dir() and Path(str(output)).resolve() == folder.resolve():
+    if (
+        settings.get("keypoints")
+        and output
+        and folder.is_dir()
+        and Path(str(output)).resolve() == folder.resolve()
+    ):
         problem = f"is {output}, the folder that the key points are read from"
         raise GhptConfigError("output", problem, "Name another folder.")
 

@@ -1,4 +1,6 @@
-"""The words of a command line, checked before Hydra composes them: a mistake is named, with what exists."""
+"""The words of a command line, checked before Hydra composes them: a mistake is named, with what
+exists.
+"""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -15,18 +17,29 @@ from ghpt.errors import GhptConfigError
 
 
 def check_overrides(conf: Path, config_name: str, words: Sequence[str]) -> list[Override]:
-    """The parsed overrides. Raises GhptConfigError, saying what exists, for a setting or a choice that does not."""
+    """The parsed overrides. Raises GhptConfigError, saying what exists, for a setting or a choice
+    that does not.
+    """
     overrides = [_parse(word) for word in words]
     groups = {}
     for override in overrides:
         if (conf / override.key_or_group).is_dir() and not override.is_delete():
-            chosen = [_check_choice(conf, override.key_or_group, value) for value in _values(override)]
+            chosen = [
+                _check_choice(conf, override.key_or_group, value) for value in _values(override)
+            ]
             groups[override.key_or_group] = f"{override.get_key_element()}={chosen[0]}"
     with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-        config: Any = OmegaConf.to_container(hydra.compose(config_name, overrides=list(groups.values())))
+        config: Any = OmegaConf.to_container(
+            hydra.compose(config_name, overrides=list(groups.values()))
+        )
     for override in overrides:
         key = override.key_or_group
-        if key not in groups and not key.startswith("hydra") and "@" not in key and not (conf / key).is_dir():
+        if (
+            key not in groups
+            and not key.startswith("hydra")
+            and "@" not in key
+            and not (conf / key).is_dir()
+        ):
             _check_key(config, key, added=override.is_add() or override.is_force_add())
     return overrides
 

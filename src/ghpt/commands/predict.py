@@ -18,7 +18,15 @@ from ghpt.commands.calibrate import from_data
 from ghpt.commands.inputs import InputSettings, own_cameras
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
-from ghpt.commands.prediction.frames import Detected, Frames, Seen, calibrated, evidence, frames_of_views, in_unit
+from ghpt.commands.prediction.frames import (
+    Detected,
+    Frames,
+    Seen,
+    calibrated,
+    evidence,
+    frames_of_views,
+    in_unit,
+)
 from ghpt.commands.prediction.gaps import Gaps, after, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
 from ghpt.commands.prediction.report import prediction_report, print_prediction, print_verdict
@@ -112,30 +120,54 @@ def files(config: dict[str, Any]) -> Files:
 def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     """Predict the 3D joints of ``config["keypoints"]``, or of a recording of ``config["data"]``.
 
-    Writes poses.<format>, prediction.json and report.md into ``output`` and prints the tables; the shards that an
-    interrupted run left are gone on with. Returns what prediction.json holds.
+    Writes poses.<format>, prediction.json and report.md into ``output`` and prints the tables; the
+    shards that an interrupted run left are gone on with. Returns what prediction.json holds.
     """
     check_type(config, Settings, "")
     _check(config)
     chosen = choose(config)
-    compared = {name: build(config["baselines"][name], f"baselines.{name}") for name in config["compare"]}
-    doctor, judge = build(config["doctor"], "doctor"), build(config["verdict"], "verdict")
-    frames = in_unit(from_files(config), doctor.consensus) if config["keypoints"] else _from_data(config)
+    compared = {
+        name: build(config["baselines"][name], f"baselines.{name}") for name in config["compare"]
+    }
+    doctor = build(config["doctor"], "doctor")
+    judge = build(config["verdict"], "verdict")
+    frames = (
+        in_unit(from_files(config), doctor.consensus) if config["keypoints"] else _from_data(config)
+    )
     hertz = None if config["smooth"] is None else float(config["smooth"])
-    gaps = Gaps(gap_frames(config["fill"], frames.rate_hz), config["interpolation"], hertz, frames.rate_hz)
+    gaps = Gaps(
+        gap_frames(config["fill"], frames.rate_hz), config["interpolation"], hertz, frames.rate_hz
+    )
     unit = frames.detected.cameras.unit_mm if frames.detected else 1.0
     origin = provenance(config["seed"])
     about = About(
-        name=frames.title, source=frames.source, estimator=chosen.name, joints=JOINTS, camera_names=frames.camera_names,
-        rate_hz=frames.rate_hz, smoothed=config["smooth"] is not None,
-        provenance=origin | {"estimator": chosen.text, "settings": chosen.identity, "fill_frames": gaps.longest,
-                             "interpolation": gaps.interpolation, "smooth_hz": gaps.cut_off_hz,
-                             "camera_unit_mm": unit},
+        name=frames.title,
+        source=frames.source,
+        estimator=chosen.name,
+        joints=JOINTS,
+        camera_names=frames.camera_names,
+        rate_hz=frames.rate_hz,
+        smoothed=config["smooth"] is not None,
+        provenance=origin
+        | {
+            "estimator": chosen.text,
+            "settings": chosen.identity,
+            "fill_frames": gaps.longest,
+            "interpolation": gaps.interpolation,
+            "smooth_hz": gaps.cut_off_hz,
+            "camera_unit_mm": unit,
+        },
         origin=tuple(frames.origin.tolist()),
-    )  # fmt: skip
+    )
     formats = _formats(config, frames)
     _tell_origin(about, formats)
-    _log.info("%s: %d frames, %d views, by %s.", frames.title, len(frames), len(frames.camera_names), chosen.text)
+    _log.info(
+        "%s: %d frames, %d views, by %s.",
+        frames.title,
+        len(frames),
+        len(frames.camera_names),
+        chosen.text,
+    )
     sweep_temporaries(output)
     predictor = chosen.predictor.fitted(frames.batch(frames.spread(config["fitted_frames"])))
     key = _key(frames, chosen, origin)
@@ -146,19 +178,32 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
             scene = Scene(frames.cameras, lambda: evidence(frames, shards))
             settings = {"trc": config["trc"], "html": {"scene": scene}, "rerun": {"scene": scene}}
             for name in formats:
-                WRITERS[name].write(output / WRITERS[name].file, about, chunks, **settings.get(name, {}))
+                WRITERS[name].write(
+                    output / WRITERS[name].file, about, chunks, **settings.get(name, {})
+                )
             found = counts(chunks(), about.joints, about.camera_names, len(frames))
     estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor.rejecting_nothing())}
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
-    evaluation = evaluate(frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"])
+    evaluation = evaluate(
+        frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"]
+    )
     own = evaluation["estimators"][chosen.name]
     numbers = {
-        "data": frames.title, "source": frames.source, "cameras": list(frames.camera_names),
-        "estimator": chosen.name, "estimator_text": chosen.text, "rate_hz": frames.rate_hz,
-        "fill_frames": gaps.longest, "smooth_hz": gaps.cut_off_hz, **found,
-        "scales": own["scales"], "unit_mm": unit, "evaluation": evaluation,
-        "formats": formats, "provenance": about.provenance,
-    }  # fmt: skip
+        "data": frames.title,
+        "source": frames.source,
+        "cameras": list(frames.camera_names),
+        "estimator": chosen.name,
+        "estimator_text": chosen.text,
+        "rate_hz": frames.rate_hz,
+        "fill_frames": gaps.longest,
+        "smooth_hz": gaps.cut_off_hz,
+        **found,
+        "scales": own["scales"],
+        "unit_mm": unit,
+        "evaluation": evaluation,
+        "formats": formats,
+        "provenance": about.provenance,
+    }
     checkup = check_cameras(frames, doctor) if judge.asks(own["scales"]["views"]) else None
     verdict = judge(numbers, checkup, unit, commands_on(config, output))
     numbers["verdict"] = verdict.numbers()
@@ -181,33 +226,46 @@ def summary(numbers: dict[str, Any]) -> str:
     if not numbers:
         return "done by the first process"
     observed = f"{100 * numbers['share']['observed']:.1f} % observed"
-    return f"{numbers['data']}: {numbers['frames']} frames, {observed}, {numbers['verdict']['level']}"
+    return (
+        f"{numbers['data']}: {numbers['frames']} frames, {observed}, {numbers['verdict']['level']}"
+    )
 
 
 def choose(config: dict[str, Any]) -> Chosen:
-    """The checkpoint's model, or without one the classical estimator. Raises GhptCheckpointError for a model that does
-    not predict poses."""
+    """The checkpoint's model, or without one the classical estimator. Raises GhptCheckpointError
+    for a model that does not predict poses.
+    """
     kind = "learned" if config["ckpt"] else "classical"
     settings = config["estimator"][kind] | ({} if config["swaps"] else {"swaps": None})
     if not config["ckpt"]:
         name = config["triangulation"]
-        text = f"{NAMES.get(name, name.replace('_', ' '))}, a classical estimator (no ckpt was given)"
+        text = (
+            f"{NAMES.get(name, name.replace('_', ' '))}, a classical estimator (no ckpt was given)"
+        )
         estimator = config["baselines"][name]
-        predictor = build(settings, "estimator.classical")(estimator=build(estimator, f"baselines.{name}"))
-        return Chosen(name, text, predictor, predictor.swaps, None, settings | {"estimator": estimator})
+        predictor = build(settings, "estimator.classical")(
+            estimator=build(estimator, f"baselines.{name}")
+        )
+        return Chosen(
+            name, text, predictor, predictor.swaps, None, settings | {"estimator": estimator}
+        )
     changes = {"hypotheses": config["hypotheses"], "seed": config["seed"]}
     model, trained = load_model(config["ckpt"], config.get("trust") or (), **changes)
     if not isinstance(model.problem, PoseTriangulation):
         problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
-        raise GhptCheckpointError(config["ckpt"], problem, "Give one that train.py model=pose wrote.")
+        raise GhptCheckpointError(
+            config["ckpt"], problem, "Give one that train.py model=pose wrote."
+        )
     digest = hashlib.sha256(Path(config["ckpt"]).read_bytes()).hexdigest()
-    text = (
-        f"the learned model of {Path(config['ckpt']).name}, trained on {trained['provenance'].get('data', 'unknown')}"
-    )
+    text = f"the learned model of {Path(config['ckpt']).name}, trained on {trained['provenance'].get('data', 'unknown')}"
     view_weights = build(config["view_weights"], "view_weights")(model)
     predictor = build(settings, "estimator.learned")(view_weights=view_weights)
-    identity = settings | {"view_weights": config["view_weights"], "ckpt_sha256": digest,
-                           "hypotheses": model.hypotheses, "seed": config["seed"]}  # fmt: skip
+    identity = settings | {
+        "view_weights": config["view_weights"],
+        "ckpt_sha256": digest,
+        "hypotheses": model.hypotheses,
+        "seed": config["seed"],
+    }
     return Chosen("view_weights", text, predictor, predictor.swaps, model, identity)
 
 
@@ -217,11 +275,17 @@ def from_files(config: dict[str, Any]) -> Frames:
     calibrated(str(config["cameras"]), cameras)
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
     rate = None if config["rate_hz"] is None else float(config["rate_hz"])
-    stored = open_stored(config["keypoints"], config["skeleton"], rate) if config["format"] in (None, "npz") else None
+    stored = (
+        open_stored(config["keypoints"], config["skeleton"], rate)
+        if config["format"] in (None, "npz")
+        else None
+    )
     if stored is not None:
         return frames_of_stored(stored, cameras, config["match"], config["views"], title)
     people = read_people(config["keypoints"], config["skeleton"], rate, config["format"])
-    points, at, ordered = as_one_person(people, cameras, config["match"], config["views"], config["person"])
+    points, at, ordered = as_one_person(
+        people, cameras, config["match"], config["views"], config["person"]
+    )
     views = look_through(points, cameras, config["match"], config["views"])
 
     def detected(rows: Int[np.ndarray, " N"]) -> Seen:
@@ -231,7 +295,9 @@ def from_files(config: dict[str, Any]) -> Frames:
     several = dict(zip(people.views, (people.counts() > 1).sum(0).tolist(), strict=True))
     if any(several.values()):
         words = ", ".join(f"{n} frames of {view}" for view, n in several.items() if n)
-        _log.warning("Several people are in %s: person %d is followed (person=).", words, config["person"])
+        _log.warning(
+            "Several people are in %s: person %d is followed (person=).", words, config["person"]
+        )
     frames = frames_of_views(views, str(Path(config["keypoints"]).resolve()), title)
     return replace(frames, detected=Detected(ordered, detected))
 
@@ -244,18 +310,33 @@ def _from_data(config: dict[str, Any]) -> Frames:
 def _key(frames: Frames, chosen: Chosen, origin: dict[str, Any]) -> str:
     """What shards depend on, in one word."""
     made = {name: value for name, value in origin.items() if name != "command"}
-    parts = {"frames": frames.stamp(), "estimator": chosen.name, "settings": chosen.identity, "made": made}
+    parts = {
+        "frames": frames.stamp(),
+        "estimator": chosen.name,
+        "settings": chosen.identity,
+        "made": made,
+    }
     return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
 
 
 def _formats(config: dict[str, Any], frames: Frames) -> list[str]:
-    """Those that are asked for; without any all that are there, but for those that need a rate that is not known."""
+    """Those that are asked for; without any all that are there, but for those that need a rate that
+    is not known.
+    """
     if frames.rate_hz:
         return config["formats"] or list(_ALL)
     for name in config["formats"] or ():
-        check(name not in _TIMED, "rate_hz", f"is unknown, and {name} needs it", "Give rate_hz=60, say.")
+        check(
+            name not in _TIMED,
+            "rate_hz",
+            f"is unknown, and {name} needs it",
+            "Give rate_hz=60, say.",
+        )
     if config["formats"] is None:
-        _log.warning("The files do not tell the frame rate: no %s. Give rate_hz=60, say.", " and ".join(_TIMED))
+        _log.warning(
+            "The files do not tell the frame rate: no %s. Give rate_hz=60, say.",
+            " and ".join(_TIMED),
+        )
     return config["formats"] or [name for name in _ALL if name not in _TIMED]
 
 
@@ -274,7 +355,7 @@ def _check(config: dict[str, Any]) -> None:
         ("triangulation", [] if config["ckpt"] else [config["triangulation"]], config["baselines"]),
         ("compare", config["compare"], config["baselines"]),
         ("formats", config["formats"] or [], WRITERS),
-    ):  # fmt: skip
+    ):
         for name in names:
             check(name in existing, key, f"there is no {name!r}", suggest(name, existing))
 

@@ -1,4 +1,6 @@
-"""Every table and figure of the paper again: the cells that are missing, then the report from all of them."""
+"""Every table and figure of the paper again: the cells that are missing, then the report from all
+of them.
+"""
 
 from __future__ import annotations
 
@@ -33,8 +35,15 @@ from ghpt.report.escape import code
 from ghpt.report.tables import words
 
 _PARTS = (
-    generalization, other_systems, base_dataset, pose_figures, camera_tables, view_weights, ablations, robustness,
-)  # fmt: skip
+    generalization,
+    other_systems,
+    base_dataset,
+    pose_figures,
+    camera_tables,
+    view_weights,
+    ablations,
+    robustness,
+)
 ITEMS: dict[str, Item] = {item.label: item for part in _PARTS for item in part.ITEMS}
 """Every item by its label, in the report's order."""
 MOST_JOBS = 8
@@ -78,19 +87,27 @@ def files(config: dict[str, Any]) -> Files:
 
 
 def reproduce(config: dict[str, Any], output: Path, conf: Path) -> dict[str, Any]:
-    """Compute what is missing of the items that are asked for, and write their report into ``output``.
+    """Compute what is missing of the items that are asked for, and write their report into
+    ``output``.
 
-    ``conf`` is the folder of train.yaml and test.yaml. Returns what the report says of itself. Raises GhptConfigError
-    for a label that there is not, and whatever a cell raises, with its name; what was finished by then is kept.
+    ``conf`` is the folder of train.yaml and test.yaml. Returns what the report says of itself.
+    Raises GhptConfigError for a label that there is not, and whatever a cell raises, with its name;
+    what was finished by then is kept.
     """
     check_type(config, Settings, "")
     check(config["seeds"] >= 1, "seeds", f"is {config['seeds']}", "It must be >= 1.")
-    check(config["jobs"] is None or config["jobs"] >= 1, "jobs", f"is {config['jobs']}", "It must be >= 1, or null.")
+    check(
+        config["jobs"] is None or config["jobs"] >= 1,
+        "jobs",
+        f"is {config['jobs']}",
+        "It must be >= 1, or null.",
+    )
     return _reproduce(config, seeds_of(config), output, conf)
 
 
 def gather(jobs: Sequence[Job], conf: Path) -> None:
-    """After a sweep over seeds or items: one report of them all in the sweep's folder, from the cells that they kept.
+    """After a sweep over seeds or items: one report of them all in the sweep's folder, from the
+    cells that they kept.
 
     Where the jobs differ in anything else there is nothing to gather, and each has its own report.
     """
@@ -99,16 +116,25 @@ def gather(jobs: Sequence[Job], conf: Path) -> None:
         return
     seeds = sorted({seed for config in configs for seed in seeds_of(config)})
     everything = any(config["only"] is None for config in configs)
-    only = None if everything else [item.label for config in configs for item in chosen(config["only"])]
+    only = (
+        None
+        if everything
+        else [item.label for config in configs for item in chosen(config["only"])]
+    )
     with_all = {"only": only, "seed": seeds[0], "seeds": len(seeds)}
     _reproduce(configs[0] | with_all, seeds, Path(configs[0]["output"]), conf)
 
 
 def spread(command: Sequence[str]) -> list[str]:
-    """The words of a command line: in a sweep ``seeds=5`` becomes ``seed=0,1,2,3,4``, a job for each."""
+    """The words of a command line: in a sweep ``seeds=5`` becomes ``seed=0,1,2,3,4``, a job for
+    each.
+    """
     words = dict(word.split("=", 1) for word in command if "=" in word)
-    number, first = words.get("seeds", ""), words.get("seed", "0")
-    if not {"-m", "--multirun"} & set(command) or not (number.isdecimal() and first.isdecimal() and int(number) > 1):
+    number = words.get("seeds", "")
+    first = words.get("seed", "0")
+    if not {"-m", "--multirun"} & set(command) or not (
+        number.isdecimal() and first.isdecimal() and int(number) > 1
+    ):
         return list(command)
     others = [word for word in command if not word.startswith(("seeds=", "seed="))]
     return [*others, "seed=" + ",".join(str(int(first) + i) for i in range(int(number)))]
@@ -123,29 +149,50 @@ def _but_shares(config: dict[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in config.items() if key not in ("only", "seed", "seeds")}
 
 
-def _reproduce(config: dict[str, Any], seeds: Sequence[int], output: Path, conf: Path) -> dict[str, Any]:
+def _reproduce(
+    config: dict[str, Any], seeds: Sequence[int], output: Path, conf: Path
+) -> dict[str, Any]:
     start = time.perf_counter()
     items = chosen(config["only"])
-    setups = [Setup(conf, _roots(config["data"]), config["overrides"], config["sizes"], seed) for seed in seeds]
+    setups = [
+        Setup(conf, _roots(config["data"]), config["overrides"], config["sizes"], seed)
+        for seed in seeds
+    ]
     cells = {item.label: [item.cells(setup) for setup in setups] for item in items}
-    wanted = [cell for of_item in cells.values() for of_seed in of_item for cell in of_seed.values()]
+    wanted = [
+        cell for of_item in cells.values() for of_seed in of_item for cell in of_seed.values()
+    ]
     folder = Path(config["cells"])
     jobs = config["jobs"] or min(processors(), MOST_JOBS)
     try:
         done = perform_all(wanted, folder, jobs, config["progress_bar"])
     except (KeyboardInterrupt, SystemExit):
-        _log.warning("Stopped. What was finished is in %s; the same command goes on.", shown(folder))
+        _log.warning(
+            "Stopped. What was finished is in %s; the same command goes on.", shown(folder)
+        )
         raise
     entries = [
-        Entry(item, item.section(Results(setups, cells[item.label], folder)), _commands(cells[item.label][0]))
+        Entry(
+            item,
+            item.section(Results(setups, cells[item.label], folder)),
+            _commands(cells[item.label][0]),
+        )
         for item in items
     ]
-    page = Page(entries, _about(config, setups, done, start), yaml.safe_dump(config, sort_keys=False))
+    page = Page(
+        entries, _about(config, setups, done, start), yaml.safe_dump(config, sort_keys=False)
+    )
     write_page(page, output)
     held = sum(claim.holds for claim in page.claims)
     misses = sum(len(entry.misses) for entry in entries)
     numbers = sum(len(entry.section.compared) for entry in entries)
-    _log.info("%d of %d claims hold, %d of %d numbers miss the paper's.", held, len(page.claims), misses, numbers)
+    _log.info(
+        "%d of %d claims hold, %d of %d numbers miss the paper's.",
+        held,
+        len(page.claims),
+        misses,
+        numbers,
+    )
     _log.info("Report: %s, and report.html", shown(output / "report.md"))
     return {"claims": len(page.claims), "held": held, "numbers": numbers, "misses": misses}
 
@@ -156,10 +203,15 @@ def summary(told: dict[str, Any]) -> str:
 
 
 def chosen(only: Sequence[str] | str | None) -> list[Item]:
-    """The items of these labels, with or without ``tab:`` or ``fig:``, or kinds, in the report's order; None: all."""
+    """The items of these labels, with or without ``tab:`` or ``fig:``, or kinds, in the report's
+    order; None: all.
+    """
     if only is None:
         return list(ITEMS.values())
-    wanted = [word.removeprefix("tab:").removeprefix("fig:") for word in ([only] if isinstance(only, str) else only)]
+    wanted = [
+        word.removeprefix("tab:").removeprefix("fig:")
+        for word in ([only] if isinstance(only, str) else only)
+    ]
     existing = {*ITEMS, *(item.kind for item in ITEMS.values())}
     for word in wanted:
         if word not in existing:
@@ -194,7 +246,9 @@ def _commands(cells: dict[str, Cell]) -> list[str]:
     return sorted(found, key=lambda command: "train.py" not in command)
 
 
-def _about(config: dict[str, Any], setups: Sequence[Setup], done: int, start: float) -> dict[str, Any]:
+def _about(
+    config: dict[str, Any], setups: Sequence[Setup], done: int, start: float
+) -> dict[str, Any]:
     origin = provenance(config["seed"])
     minutes = (time.perf_counter() - start) / 60
     seeds = [setup.seed for setup in setups]
@@ -205,10 +259,11 @@ def _about(config: dict[str, Any], setups: Sequence[Setup], done: int, start: fl
         f"numpy {origin['numpy']}, Python {origin['python']}",
         "command": code(origin["command"]),
         "run time": f"{minutes:.1f} minutes on {processors()} processors, for {done} cells that were not there before",
-    }  # fmt: skip
+    }
 
 
 def command(conf: Path) -> Command:
     """The command, of the configurations in the folder ``conf``."""
-    task, after = partial(reproduce, conf=conf), partial(gather, conf=conf)
+    task = partial(reproduce, conf=conf)
+    after = partial(gather, conf=conf)
     return Command("reproduce", task, summary, files, after)

@@ -48,7 +48,8 @@ def files(config: dict[str, Any]) -> Files:
 def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
     """Test ``config["ckpt"]`` on ``config["data"]``; returns what metrics.json holds.
 
-    Writes predictions.npz, metrics.json, report.md and TensorBoard events into ``output`` and prints the table.
+    Writes predictions.npz, metrics.json, report.md and TensorBoard events into ``output`` and
+    prints the table.
     """
     measured = measure(config, output)
     if measured is None:
@@ -57,7 +58,9 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
     report.write_report(output / "report.md", metrics)
     report.write_events(output, predictions, metrics)
     report.print_table(metrics)
-    _log.info("Report: %s, beside it metrics.json and predictions.npz.", shown(output / "report.md"))
+    _log.info(
+        "Report: %s, beside it metrics.json and predictions.npz.", shown(output / "report.md")
+    )
     _log.info("Figures: tensorboard --logdir %s", shown(output))
     return metrics
 
@@ -65,25 +68,41 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
 def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str, Any]] | None:
     """The part of `test` that computes: writes predictions.npz and metrics.json into ``output``.
 
-    Returns the problem's report, the opened predictions and the metrics; None on all processes but the first.
+    Returns the problem's report, the opened predictions and the metrics; None on all processes but
+    the first.
     """
     check_type(config, Settings, "")
     if not config["ckpt"]:
-        raise GhptCheckpointError("ckpt", "is missing", "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m")
-    changes = {"hypotheses": config["hypotheses"], "seed": config["seed"], "problem.frames": config.get("frames")}
+        raise GhptCheckpointError(
+            "ckpt", "is missing", "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m"
+        )
+    changes = {
+        "hypotheses": config["hypotheses"],
+        "seed": config["seed"],
+        "problem.frames": config.get("frames"),
+    }
     model, trained = load_model(config["ckpt"], config.get("trust") or (), **changes)
     kinds = type(model.problem).__mro__  # a class derived from one of ours has its report
     report = next((REPORTS[kind] for kind in kinds if kind in REPORTS), None)
     if report is None:
-        raise GhptCheckpointError(config["ckpt"], f"is of a {type(model.problem).__name__}", "It has no report.")
+        raise GhptCheckpointError(
+            config["ckpt"], f"is of a {type(model.problem).__name__}", "It has no report."
+        )
     check_type(config, report.settings, "")
     data = build(config["data"], "data")
     data.serve(model.problem)
-    origin = provenance(config["seed"]) | {"checkpoint": str(config["ckpt"]), "training": trained["provenance"]}
+    origin = provenance(config["seed"]) | {
+        "checkpoint": str(config["ckpt"]),
+        "training": trained["provenance"],
+    }
     meta = {
-        "data": data.name, "source": data.source, "split": data.evaluate, "seed": config["seed"],
-        "hypotheses": model.hypotheses, "provenance": origin,
-    }  # fmt: skip
+        "data": data.name,
+        "source": data.source,
+        "split": data.evaluate,
+        "seed": config["seed"],
+        "hypotheses": model.hypotheses,
+        "provenance": origin,
+    }
     estimators = report.estimators(config, model)
     trainer = make_trainer(
         config["trainer"],
@@ -107,7 +126,9 @@ def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str
 def summary(metrics: dict[str, Any]) -> str:
     """What `test` returned, in words."""
     weight = metrics["selections"]["weight"]
-    error = next(weight[report.headline] for report in REPORTS.values() if report.headline in weight)
+    error = next(
+        weight[report.headline] for report in REPORTS.values() if report.headline in weight
+    )
     return f"{title(metrics)}: {'–' if error is None else f'{error:.1f} mm'}"
 
 

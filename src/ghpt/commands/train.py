@@ -94,7 +94,12 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
         resume = last.exists() or (output / PREVIOUS).exists()
     start, warning = resumable(output, config, model) if resume else (None, "")
     saver = SaveLast(last, config["save_every"], identity, resumed=start == last)
-    about = {"data": data.name, "source": data.source, "train_samples": data.train_samples, "seed": seed}
+    about = {
+        "data": data.name,
+        "source": data.source,
+        "train_samples": data.train_samples,
+        "seed": seed,
+    }
     trainer = make_trainer(
         config["trainer"],
         default_root_dir=output,
@@ -123,7 +128,9 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
         if trainer.is_global_zero and (saver.saved is not None or isinstance(stop, SystemExit)):
             _say_stopped(last, saver.saved)
         raise
-    errors = {k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("validation/")}
+    errors = {
+        k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("validation/")
+    }
     if trainer.is_global_zero:
         _say_finished(last, data, config["model"], model.problem.measures, errors)
     return errors
@@ -131,21 +138,29 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
 
 def summary(errors: dict[str, float]) -> str:
     """What `train` returned, in words."""
-    numbers = (f"{name.removeprefix('validation/')} {error:.1f} mm" for name, error in errors.items())
+    numbers = (
+        f"{name.removeprefix('validation/')} {error:.1f} mm" for name, error in errors.items()
+    )
     return ", ".join(numbers) or "nothing was left to do"
 
 
 def make_trainer(settings: dict[str, Any], **ours: Any) -> L.Trainer:
-    """Lightning's Trainer of the yaml's settings and ``ours``. Raises GhptConfigError for what it does not take."""
+    """Lightning's Trainer of the yaml's settings and ``ours``. Raises GhptConfigError for what it
+    does not take.
+    """
     settings = build(settings, "trainer")
     ours["callbacks"] = [*ours.get("callbacks", ()), OwnSignals()]
     for key in set(settings) & set(ours):
-        raise GhptConfigError(f"trainer.{key}", "is not for the configuration: ghpt sets it", "Leave it out.")
+        raise GhptConfigError(
+            f"trainer.{key}", "is not for the configuration: ghpt sets it", "Leave it out."
+        )
     check_arguments(L.Trainer, settings, "trainer")
     try:
         return L.Trainer(**settings, **ours, use_distributed_sampler=False)
     except (TypeError, ValueError, MisconfigurationException) as error:
-        raise GhptConfigError("trainer", str(error).rstrip("."), "See lightning.Trainer's arguments.") from error
+        raise GhptConfigError(
+            "trainer", str(error).rstrip("."), "See lightning.Trainer's arguments."
+        ) from error
 
 
 def progress(config: dict[str, Any]) -> list[L.Callback]:
@@ -186,7 +201,8 @@ def resumable(output: Path, config: dict[str, Any], model: Any) -> tuple[Path, s
     Raises GhptCheckpointError if neither the last nor the previous one can be used, and if the one
     that can was made with other settings.
     """
-    last, previous = output / LAST, output / PREVIOUS
+    last = output / LAST
+    previous = output / PREVIOUS
     try:
         _check_resumable(last, config, model)
         return last, ""
@@ -234,8 +250,14 @@ def _check_resumable(path: Path, config: dict[str, Any], model: Any) -> int:
 
 
 def _what(settings: Any) -> Any:
-    """What decides the numbers: not how the batches are loaded, which one may have to change to go on."""
-    return {k: v for k, v in settings.items() if k != "workers"} if isinstance(settings, dict) else settings
+    """What decides the numbers: not how the batches are loaded, which one may have to change to go
+    on.
+    """
+    return (
+        {k: v for k, v in settings.items() if k != "workers"}
+        if isinstance(settings, dict)
+        else settings
+    )
 
 
 def _flat(config: Any, above: str) -> dict[str, Any]:
@@ -243,7 +265,10 @@ def _flat(config: Any, above: str) -> dict[str, Any]:
     if not isinstance(config, dict):
         return {above: config if isinstance(config, bool | int | float | str) else str(config)}
     return {
-        k: v for name, value in config.items() if name[0] != "_" for k, v in _flat(value, f"{above}.{name}").items()
+        k: v
+        for name, value in config.items()
+        if name[0] != "_"
+        for k, v in _flat(value, f"{above}.{name}").items()
     }
 
 
@@ -257,7 +282,9 @@ def _say_finished(
     _log.info("Validation on %s, %s:", words(data.name, data.source), measures)
     _log.info("  %s", summary(errors))
     _log.info("Checkpoint: %s", shown(last))
-    where = "data=h36m" if data.root is None else f"data={data.name} {typed('data.root', data.root)}"
+    where = (
+        "data=h36m" if data.root is None else f"data={data.name} {typed('data.root', data.root)}"
+    )
     trust = ",".join(packages_to_trust(model))
     command = ["python test.py", typed("ckpt", shown(last)), where]
     if trust:
@@ -270,7 +297,9 @@ def _say_stopped(last: Path, step: int | None) -> None:
         _log.warning("Stopped before the first checkpoint of this run.")
     else:
         _log.warning("Stopped. %s holds training step %d.", shown(last), step)
-        _log.warning("Go on with the same command and %s resume=true", typed("output", shown(last.parent)))
+        _log.warning(
+            "Go on with the same command and %s resume=true", typed("output", shown(last.parent))
+        )
 
 
 COMMAND = Command("train", train, summary, files)

@@ -21,8 +21,9 @@ __all__ = ["WRITERS", "Chunks", "Evidence", "Scene", "Writer", "read_reconstruct
 class Writer:
     """How a format is written: ``write(path, about, chunks, **settings)``.
 
-    Atomic, at a memory that does not grow with the recording. Raises GhptConfigError for what the format needs and
-    does not have (a rate, a package) and GhptDataError for frames or names that it cannot hold.
+    Atomic, at a memory that does not grow with the recording. Raises GhptConfigError for what the
+    format needs and does not have (a rate, a package) and GhptDataError for frames or names that it
+    cannot hold.
     """
 
     file: str

@@ -46,18 +46,23 @@ def _layout(views: int, joints: int, version: int = FORMAT_VERSION) -> _Layout:
 def write_npz(path: Path, about: About, chunks: Chunks) -> None:
     """All fields of ``Reconstruction`` and ``About`` (docs/outputs.md).
 
-    Positions are NaN where missing; errors and covariances where not observed. Stored without compression: numpy
-    reads it, in parts too. The same content gives the same bytes.
+    Positions are NaN where missing; errors and covariances where not observed. Stored without
+    compression: numpy reads it, in parts too. The same content gives the same bytes.
     """
     layout = _layout(len(about.camera_names), len(about.joints))
-    tables = {"joints": np.array(about.joints, np.str_), "camera_names": np.array(about.camera_names, np.str_)}
+    tables = {
+        "joints": np.array(about.joints, np.str_),
+        "camera_names": np.array(about.camera_names, np.str_),
+    }
     tables["rate_hz"] = np.array(np.nan if about.rate_hz is None else about.rate_hz, "<f8")
     tables["unit"] = np.array("mm")
     tables["meta"] = np.array(json.dumps(_meta(about), allow_nan=False))
     count = 0
     with atomic_write(path, verify=read_reconstruction) as handle, ExitStack() as stack:
         # Files without a name: nothing of them is left behind, however the process ends.
-        spools = {name: stack.enter_context(tempfile.TemporaryFile(dir=path.parent)) for name in layout}
+        spools = {
+            name: stack.enter_context(tempfile.TemporaryFile(dir=path.parent)) for name in layout
+        }
         for piece in pieces(path, about, chunks):
             count += len(piece)
             for name, value in _masked(piece).items():
@@ -74,38 +79,52 @@ def _meta(about: About) -> dict[str, Any]:
     plain = ("name", "source", "estimator", "rate_hz", "smoothed", "provenance", "origin")
     meta = {"format": "ghpt reconstruction", "format_version": FORMAT_VERSION, "unit": "mm"}
     return (
-        meta | {field: getattr(about, field) for field in plain} | {"states": {s.name.lower(): int(s) for s in State}}
+        meta
+        | {field: getattr(about, field) for field in plain}
+        | {"states": {s.name.lower(): int(s) for s in State}}
     )
 
 
 def _masked(piece: Reconstruction) -> dict[str, torch.Tensor]:
     values = {name: getattr(piece, name).cpu() for name in _layout(1, 1)}
     observed = values["state"] == State.OBSERVED
-    values["points"] = torch.where((values["state"] <= State.FILLED)[..., None], values["points"], torch.nan)
+    values["points"] = torch.where(
+        (values["state"] <= State.FILLED)[..., None], values["points"], torch.nan
+    )
     values["error"] = torch.where(observed, values["error"], torch.nan)
     values["covariance"] = torch.where(observed[..., None], values["covariance"], torch.nan)
     return values
 
 
-def read_reconstruction(path: str | Path, size: int = PIECE) -> tuple[About, Iterator[Reconstruction]]:
-    """What ``write_npz`` wrote: at most ``size`` frames at a time. Nothing in the file is executed or unpacked.
+def read_reconstruction(
+    path: str | Path, size: int = PIECE
+) -> tuple[About, Iterator[Reconstruction]]:
+    """What ``write_npz`` wrote: at most ``size`` frames at a time. Nothing in the file is executed
+    or unpacked.
 
-    Raises GhptDataError if it is missing, damaged (every byte is compared with its checksum), of another version,
-    or if its arrays do not belong together.
+    Raises GhptDataError if it is missing, damaged (every byte is compared with its checksum), of
+    another version, or if its arrays do not belong together.
     """
     path = Path(path)
     members, texts, meta = _open(path)
-    joints, cameras = texts["joints"], texts["camera_names"]
+    joints = texts["joints"]
+    cameras = texts["camera_names"]
     frames = members["frame"].shape[0] if "frame" in members and members["frame"].shape else 0
     layout = _layout(len(cameras), len(joints), meta["format_version"])
     for name, (dtype, shape) in layout.items():
         if name not in members or members[name][1:] != (np.dtype(dtype), (frames, *shape)):
             raise GhptDataError(path, name, f"is not {dtype} of shape {(frames, *shape)}", _MEND)
     about = About(
-        name=meta["name"], source=meta["source"], estimator=meta["estimator"], joints=joints, camera_names=cameras,
-        rate_hz=meta["rate_hz"], smoothed=meta["smoothed"], provenance=meta["provenance"],
+        name=meta["name"],
+        source=meta["source"],
+        estimator=meta["estimator"],
+        joints=joints,
+        camera_names=cameras,
+        rate_hz=meta["rate_hz"],
+        smoothed=meta["smoothed"],
+        provenance=meta["provenance"],
         origin=_origin(path, meta),
-    )  # fmt: skip
+    )
     starts = range(0, frames, size)
     return about, (_read(path, members, start, min(start + size, frames)) for start in starts)
 
@@ -125,16 +144,32 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
         meta = json.loads(texts["meta"][0])
     except FileNotFoundError as error:
         raise GhptDataError(path, "", "there is no such file", "Check the path") from error
-    except (OSError, ValueError, TypeError, EOFError, IndexError, RuntimeError, zipfile.BadZipFile) as error:
-        raise GhptDataError(path, "", f"is not a readable reconstruction ({error})", _MEND) from error
+    except (
+        OSError,
+        ValueError,
+        TypeError,
+        EOFError,
+        IndexError,
+        RuntimeError,
+        zipfile.BadZipFile,
+    ) as error:
+        raise GhptDataError(
+            path, "", f"is not a readable reconstruction ({error})", _MEND
+        ) from error
     version = meta.get("format_version") if isinstance(meta, dict) else None
     readable = type(version) is int and version in _POINTS
     if not readable or meta.get("format") != "ghpt reconstruction":
         known = " and ".join(map(str, _POINTS))
         problem = f"is {version!r}; this ghpt reads {known}"
         raise GhptDataError(path, "meta.format_version", problem, _MEND)
-    forms = {"name": str, "source": str, "estimator": str, "rate_hz": (float, int, type(None)), "smoothed": bool,
-             "provenance": dict}  # fmt: skip
+    forms = {
+        "name": str,
+        "source": str,
+        "estimator": str,
+        "rate_hz": (float, int, type(None)),
+        "smoothed": bool,
+        "provenance": dict,
+    }
     for field, form in forms.items():
         if not isinstance(meta.get(field, ...), form):
             raise GhptDataError(path, f"meta.{field}", f"is {meta.get(field)!r}", _MEND)
@@ -142,7 +177,10 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
 
 
 def _read(path: Path, members: dict[str, Member], start: int, stop: int) -> Reconstruction:
-    rows = {name: torch.from_numpy(read_rows(path, members[name], start, stop)) for name in _layout(1, 1)}
+    rows = {
+        name: torch.from_numpy(read_rows(path, members[name], start, stop))
+        for name in _layout(1, 1)
+    }
     state = rows["state"]
     if ((state < 0) | (state > max(State))).any():
         raise GhptDataError(path, "state", "holds a number that is no state", _MEND)

@@ -1,4 +1,6 @@
-"""poses.rrd: a recording for the Rerun viewer: cameras, rays, key points and reprojections, joints, hypotheses."""
+"""poses.rrd: a recording for the Rerun viewer: cameras, rays, key points and reprojections, joints,
+hypotheses.
+"""
 
 from __future__ import annotations
 
@@ -26,22 +28,27 @@ _GREY = 0x99999966
 
 
 def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = None) -> None:
-    """Timelines ``frame`` and, with a known rate, ``time``; mm. Missing joints are absent, filled ones pale.
+    """Timelines ``frame`` and, with a known rate, ``time``; mm. Missing joints are absent, filled
+    ones pale.
 
-    ``scene`` adds cameras and rays, and with evidence key points, reprojections and hypotheses. The viewer has
-    float32, so all is relative to ``about.origin``, which the recording's name tells.
+    ``scene`` adds cameras and rays, and with evidence key points, reprojections and hypotheses. The
+    viewer has float32, so all is relative to ``about.origin``, which the recording's name tells.
 
     Raises GhptConfigError without the package.
     """
     try:
         import rerun as rr
     except ImportError as error:
-        raise GhptConfigError("rerun", "needs rerun-sdk", "pip install 'ghpt[viz]', or leave rerun out") from error
+        raise GhptConfigError(
+            "rerun", "needs rerun-sdk", "pip install 'ghpt[viz]', or leave rerun out"
+        ) from error
     extent(path, about, chunks)
     if scene is not None:
         origin = torch.tensor(about.origin, dtype=torch.float64)
         scene = replace(scene, cameras=scene.cameras.relative_to(origin))
-    evidence = scene.evidence() if scene is not None and scene.evidence is not None else repeat(None)
+    evidence = (
+        scene.evidence() if scene is not None and scene.evidence is not None else repeat(None)
+    )
     with atomic_write(path) as handle:
         recording = rr.RecordingStream("ghpt")
         recording.save(handle.name)
@@ -51,7 +58,11 @@ def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = 
         for chunk, made_of in zip(chunks(), evidence, strict=False):
             for start in range(0, len(chunk), _PIECE):
                 stop = start + _PIECE
-                there = None if made_of is None else Evidence(*(None if x is None else x[start:stop] for x in made_of))
+                there = (
+                    None
+                    if made_of is None
+                    else Evidence(*(None if x is None else x[start:stop] for x in made_of))
+                )
                 piece = part(chunk, start, stop)
                 near = replace(piece, points=points_of_origin(about, piece))
                 _Piece(rr, recording, about, near).log(scene, there)
@@ -63,7 +74,11 @@ def _log_cameras(rr: Any, recording: Any, about: About, cameras: Cameras) -> Non
     views = zip(about.camera_names, cameras.K, cameras.R, cameras.centre, strict=True)
     for name, K, R, centre in views:
         pose = rr.Transform3D(translation=centre.tolist(), mat3x3=R.T.numpy())
-        lens = rr.Pinhole(image_from_camera=K.numpy(), resolution=(2 * K[:2, 2]).tolist(), image_plane_distance=300.0)
+        lens = rr.Pinhole(
+            image_from_camera=K.numpy(),
+            resolution=(2 * K[:2, 2]).tolist(),
+            image_plane_distance=300.0,
+        )
         recording.log(_camera(rr, name), pose, static=True)
         recording.log(f"{_camera(rr, name)}/image", lens, static=True)
 
@@ -76,7 +91,10 @@ class _Piece:
     """Logs some frames."""
 
     def __init__(self, rr: Any, recording: Any, about: About, piece: Reconstruction) -> None:
-        self.rr, self.recording, self.about, self.piece = rr, recording, about, piece
+        self.rr = rr
+        self.recording = recording
+        self.about = about
+        self.piece = piece
         frame = piece.frame.numpy()
         self.times = [rr.TimeColumn("frame", sequence=frame)]
         if about.rate_hz:
@@ -85,10 +103,12 @@ class _Piece:
         self.colours = torch.where(piece.state == State.FILLED, colours - _PALE, colours)
 
     def log(self, scene: Scene | None, evidence: Evidence | None) -> None:
-        rr, piece = self.rr, self.piece
+        rr = self.rr
+        piece = self.piece
         self._points(rr.Points3D, "world/joints", piece.points, piece.placed, self.colours, 15.0)
         bones = torch.tensor(bones_of(self.about.joints), dtype=torch.long).reshape(-1, 2)
-        strips, there = piece.points[:, bones], piece.placed[:, bones].all(-1)
+        strips = piece.points[:, bones]
+        there = piece.placed[:, bones].all(-1)
         colours = torch.minimum(self.colours[:, bones[:, 0]], self.colours[:, bones[:, 1]])
         self._strips("world/bones", strips, there, colours, 6.0)
         observed = piece.state == State.OBSERVED
@@ -99,10 +119,19 @@ class _Piece:
         if evidence is not None and evidence.hypotheses is not None:
             pool = evidence.hypotheses.flatten(1, 2)
             pool = pool.double() - torch.tensor(self.about.origin, dtype=torch.float64)
-            self._points(rr.Points3D, "world/hypotheses", pool, pool.isfinite().all(-1), pool[..., 0] * 0 + _GREY, 4.0)
+            self._points(
+                rr.Points3D,
+                "world/hypotheses",
+                pool,
+                pool.isfinite().all(-1),
+                pool[..., 0] * 0 + _GREY,
+                4.0,
+            )
 
     def _views(self, cameras: Cameras, evidence: Evidence | None) -> None:
-        rr, piece, double = self.rr, self.piece, cameras.to(torch.float64)
+        rr = self.rr
+        piece = self.piece
+        double = cameras.to(torch.float64)
         pixels, depth = project(double, piece.points.double())
         for v, name in enumerate(self.about.camera_names):
             used = piece.views[:, v] & (piece.state == State.OBSERVED)
@@ -112,22 +141,43 @@ class _Piece:
             self._strips(f"world/rays/{rr.escape_entity_path_part(name)}", rays, used, colour, 1.0)
             image = f"{_camera(rr, name)}/image"
             shown = piece.placed & (depth[:, v] > 0)
-            self._points(rr.Points2D, f"{image}/reprojected", pixels[:, v], shown, self.colours, 3.0)
+            self._points(
+                rr.Points2D, f"{image}/reprojected", pixels[:, v], shown, self.colours, 3.0
+            )
             if evidence is not None:
                 seen = evidence.seen[:, v]
-                self._points(rr.Points2D, f"{image}/key_points", evidence.key_points[:, v], seen, colour, 5.0)
+                self._points(
+                    rr.Points2D, f"{image}/key_points", evidence.key_points[:, v], seen, colour, 5.0
+                )
 
     def _points(
-        self, kind: Any, path: str, points: torch.Tensor, there: torch.Tensor, colours: torch.Tensor, radius: float
+        self,
+        kind: Any,
+        path: str,
+        points: torch.Tensor,
+        there: torch.Tensor,
+        colours: torch.Tensor,
+        radius: float,
     ) -> None:
-        values = {"positions": points[there].float().numpy(), "colors": colours[there].numpy().astype(np.uint32)}
+        values = {
+            "positions": points[there].float().numpy(),
+            "colors": colours[there].numpy().astype(np.uint32),
+        }
         values["radii"] = np.full(len(values["positions"]), radius, np.float32)
         self._send(path, kind.columns(**values).partition(there.sum(1).numpy()))
 
     def _strips(
-        self, path: str, strips: torch.Tensor, there: torch.Tensor, colours: torch.Tensor, radius: float
+        self,
+        path: str,
+        strips: torch.Tensor,
+        there: torch.Tensor,
+        colours: torch.Tensor,
+        radius: float,
     ) -> None:
-        values = {"strips": strips[there].float().numpy(), "colors": colours[there].numpy().astype(np.uint32)}
+        values = {
+            "strips": strips[there].float().numpy(),
+            "colors": colours[there].numpy().astype(np.uint32),
+        }
         values["radii"] = np.full(len(values["strips"]), radius, np.float32)
         self._send(path, self.rr.LineStrips3D.columns(**values).partition(there.sum(1).numpy()))
 

@@ -1,4 +1,6 @@
-"""What pictures of a reconstruction show besides it: the cameras, what they saw, and which way is up."""
+"""What pictures of a reconstruction show besides it: the cameras, what they saw, and which way is
+up.
+"""
 
 from __future__ import annotations
 
@@ -78,8 +80,15 @@ def to_z_up(up: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
 
 
 def frustum(cameras: Cameras, depth: float) -> Float[Tensor, "V 4 3"]:
-    """World corners, ``depth`` mm before each camera, of an image whose middle is the principal point."""
+    """World corners, ``depth`` mm before each camera, of an image whose middle is the principal
+    point.
+    """
     c = cameras.K[:, :2, 2]
-    corners = torch.stack([c * c.new_tensor(s) for s in ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))], dim=1)
-    rays = torch.cat([corners, torch.ones_like(corners[..., :1])], dim=-1) @ torch.linalg.inv(cameras.K).mT
+    corners = torch.stack(
+        [c * c.new_tensor(s) for s in ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))], dim=1
+    )
+    rays = (
+        torch.cat([corners, torch.ones_like(corners[..., :1])], dim=-1)
+        @ torch.linalg.inv(cameras.K).mT
+    )
     return (depth * rays - cameras.t[:, None]) @ cameras.R

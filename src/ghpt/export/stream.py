@@ -1,4 +1,6 @@
-"""What all writers share: successive frames, checked, in pieces of bounded size, and numbers as text."""
+"""What all writers share: successive frames, checked, in pieces of bounded size, and numbers as
+text.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +26,8 @@ PIECE = 4096
 
 _MOST_ABSENT = 50
 _ALWAYS_ABSENT = 100_000
-"""Formats without gaps take this many absent frames for each frame there is, and these in any case."""
+"""Formats without gaps take this many absent frames for each frame there is, and these in any case.
+"""
 
 
 class Extent(NamedTuple):
@@ -36,18 +39,24 @@ class Extent(NamedTuple):
 
 
 def pieces(path: Path, about: About, chunks: Chunks) -> Iterator[Reconstruction]:
-    """All frames, at most ``PIECE`` at a time. Raises GhptDataError (for the file ``path`` that is being written)
-    unless frame numbers rise and shapes fit the names."""
-    shape, last = (len(about.camera_names), len(about.joints)), None
+    """All frames, at most ``PIECE`` at a time. Raises GhptDataError (for the file ``path`` that is
+    being written) unless frame numbers rise and shapes fit the names.
+    """
+    shape = (len(about.camera_names), len(about.joints))
+    last = None
     for chunk in chunks():
         if chunk.views.shape[1:] != shape:
-            problem = (
-                f"are {shape[0]} and {shape[1]} in name, {chunk.views.shape[1]} and {chunk.views.shape[2]} in number"
+            problem = f"are {shape[0]} and {shape[1]} in name, {chunk.views.shape[1]} and {chunk.views.shape[2]} in number"
+            raise GhptDataError(
+                path, "camera_names, joints", problem, "Predict this recording again"
             )
-            raise GhptDataError(path, "camera_names, joints", problem, "Predict this recording again")
         if not len(chunk):
             continue
-        frame = chunk.frame if last is None else torch.cat([chunk.frame.new_tensor([last]), chunk.frame])
+        frame = (
+            chunk.frame
+            if last is None
+            else torch.cat([chunk.frame.new_tensor([last]), chunk.frame])
+        )
         falls = torch.nonzero(frame.diff() <= 0)[:, 0].tolist()
         if falls:
             problem = f"{int(frame[falls[0] + 1])} comes after {int(frame[falls[0]])}"
@@ -58,32 +67,46 @@ def pieces(path: Path, about: About, chunks: Chunks) -> Iterator[Reconstruction]
 
 def part(chunk: Reconstruction, start: int, stop: int) -> Reconstruction:
     """Frames from position ``start`` up to ``stop``."""
-    return Reconstruction(**{field.name: getattr(chunk, field.name)[start:stop] for field in fields(chunk)})
+    return Reconstruction(
+        **{field.name: getattr(chunk, field.name)[start:stop] for field in fields(chunk)}
+    )
 
 
 def extent(path: Path, about: About, chunks: Chunks) -> Extent:
     """Of all frames. Raises GhptDataError where there is none."""
-    first, last, count = None, 0, 0
+    first = None
+    last = 0
+    count = 0
     for piece in pieces(path, about, chunks):
         first = int(piece.frame[0]) if first is None else first
-        last, count = int(piece.frame[-1]), count + len(piece)
+        last = int(piece.frame[-1])
+        count = count + len(piece)
     if first is None:
-        raise GhptDataError(path, "frame", "there is no frame to write", "Check that the key points have frames")
+        raise GhptDataError(
+            path, "frame", "there is no frame to write", "Check that the key points have frames"
+        )
     return Extent(first, last, count)
 
 
 def extent_without_gaps(path: Path, about: About, chunks: Chunks) -> Extent:
-    """``extent``, for formats whose rows are equally spaced in time. Raises GhptDataError if next to all frames would
-    be absent: such numbers are times or names."""
+    """``extent``, for formats whose rows are equally spaced in time. Raises GhptDataError if next
+    to all frames would be absent: such numbers are times or names.
+    """
     whole = extent(path, about, chunks)
     if whole.last - whole.first > _MOST_ABSENT * whole.count + _ALWAYS_ABSENT:
         problem = f"{whole.count} frames have numbers from {whole.first} to {whole.last}"
-        raise GhptDataError(path, "frame", problem, "Number the frames one after another, or leave this format out")
+        raise GhptDataError(
+            path, "frame", problem, "Number the frames one after another, or leave this format out"
+        )
     return whole
 
 
-def without_gaps(path: Path, about: About, chunks: Chunks, whole: Extent) -> Iterator[Reconstruction]:
-    """All frames from the first number to the last, in pieces: one that is absent has no joint (``FEW_VIEWS``)."""
+def without_gaps(
+    path: Path, about: About, chunks: Chunks, whole: Extent
+) -> Iterator[Reconstruction]:
+    """All frames from the first number to the last, in pieces: one that is absent has no joint
+    (``FEW_VIEWS``).
+    """
     following = whole.first
     for piece in pieces(path, about, chunks):
         stop = int(piece.frame[-1]) + 1
@@ -101,7 +124,8 @@ def _between(piece: Reconstruction, start: int, stop: int) -> Reconstruction:
     numbers = torch.arange(start, stop, dtype=piece.frame.dtype)
     values = {"frame": numbers}
     for field in (field.name for field in fields(piece) if field.name != "frame"):
-        value, absent = getattr(there, field), State.FEW_VIEWS if field == "state" else 0
+        value = getattr(there, field)
+        absent = State.FEW_VIEWS if field == "state" else 0
         values[field] = value.new_full((len(numbers), *value.shape[1:]), int(absent))
         values[field][there.frame - start] = value
     return Reconstruction(**values)
@@ -110,9 +134,13 @@ def _between(piece: Reconstruction, start: int, stop: int) -> Reconstruction:
 def required_rate(about: About, format: str) -> float:
     """Frames per second. Raises GhptConfigError where it is not known."""
     if about.rate_hz is None:
-        raise GhptConfigError("rate_hz", f"is unknown, and {format} needs it", "Give rate_hz=30 (frames per second)")
+        raise GhptConfigError(
+            "rate_hz", f"is unknown, and {format} needs it", "Give rate_hz=30 (frames per second)"
+        )
     if not (math.isfinite(about.rate_hz) and about.rate_hz > 0):
-        raise GhptConfigError("rate_hz", f"is {about.rate_hz}", "Give the frames per second, e.g. rate_hz=30")
+        raise GhptConfigError(
+            "rate_hz", f"is {about.rate_hz}", "Give the frames per second, e.g. rate_hz=30"
+        )
     return about.rate_hz
 
 
@@ -126,7 +154,9 @@ def plain_names(path: Path, field: str, names: tuple[str, ...]) -> list[str]:
     found = [plain(name) for name in names]
     if len(set(found)) != len(found):
         twice = next(name for name in found if found.count(name) > 1)
-        raise GhptDataError(path, field, f"{twice!r} is the name of two", "Give each a name of its own")
+        raise GhptDataError(
+            path, field, f"{twice!r} is the name of two", "Give each a name of its own"
+        )
     return found
 
 
@@ -137,6 +167,7 @@ def points_of_origin(about: About, piece: Reconstruction) -> Float[Tensor, "T J 
 
 
 def text_rows(cells: np.ndarray, numbers: np.ndarray, separator: str, ending: str) -> str:
-    """A line for each row of ``cells``: texts and %-formats, which ``numbers`` fill row by row. The same in every
-    locale."""
+    """A line for each row of ``cells``: texts and %-formats, which ``numbers`` fill row by row. The
+    same in every locale.
+    """
     return "".join(separator.join(row) + ending for row in cells.tolist()) % tuple(numbers.tolist())

@@ -1,4 +1,6 @@
-"""Ideal pinhole cameras: ``x_cam = R X + t``, ``lambda (u, v, 1) = K x_cam``; OpenCV axes, mm and pixels."""
+"""Ideal pinhole cameras: ``x_cam = R X + t``, ``lambda (u, v, 1) = K x_cam``; OpenCV axes, mm and
+pixels.
+"""
 
 from __future__ import annotations
 
@@ -46,8 +48,9 @@ class Cameras:
 def project(
     cameras: Cameras, points: Float[Tensor, "*B J 3"]
 ) -> tuple[Float[Tensor, "*B V J 2"], Float[Tensor, "*B V J"]]:
-    """Pixels and depths (mm) of world points in every view. Behind a camera (depth <= 0) pixels mean nothing,
-    and are finite except at depth 0 exactly, where they are 0."""
+    """Pixels and depths (mm) of world points in every view. Behind a camera (depth <= 0) pixels
+    mean nothing, and are finite except at depth 0 exactly, where they are 0.
+    """
     in_camera = points[..., None, :, :] @ cameras.R.mT + cameras.t[..., None, :]
     depth = in_camera[..., 2]
     homogeneous = in_camera @ cameras.K.mT
@@ -59,8 +62,9 @@ def project(
 def reprojection_error(
     cameras: Cameras, key_points: Float[Tensor, "*B V J 2"], points: Float[Tensor, "*B J 3"]
 ) -> Float[Tensor, "*B V J"]:
-    """Distance in pixels between key points and the projected points, float64; inf behind a camera and where
-    an input is not finite."""
+    """Distance in pixels between key points and the projected points, float64; inf behind a camera
+    and where an input is not finite.
+    """
     double = cameras.to(torch.float64)
     pixels, depth = project(double, points.to(torch.float64))
     error = torch.linalg.vector_norm(pixels - key_points, dim=-1)

@@ -1,8 +1,10 @@
-"""Normal equations of linear triangulation: one 3x3 system for each view and joint, free of the unit of length.
+"""Normal equations of linear triangulation: one 3x3 system for each view and joint, free of the
+unit of length.
 
-A view that sees the joint at pixel (u, v) gives two rows, ``a = (u - c_x) r_3 - f_x r_1 - s r_2`` and
-``b = (v - c_y) r_3 - f_y r_2`` (r_i the rows of R), whose residuals are depth x pixel error. So unequal cameras are
-weighted by pixels, and the matrix ``a a^T + b b^T`` holds no length: its conditioning is that of the rays alone.
+A view that sees the joint at pixel (u, v) gives two rows, ``a = (u - c_x) r_3 - f_x r_1 - s r_2``
+and ``b = (v - c_y) r_3 - f_y r_2`` (r_i the rows of R), whose residuals are depth x pixel error. So
+unequal cameras are weighted by pixels, and the matrix ``a a^T + b b^T`` holds no length: its
+conditioning is that of the rays alone.
 """
 
 from __future__ import annotations
@@ -18,15 +20,22 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import is_rotation
 
 LARGEST = 1e12
-"""A pixel or millimetre beyond this is no measurement; its square would spoil float64's precision or range."""
+"""A pixel or millimetre beyond this is no measurement; its square would spoil float64's precision
+or range.
+"""
 LARGEST_CONDITION = 1e13
-"""Of tr(M) tr(M^-1). Two equal cameras reach it at rays 1e-6 rad apart; rounding alone gives 1e15 and more."""
+"""Of tr(M) tr(M^-1). Two equal cameras reach it at rays 1e-6 rad apart; rounding alone gives 1e15
+and more.
+"""
 
 
 def valid_cameras(cameras: Cameras) -> Bool[Tensor, "*B V"]:
-    """Which cameras are cameras: finite and not absurd, R a rotation within 1e-3, positive focal lengths, last
-    row of K (0, 0, 1)."""
-    K, R, t = cameras.K, cameras.R, cameras.t
+    """Which cameras are cameras: finite and not absurd, R a rotation within 1e-3, positive focal
+    lengths, last row of K (0, 0, 1).
+    """
+    K = cameras.K
+    R = cameras.R
+    t = cameras.t
     values = torch.cat((K.flatten(-2), R.flatten(-2), t), dim=-1)
     focal = torch.stack((K[..., 0, 0], K[..., 1, 1]), dim=-1)
     last_row = K[..., 2, :] - K.new_tensor([0.0, 0.0, 1.0])
@@ -43,11 +52,15 @@ def usable_views(cameras: Cameras, key_points: Float[Tensor, "*B V J 2"]) -> Boo
     return (key_points.abs() <= LARGEST).all(-1) & valid_cameras(cameras)[..., None]
 
 
-def local_cameras(cameras: Cameras, valid: Bool[Tensor, "*B V"] | None = None) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
-    """Float64 cameras in a world whose origin is the rig's (component-wise median) centre, and that origin.
+def local_cameras(
+    cameras: Cameras, valid: Bool[Tensor, "*B V"] | None = None
+) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
+    """Float64 cameras in a world whose origin is the rig's (component-wise median) centre, and that
+    origin.
 
-    Far from the world's origin the squares of coordinates would cost digits, and a median is not moved by one
-    camera with absurd numbers. Invalid cameras are replaced by one at the origin. ``valid``: ``valid_cameras``.
+    Far from the world's origin the squares of coordinates would cost digits, and a median is not
+    moved by one camera with absurd numbers. Invalid cameras are replaced by one at the origin.
+    ``valid``: ``valid_cameras``.
     """
     valid = valid_cameras(cameras) if valid is None else valid
     K, R, t = (x.to(torch.float64) for x in (cameras.K, cameras.R, cameras.t))
@@ -61,8 +74,9 @@ def local_cameras(cameras: Cameras, valid: Bool[Tensor, "*B V"] | None = None) -
 
 
 class Views(NamedTuple):
-    """Cameras and key points with their components apart and the frames last, so that each operation runs along
-    memory: key points are [V, J, B], what is a camera's is [V, 1, B]; float64."""
+    """Cameras and key points with their components apart and the frames last, so that each
+    operation runs along memory: key points are [V, J, B], what is a camera's is [V, 1, B]; float64.
+    """
 
     first: tuple[Tensor, Tensor, Tensor]
     """The first row of ``K[:2, :2] R[:2]``."""
@@ -84,30 +98,43 @@ class Views(NamedTuple):
 
     def depth(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
         """Of points [J, B] in each view, mm."""
-        (rx, ry, rz), shift = self.axis, self.shift[2]
+        (rx, ry, rz) = self.axis
+        shift = self.shift[2]
         return torch.addcmul(torch.addcmul(torch.addcmul(shift, rx, x), ry, y), rz, z)
 
 
-def views_of(cameras: Cameras, key_points: Float[Tensor, "B V J 2"], usable: Bool[Tensor, "V J B"]) -> Views:
-    """``cameras`` are used as they are: pass valid ones near the origin, [B, V] or [1, V] for all frames."""
-    R, t = cameras.R.permute(2, 3, 1, 0)[..., None, :].contiguous(), cameras.t.permute(2, 1, 0)[..., None, :]
+def views_of(
+    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], usable: Bool[Tensor, "V J B"]
+) -> Views:
+    """``cameras`` are used as they are: pass valid ones near the origin, [B, V] or [1, V] for all
+    frames.
+    """
+    R = cameras.R.permute(2, 3, 1, 0)[..., None, :].contiguous()
+    t = cameras.t.permute(2, 1, 0)[..., None, :]
     K = cameras.K.permute(2, 3, 1, 0)[:2, :, :, None].contiguous()
     pixels = torch.where(usable, key_points.permute(3, 1, 2, 0).to(torch.float64), 0.0)
     u, v = (torch.where(usable, pixels[i] - K[i, 2], 0.0) for i in range(2))
-    first, second = (tuple(K[i, 0] * R[0, j] + K[i, 1] * R[1, j] for j in range(3)) for i in range(2))
+    first, second = (
+        tuple(K[i, 0] * R[0, j] + K[i, 1] * R[1, j] for j in range(3)) for i in range(2)
+    )
     shift = tuple(K[i, 0] * t[0] + K[i, 1] * t[1] for i in range(2))
     return Views(first, second, tuple(R[2]), (*shift, t[2].contiguous()), u, v)
 
 
 def products(a: Sequence[Tensor], b: Sequence[Tensor]) -> Float[Tensor, "V 9 ..."]:
-    """Normal equations of each view alone from its two rows: the matrix (xx xy xz yy yz zz) and its right-hand side
-    (3)."""
+    """Normal equations of each view alone from its two rows: the matrix (xx xy xz yy yz zz) and its
+    right-hand side (3).
+    """
     pairs = [(i, j) for i in range(3) for j in range(i, 3)] + [(i, 3) for i in range(3)]
     return torch.stack([torch.addcmul(a[i] * a[j], b[i], b[j]) for i, j in pairs], dim=1)
 
 
-def weighted_sum(equations: Float[Tensor, "V E ..."], weights: Float[Tensor, "V ..."]) -> Float[Tensor, "E ..."]:
-    """Over the views, in their order: each frame's sum is the same in any batch, as ``torch.sum``'s is not."""
+def weighted_sum(
+    equations: Float[Tensor, "V E ..."], weights: Float[Tensor, "V ..."]
+) -> Float[Tensor, "E ..."]:
+    """Over the views, in their order: each frame's sum is the same in any batch, as ``torch.sum``'s
+    is not.
+    """
     total = equations.new_zeros(equations.shape[1:])
     for equation, weight in zip(equations, weights, strict=True):
         total = torch.addcmul(total, equation, weight)
@@ -117,8 +144,10 @@ def weighted_sum(equations: Float[Tensor, "V E ..."], weights: Float[Tensor, "V 
 def view_equations(
     cameras: Cameras, key_points: Float[Tensor, "B V J 2"], usable: Bool[Tensor, "B V J"]
 ) -> Float[Tensor, "B V J 9"]:
-    """Normal equations of each view alone, float64: the matrix (xx xy xz yy yz zz) and its right-hand side (3);
-    all 0 where the view is not usable. ``cameras`` are used as they are: pass valid ones near the origin."""
+    """Normal equations of each view alone, float64: the matrix (xx xy xz yy yz zz) and its
+    right-hand side (3); all 0 where the view is not usable. ``cameras`` are used as they are: pass
+    valid ones near the origin.
+    """
     usable = usable.permute(1, 2, 0)
     each = products(*views_of(cameras, key_points, usable).rows())
     return torch.where(usable[:, None], each, 0.0).permute(3, 0, 2, 1).contiguous()
@@ -128,18 +157,24 @@ def minors(m: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     """Cofactors (xx xy xz yy yz zz) of symmetric 3x3 matrices."""
     xx, xy, xz, yy, yz, zz = m
     return (
-        yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy,
-        xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy,
-    )  # fmt: skip
+        yy * zz - yz * yz,
+        xz * yz - xy * zz,
+        xy * yz - xz * yy,
+        xx * zz - xz * xz,
+        xy * xz - xx * yz,
+        xx * yy - xy * xy,
+    )
 
 
 def solve_symmetric(equations: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Solve batched symmetric 3x3 systems by cofactors.
 
-    ``equations``: nine equal shapes, the matrix (xx xy xz yy yz zz) and the right-hand side (x y z). Returns
-    x, y, z and tr(M) tr(M^-1); where that exceeds ``LARGEST_CONDITION`` it is inf and the solution 0.
+    ``equations``: nine equal shapes, the matrix (xx xy xz yy yz zz) and the right-hand side (x y
+    z). Returns x, y, z and tr(M) tr(M^-1); where that exceeds ``LARGEST_CONDITION`` it is inf and
+    the solution 0.
     """
-    matrix, (p, q, r) = equations[:6], equations[6:]
+    matrix = equations[:6]
+    (p, q, r) = equations[6:]
     cxx, cxy, cxz, cyy, cyz, czz = minors(matrix)
     determinant = matrix[0] * cxx + matrix[1] * cxy + matrix[2] * cxz
     numerator = (matrix[0] + matrix[3] + matrix[5]) * (cxx + cyy + czz)

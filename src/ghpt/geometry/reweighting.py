@@ -1,4 +1,6 @@
-"""Iteratively reweighted triangulation: a view's equations are made once, only their weights change."""
+"""Iteratively reweighted triangulation: a view's equations are made once, only their weights
+change.
+"""
 
 from __future__ import annotations
 
@@ -21,8 +23,9 @@ WEIGHTS: dict[str, Callable[[Tensor], Tensor]] = {
     "cauchy": lambda near: near,
     "geman_mcclure": lambda near: near * near,
 }
-"""Weight of a residual of r scales in iteratively reweighted least squares (the loss's derivative over r), as a
-function of ``1 / (1 + r^2)``."""
+"""Weight of a residual of r scales in iteratively reweighted least squares (the loss's derivative
+over r), as a function of ``1 / (1 + r^2)``.
+"""
 
 
 @torch.no_grad()
@@ -35,11 +38,13 @@ def triangulate_robustly(
     iterations: int,
     tolerance: float,
 ) -> Triangulation:
-    """Iteratively reweighted least squares on the reprojection error, from the linear solution of all seen views.
+    """Iteratively reweighted least squares on the reprojection error, from the linear solution of
+    all seen views.
 
-    A view's weight is that of its reprojection error in ``scale`` pixels over its squared depth, which turns the rows'
-    residuals into pixels; 0 behind a camera. A joint whose last step is longer than ``tolerance`` (mm) is
-    NOT_CONVERGED; one whose step is far shorter rests. Where a solution fails, the linear one stands.
+    A view's weight is that of its reprojection error in ``scale`` pixels over its squared depth,
+    which turns the rows' residuals into pixels; 0 behind a camera. A joint whose last step is
+    longer than ``tolerance`` (mm) is NOT_CONVERGED; one whose step is far shorter rests. Where a
+    solution fails, the linear one stands.
     """
     rig = flat_cameras(cameras, seen.shape[:1])
 
@@ -54,7 +59,8 @@ def triangulate_robustly(
         robust = system.solve(weight / weight.amax(0).clamp(min=_TINY))
         fields = system.fields(*robust, weight > 0, spoilt)
         step = torch.linalg.vector_norm(torch.stack(robust[0]) - before, dim=0).mT
-        started, good = first[1] == Status.OK, fields[1] == Status.OK
+        started = first[1] == Status.OK
+        good = fields[1] == Status.OK
         fields = tuple(
             torch.where((started & good)[..., None] if x.ndim > good.ndim else started & good, x, y)
             for x, y in zip(fields, first, strict=True)
@@ -84,7 +90,8 @@ def _reweighted(
     whole = rows = torch.stack((*a, *b, *axis, depth, square), dim=1).flatten(2)
     equations = products(rows[:, :4].unbind(1), rows[:, 4:8].unbind(1))
     total = rows.new_zeros(3, rows.shape[-1])
-    offset, moving = total.clone(), torch.arange(rows.shape[-1], device=rows.device)
+    offset = total.clone()
+    moving = torch.arange(rows.shape[-1], device=rows.device)
     active = torch.ones_like(moving, dtype=torch.bool)
     for _ in range(steps):
         sums = weighted_sum(equations, _weights(rows, offset, weigh))
@@ -95,8 +102,11 @@ def _reweighted(
         left = torch.nonzero(active)[:, 0]
         if 4 * len(left) < 3 * len(active):
             total[:, moving] = offset
-            rows, equations, offset = rows[..., left], equations[..., left], offset[:, left]
-            moving, active = moving[left], active[left]
+            rows = rows[..., left]
+            equations = equations[..., left]
+            offset = offset[:, left]
+            moving = moving[left]
+            active = active[left]
         if not len(left):
             break
     total[:, moving] = offset

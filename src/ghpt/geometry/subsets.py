@@ -10,11 +10,14 @@ _WORD = 62
 """Views that one random word decides on: ranks of subsets stay within int64."""
 
 
-def random_subsets(seen: Bool[Tensor, "B V J"], count: int, keys: Int[Tensor, " B"]) -> Bool[Tensor, "B H J V"]:
-    """For each hypothesis and joint a subset of the seen views, uniform over all those of two views or more.
+def random_subsets(
+    seen: Bool[Tensor, "B V J"], count: int, keys: Int[Tensor, " B"]
+) -> Bool[Tensor, "B H J V"]:
+    """For each hypothesis and joint a subset of the seen views, uniform over all those of two views
+    or more.
 
-    ``count`` is H. A frame's subsets depend on its key and its own ``seen`` alone. A joint seen in fewer than
-    two views gets the empty subset.
+    ``count`` is H. A frame's subsets depend on its key and its own ``seen`` alone. A joint seen in
+    fewer than two views gets the empty subset.
     """
     seen = seen.transpose(1, 2)[:, None]
     views = seen.sum(-1, keepdim=True)
@@ -27,18 +30,21 @@ def random_subsets(seen: Bool[Tensor, "B V J"], count: int, keys: Int[Tensor, " 
     else:
         place = place.clamp(min=0).expand(-1, count, -1, -1)
         chosen = seen & (((word.gather(-1, place // _WORD) >> (place % _WORD)) & 1) != 0)
-        # for more views than a word holds the fair bits themselves are drawn: once in 1e17 draws fewer than
-        # two
+        # for more views than a word holds the fair bits themselves are drawn: once in 1e17 draws
+        # fewer than two
         chosen |= seen & (views > _WORD) & (chosen.sum(-1, keepdim=True) < 2)
     return chosen
 
 
-def _pairs_or_more(word: Int[Tensor, "B H J 1"], views: Int[Tensor, "B 1 J 1"]) -> Int[Tensor, "B H J 1"]:
-    """Turn 63 random bits into a number with two bits or more set out of ``views``, each equally likely.
+def _pairs_or_more(
+    word: Int[Tensor, "B H J 1"], views: Int[Tensor, "B 1 J 1"]
+) -> Int[Tensor, "B H J 1"]:
+    """Turn 63 random bits into a number with two bits or more set out of ``views``, each equally
+    likely.
 
-    Such numbers below 2^n are counted by 2^n - n - 1, and the one of rank r whose highest bit is p is r + p +
-    2. The remainder that gives r is uniform but for less than 2e-9 of the probability (none to speak of below
-    30 views).
+    Such numbers below 2^n are counted by 2^n - n - 1, and the one of rank r whose highest bit is p
+    is r + p + 2. The remainder that gives r is uniform but for less than 2e-9 of the probability
+    (none to speak of below 30 views).
     """
     n = torch.arange(_WORD + 1, device=word.device)
     below = (1 << n) - n - 1

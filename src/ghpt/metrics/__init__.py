@@ -1,4 +1,6 @@
-"""The numbers of the paper: for each a stateless function, and a torchmetrics ``Metric`` that sums it up."""
+"""The numbers of the paper: for each a stateless function, and a torchmetrics ``Metric`` that sums
+it up.
+"""
 
 from ghpt.metrics.pose_error import MPJPE, PoseErrors, joint_errors
 from ghpt.metrics.pose_prior import PosePrior, length_ratios

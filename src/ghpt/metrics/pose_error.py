@@ -16,17 +16,24 @@ Kind = Literal["absolute", "relative", "aligned"]
 
 
 def joint_errors(
-    estimate: PoseEstimate, truth: Float[Tensor, "*B J 3"], truth_seen: Bool[Tensor, "*B J"], kind: Kind
+    estimate: PoseEstimate,
+    truth: Float[Tensor, "*B J 3"],
+    truth_seen: Bool[Tensor, "*B J"],
+    kind: Kind,
 ) -> tuple[Float[Tensor, "*B J"], Bool[Tensor, "*B J"]]:
     """Distance of each estimated joint to its true place, mm, float64, and which of them count.
 
-    A joint counts if it is estimated and has a truth. ``relative``: only where the pelvis counts too, and the
-    pelvis itself counts with an error of 0, as is the field's habit. ``aligned``: only where at least three
-    joints count, the fewest that fix a similarity. An error that does not count is 0.
+    A joint counts if it is estimated and has a truth. ``relative``: only where the pelvis counts
+    too, and the pelvis itself counts with an error of 0, as is the field's habit. ``aligned``: only
+    where at least three joints count, the fewest that fix a similarity. An error that does not
+    count is 0.
     """
-    points, truth, counted = estimate.points.double(), truth.double(), estimate.estimated & truth_seen
+    points = estimate.points.double()
+    truth = truth.double()
+    counted = estimate.estimated & truth_seen
     if kind == "relative":
-        points, truth = points - points[..., PELVIS, None, :], truth - truth[..., PELVIS, None, :]
+        points = points - points[..., PELVIS, None, :]
+        truth = truth - truth[..., PELVIS, None, :]
         counted = counted & counted[..., PELVIS, None]
     elif kind == "aligned":
         counted = counted & (counted.sum(-1, keepdim=True) >= 3)
@@ -48,11 +55,13 @@ class PoseErrors(NamedTuple):
 
 
 class MPJPE(Metric):
-    """Mean per-joint position error over all counted joint-frames, overall and in each of ``groups`` groups.
+    """Mean per-joint position error over all counted joint-frames, overall and in each of
+    ``groups`` groups.
 
-    Each joint-frame weighs the same, so a frame with half of its joints missing weighs half: an estimator
-    cannot change the mean by how its misses are spread over frames, only its ``coverage``. States are float64
-    sums and exact counts for each group and joint, summed over processes.
+    Each joint-frame weighs the same, so a frame with half of its joints missing weighs half: an
+    estimator cannot change the mean by how its misses are spread over frames, only its
+    ``coverage``. States are float64 sums and exact counts for each group and joint, summed over
+    processes.
     """
 
     full_state_update = False
@@ -62,10 +71,17 @@ class MPJPE(Metric):
 
     def __init__(self, kind: Kind, groups: int, joints: int) -> None:
         super().__init__()
-        self.kind, self.groups = kind, groups
-        self.add_state("error_sum", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("counted", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum")
-        self.add_state("with_truth", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum")
+        self.kind = kind
+        self.groups = groups
+        self.add_state(
+            "error_sum", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum"
+        )
+        self.add_state(
+            "counted", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum"
+        )
+        self.add_state(
+            "with_truth", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum"
+        )
 
     def update(
         self,

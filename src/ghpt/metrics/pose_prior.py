@@ -1,4 +1,6 @@
-"""The human pose prior S^2 (paper, section 4.4): how constant the body's left/right symmetry is in time."""
+"""The human pose prior S^2 (paper, section 4.4): how constant the body's left/right symmetry is in
+time.
+"""
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -13,10 +15,11 @@ PARTS = tuple(SYMMETRIC_PARTS)
 
 
 def length_ratios(estimate: PoseEstimate) -> tuple[Float[Tensor, "*B P"], Bool[Tensor, "*B P"]]:
-    """Length of the left part / length of the right, float64, for each of ``PARTS``, and which are defined.
+    """Length of the left part / length of the right, float64, for each of ``PARTS``, and which are
+    defined.
 
-    A ratio is defined where all joints of both sides are estimated and the right part has a length; elsewhere
-    it is 1.
+    A ratio is defined where all joints of both sides are estimated and the right part has a length;
+    elsewhere it is 1.
     """
     ends = torch.tensor(list(SYMMETRIC_PARTS.values()), device=estimate.points.device)
     points = estimate.points.double()[..., ends, :]
@@ -26,10 +29,11 @@ def length_ratios(estimate: PoseEstimate) -> tuple[Float[Tensor, "*B P"], Bool[T
 
 
 class PosePrior(Metric):
-    """S^2, the unbiased variance over frames of the left/right length ratio, for each subject and part.
+    """S^2, the unbiased variance over frames of the left/right length ratio, for each subject and
+    part.
 
-    The sums are of (ratio - 1) and its square, float64: near 0 for a body, so nothing cancels, and they add
-    up over batches and processes.
+    The sums are of (ratio - 1) and its square, float64: near 0 for a body, so nothing cancels, and
+    they add up over batches and processes.
     """
 
     full_state_update = False

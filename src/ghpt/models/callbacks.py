@@ -38,7 +38,9 @@ class SaveLast(Callback):
         resumed: bool = False,
     ) -> None:
         check(every >= 1, "save_every", f"is {every}", "It must be >= 1 step.")
-        self.path, self.every, self.identity = path, every, identity
+        self.path = path
+        self.every = every
+        self.identity = identity
         self.resumed = resumed
         self.interrupted = False
         self.saved: int | None = None
@@ -46,7 +48,9 @@ class SaveLast(Callback):
         self._stop: type[BaseException] = KeyboardInterrupt
         self._previous: dict[int, Any] = {}
 
-    def on_save_checkpoint(self, trainer: L.Trainer, module: L.LightningModule, checkpoint: dict[str, Any]) -> None:
+    def on_save_checkpoint(
+        self, trainer: L.Trainer, module: L.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
         checkpoint[FIELD] = self.identity
 
     def on_train_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
@@ -55,7 +59,9 @@ class SaveLast(Callback):
         if _HANG_UP is not None and signal.getsignal(_HANG_UP) != signal.SIG_IGN:
             numbers.append(_HANG_UP)
         for number in numbers:
-            with suppress(ValueError):  # not in the main thread: then nobody sends us signals either
+            with suppress(
+                ValueError
+            ):  # not in the main thread: then nobody sends us signals either
                 self._previous[number] = signal.signal(number, self._interrupt)
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:
@@ -68,7 +74,8 @@ class SaveLast(Callback):
     def on_train_batch_end(self, trainer: L.Trainer, *_: Any) -> None:
         if trainer.world_size > 1:  # or one process would wait for the others' part of a checkpoint
             self.interrupted = trainer.strategy.reduce_boolean_decision(self.interrupted, all=False)
-        # Not between an epoch's last step and its validation: resumed there, Lightning would skip the validation.
+        # Not between an epoch's last step and its validation: resumed there, Lightning would skip
+        # the validation.
         if not trainer.is_last_batch:
             self._save(trainer, due=trainer.global_step % self.every == 0)
 
@@ -91,13 +98,17 @@ class SaveLast(Callback):
 
 
 class LogHyperparameters(Callback):
-    """At the end of training, the settings and the final validation errors side by side in TensorBoard."""
+    """At the end of training, the settings and the final validation errors side by side in
+    TensorBoard.
+    """
 
     def __init__(self, values: dict[str, Any]) -> None:
         self.values = values
 
     def on_fit_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        errors = {k: v.item() for k, v in trainer.callback_metrics.items() if k.startswith("validation/")}
+        errors = {
+            k: v.item() for k, v in trainer.callback_metrics.items() if k.startswith("validation/")
+        }
         if trainer.logger and errors:
             final = {k.replace("validation/", "final/"): v for k, v in errors.items()}
             trainer.logger.log_hyperparams(self.values, final)
@@ -114,5 +125,9 @@ class Progress(RichProgressBar):
 def best_checkpoint(folder: Path) -> ModelCheckpoint:
     """``best.ckpt``: the lowest validation error of the weighted selection."""
     return ModelCheckpoint(
-        dirpath=folder, filename="best", monitor="validation/weight", mode="min", enable_version_counter=False
+        dirpath=folder,
+        filename="best",
+        monitor="validation/weight",
+        mode="min",
+        enable_version_counter=False,
     )

@@ -40,12 +40,14 @@ _MEND = "It is damaged or not a ghpt checkpoint; use another one."
 class AtomicCheckpointIO(CheckpointIO):
     """Temporary file in the checkpoint's own folder, synced, read back, moved into place.
 
-    (Lightning's own goes through the system's temporary folder, which copies without a sync where that is another
-    file system: a kill then destroys both the new and the old checkpoint.)
+    (Lightning's own goes through the system's temporary folder, which copies without a sync where
+    that is another file system: a kill then destroys both the new and the old checkpoint.)
     ``storage_options={"previous": path}`` keeps what the new checkpoint replaces under that name.
     """
 
-    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None
+    ) -> None:
         content = io.BytesIO()  # torch.save hides the cause when writing to a file fails
         torch.save(checkpoint, content)
         _sign(content)
@@ -53,7 +55,9 @@ class AtomicCheckpointIO(CheckpointIO):
         with atomic_write(path, verify=_read, previous=previous) as handle:
             handle.write(content.getbuffer())
 
-    def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:
+    def load_checkpoint(
+        self, path: Any, map_location: Any = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
         return read_checkpoint(path, map_location or "cpu")
 
     def remove_checkpoint(self, path: Any) -> None:
@@ -121,7 +125,8 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     except GhptCheckpointError:
         raise
     except Exception as error:
-        # torch.load's errors are of many kinds: a damaged zip, a truncated pickle, a refused global.
+        # torch.load's errors are of many kinds: a damaged zip, a truncated pickle, a refused
+        # global.
         raise GhptCheckpointError(path, f"cannot be read ({_one_line(error)})", _MEND) from None
     ours = checkpoint.get(FIELD) if isinstance(checkpoint, dict) else None
     if not isinstance(ours, dict) or not _are_weights(checkpoint.get("state_dict")):
@@ -142,7 +147,8 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
 def load_model(
     path: str | Path, trust: Sequence[str] = (), **changes: Any
 ) -> tuple[StochasticEstimator, dict[str, Any]]:
-    """The model that a checkpoint describes, with its weights, and what the checkpoint says of itself.
+    """The model that a checkpoint describes, with its weights, and what the checkpoint says of
+    itself.
 
     ``changes`` replace settings of the model (such as ``hypotheses``, or ``problem.frames``); None
     leaves one as it is. A checkpoint can only name the classes of ``ghpt.models.registry``, and

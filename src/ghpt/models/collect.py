@@ -1,4 +1,6 @@
-"""From test steps to predictions.npz: the callbacks that run the other estimators and write every item's estimates."""
+"""From test steps to predictions.npz: the callbacks that run the other estimators and write every
+item's estimates.
+"""
 
 import shutil
 from abc import abstractmethod
@@ -18,13 +20,18 @@ from ghpt.recording import KeyPointBatch, PairBatch, PoseEstimate, RelativePoseE
 
 
 class Collect(Callback):
-    """Writes ``<folder>/predictions.npz``, streaming: memory does not grow with the number of items.
+    """Writes ``<folder>/predictions.npz``, streaming: memory does not grow with the number of
+    items.
 
     ``estimators``: name -> what takes a batch; they get the same detections as the selections.
     """
 
-    def __init__(self, folder: Path, estimators: Mapping[str, Callable[[Any], Any]], meta: dict[str, Any]) -> None:
-        self.path, self.estimators, self.meta = folder / "predictions.npz", estimators, meta
+    def __init__(
+        self, folder: Path, estimators: Mapping[str, Callable[[Any], Any]], meta: dict[str, Any]
+    ) -> None:
+        self.path = folder / "predictions.npz"
+        self.estimators = estimators
+        self.meta = meta
         self.rows = folder / ".predictions"
 
     @abstractmethod
@@ -32,7 +39,9 @@ class Collect(Callback):
         """Make the writer, of ``self.data``."""
 
     @abstractmethod
-    def write(self, module: Any, batch: Any, estimates: dict[str, Any], weights: dict[str, torch.Tensor]) -> None:
+    def write(
+        self, module: Any, batch: Any, estimates: dict[str, Any], weights: dict[str, torch.Tensor]
+    ) -> None:
         """Write a batch with the selections' estimates."""
 
     @abstractmethod
@@ -49,7 +58,9 @@ class Collect(Callback):
     ) -> None:
         self.write(module, batch, *outputs)
 
-    def on_exception(self, trainer: L.Trainer, module: L.LightningModule, exception: BaseException) -> None:
+    def on_exception(
+        self, trainer: L.Trainer, module: L.LightningModule, exception: BaseException
+    ) -> None:
         if trainer.is_global_zero:  # nobody goes on with them
             shutil.rmtree(self.rows, ignore_errors=True)
 
@@ -67,18 +78,28 @@ class CollectPoses(Collect):
         self.writer = PredictionWriter(self.rows, len(self.data), names)
 
     def write(
-        self, module: Any, batch: KeyPointBatch, estimates: dict[str, PoseEstimate], weights: dict[str, torch.Tensor]
+        self,
+        module: Any,
+        batch: KeyPointBatch,
+        estimates: dict[str, PoseEstimate],
+        weights: dict[str, torch.Tensor],
     ) -> None:
-        estimates = estimates | {name: estimator(batch) for name, estimator in self.estimators.items()}
+        estimates = estimates | {
+            name: estimator(batch) for name, estimator in self.estimators.items()
+        }
         frame = torch.from_numpy(self.data.frame_numbers(batch.sample.tolist()))
-        self.writer.write(batch.sample, estimates, batch.truth, batch.truth_seen, batch.recording, frame, weights)
+        self.writer.write(
+            batch.sample, estimates, batch.truth, batch.truth_seen, batch.recording, frame, weights
+        )
 
     def finish(self) -> None:
         self.writer.finish(self.path, self.data.recordings, self.meta)
 
 
 class CollectPairs(Collect):
-    """Of the camera problem. The estimators' translations, of length 1, get their length where the learned ones do."""
+    """Of the camera problem. The estimators' translations, of length 1, get their length where the
+    learned ones do.
+    """
 
     def open(self, names: list[str]) -> None:
         self.writer = PairWriter(self.rows, len(self.data), names)
@@ -97,7 +118,11 @@ class CollectPairs(Collect):
         a, b = (batch.pair_cameras().index((slice(None), view)) for view in (0, 1))
         R = b.R @ a.R.mT
         t = b.t - (R @ a.t[..., None])[..., 0]
-        self.writer.write(batch.sample, estimates, (R, t), batch.rig, batch.draw, batch.pair, weights)
+        self.writer.write(
+            batch.sample, estimates, (R, t), batch.rig, batch.draw, batch.pair, weights
+        )
 
     def finish(self) -> None:
-        self.writer.finish(self.path, self.data.rigs, self.meta | {"frames": self.data.frames_per_item})
+        self.writer.finish(
+            self.path, self.data.rigs, self.meta | {"frames": self.data.frames_per_item}
+        )

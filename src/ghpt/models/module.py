@@ -1,4 +1,6 @@
-"""The loop of the framework as a LightningModule: generate, describe, score, weigh, combine, compare."""
+"""The loop of the framework as a LightningModule: generate, describe, score, weigh, combine,
+compare.
+"""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -18,7 +20,9 @@ from ghpt.models.scorer import Scorer
 from ghpt.models.selection import SELECTIONS, limit_spread, selection_weights, softmax_weights
 
 STATISTICS_HYPOTHESES = 16
-"""Hypotheses of each training sample that the feature statistics are taken from: enough for a mean and deviation."""
+"""Hypotheses of each training sample that the feature statistics are taken from: enough for a mean
+and deviation.
+"""
 
 MOST_HYPOTHESES = 100_000
 """In a pool: of more, the poses of one batch alone are gigabytes."""
@@ -65,21 +69,41 @@ class StochasticEstimator(L.LightningModule):
             f"is {hypotheses}",
             f"Draw at least 1 and at most {MOST_HYPOTHESES} (the paper: 200).",
         )
-        check(temperature > 0, "model.temperature", f"is {temperature}", "It must be > 0 (the paper: 1.5).")
-        check(spread is None or spread > 0, "model.spread", f"is {spread}", "It must be > 0, or null for no limit.")
+        check(
+            temperature > 0,
+            "model.temperature",
+            f"is {temperature}",
+            "It must be > 0 (the paper: 1.5).",
+        )
+        check(
+            spread is None or spread > 0,
+            "model.spread",
+            f"is {spread}",
+            "It must be > 0, or null for no limit.",
+        )
         check(
             selection in ("weight", "stochastic"),
             "model.selection",
             f"is {selection!r}",
             "Existing: weight, stochastic.",
         )
-        self.problem, self.loss, self.optimizer = problem, loss, optimizer
-        with torch.random.fork_rng(devices=[]):  # the initial weights too are a function of the seed alone
+        self.problem = problem
+        self.loss = loss
+        self.optimizer = optimizer
+        with torch.random.fork_rng(
+            devices=[]
+        ):  # the initial weights too are a function of the seed alone
             torch.manual_seed(seed)
             self.scorer = scorer(problem.feature_size)
-        self.hypotheses, self.temperature, self.gumbel = hypotheses, temperature, gumbel
-        self.spread, self.selection, self.seed = spread, selection, seed
-        self.validation = torch.nn.ModuleDict({name: _mean() for name in ("weight", "average", "random")})
+        self.hypotheses = hypotheses
+        self.temperature = temperature
+        self.gumbel = gumbel
+        self.spread = spread
+        self.selection = selection
+        self.seed = seed
+        self.validation = torch.nn.ModuleDict(
+            {name: _mean() for name in ("weight", "average", "random")}
+        )
 
     def pool(self, batch: Any, keys: Int[Tensor, " B"]) -> Pool:
         """Draw, score and measure the hypotheses of a batch."""
@@ -90,7 +114,9 @@ class StochasticEstimator(L.LightningModule):
         return Pool(hypotheses, logits, errors.to(logits.dtype), counted)
 
     def keys(self, purpose: str, batch: Any, *indices: int) -> Int[Tensor, " B"]:
-        return randomness.key(self.seed, purpose, *indices, batch.sample, device=batch.sample.device)
+        return randomness.key(
+            self.seed, purpose, *indices, batch.sample, device=batch.sample.device
+        )
 
     @torch.no_grad()
     def fit_statistics(self, batches: Iterator[Any]) -> None:
@@ -105,15 +131,23 @@ class StochasticEstimator(L.LightningModule):
 
     def on_fit_start(self) -> None:
         if not self.scorer.standardise.fitted:
-            self.fit_statistics(batch.to(self.device) for batch in self.trainer.datamodule.all_training_batches())
+            self.fit_statistics(
+                batch.to(self.device) for batch in self.trainer.datamodule.all_training_batches()
+            )
 
     def terms(self, pool: Pool, batch: Any, keys: Int[Tensor, " B"]) -> LossTerms:
         """The loss of each item."""
-        noise = randomness.gumbel(keys, (pool.logits.shape[-1],)).to(pool.logits.dtype) if self.gumbel else None
+        noise = (
+            randomness.gumbel(keys, (pool.logits.shape[-1],)).to(pool.logits.dtype)
+            if self.gumbel
+            else None
+        )
         weights = softmax_weights(pool.logits, self.temperature, noise)
         chosen = weights
         if self.selection == "stochastic":
-            drawn = selection_weights("stochastic", pool.logits.detach(), pool.errors, self.temperature, keys)
+            drawn = selection_weights(
+                "stochastic", pool.logits.detach(), pool.errors, self.temperature, keys
+            )
             chosen = drawn + weights - weights.detach()
         estimate_error, _ = self.problem.error(self.problem.combine(pool.hypotheses, chosen), batch)
         return self.loss(weights, pool.errors, estimate_error.to(weights.dtype))
@@ -146,7 +180,12 @@ class StochasticEstimator(L.LightningModule):
 
     def on_validation_epoch_end(self) -> None:
         for name, metric in self.validation.items():
-            self.log(f"validation/{name}", metric.compute().float(), prog_bar=name == "weight", sync_dist=False)
+            self.log(
+                f"validation/{name}",
+                metric.compute().float(),
+                prog_bar=name == "weight",
+                sync_dist=False,
+            )
             metric.reset()
 
     def test_step(self, batch: Any, batch_idx: int) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -154,7 +193,8 @@ class StochasticEstimator(L.LightningModule):
         keys = self.keys("test", batch)
         pool = self.pool(batch, keys)
         weights = {
-            name: selection_weights(name, pool.logits, pool.errors, self.temperature, keys) for name in SELECTIONS
+            name: selection_weights(name, pool.logits, pool.errors, self.temperature, keys)
+            for name in SELECTIONS
         }
         estimates = {name: self.problem.combine(pool.hypotheses, w) for name, w in weights.items()}
         w = weights["weight"]

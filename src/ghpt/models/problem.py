@@ -37,7 +37,9 @@ class Problem(Protocol):
         """What the scorer sees of each hypothesis: float32, finite, never the cameras."""
 
     def combine(self, hypotheses: Any, weights: Float[Tensor, "B H"]) -> Any:
-        """The estimate under weights that sum to 1; differentiable in the weights. One-hot weights select."""
+        """The estimate under weights that sum to 1; differentiable in the weights. One-hot weights
+        select.
+        """
 
     def expand(self, hypotheses: Any) -> Any:
         """All hypotheses as estimates with leading dimensions B H."""

@@ -1,4 +1,6 @@
-"""Files of rows: arrays with a row for each item of a test, and small tables. Both problems' predictions are such."""
+"""Files of rows: arrays with a row for each item of a test, and small tables. Both problems'
+predictions are such.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,9 @@ from ghpt.files import allocate, atomic_write, errors_name
 
 FORMAT_VERSION = 1
 WEIGHTS = ("entropy", "max", "effective")
-"""Summaries of an item's weights: entropy (nats), the largest, and 1 / sum of squares (hypotheses in effect)."""
+"""Summaries of an item's weights: entropy (nats), the largest, and 1 / sum of squares (hypotheses
+in effect).
+"""
 MEND = "Run the test again to make it anew"
 
 Layout = dict[str, tuple[str, tuple[int, ...]]]
@@ -29,16 +33,29 @@ Layout = dict[str, tuple[str, tuple[int, ...]]]
 
 
 class RowWriter:
-    """Collects rows in any order, from any number of processes on one file system, at constant memory.
+    """Collects rows in any order, from any number of processes on one file system, at constant
+    memory.
 
-    Every process opens the same new ``folder`` and writes its rows; after all have, one calls ``finish``. ``items``:
-    what a row is, for errors. ``names``: the selections and baselines, which arrays are called after.
+    Every process opens the same new ``folder`` and writes its rows; after all have, one calls
+    ``finish``. ``items``: what a row is, for errors. ``names``: the selections and baselines, which
+    arrays are called after.
     """
 
-    def __init__(self, folder: str | Path, count: int, items: str, names: Sequence[str], layout: Layout) -> None:
-        if count < 1 or not names or any(not re.fullmatch("[a-z][a-z0-9_]*", name) for name in names):
-            raise GhptError(f"predictions of {count} {items} of {list(names)}: need one and plain names")
-        self.folder, self.count, self.items, self.names = Path(folder), count, items, tuple(names)
+    def __init__(
+        self, folder: str | Path, count: int, items: str, names: Sequence[str], layout: Layout
+    ) -> None:
+        if (
+            count < 1
+            or not names
+            or any(not re.fullmatch("[a-z][a-z0-9_]*", name) for name in names)
+        ):
+            raise GhptError(
+                f"predictions of {count} {items} of {list(names)}: need one and plain names"
+            )
+        self.folder = Path(folder)
+        self.count = count
+        self.items = items
+        self.names = tuple(names)
         self.layout = layout | {f"weights_{summary}": ("<f4", ()) for summary in WEIGHTS}
         self.folder.mkdir(parents=True, exist_ok=True)
         for name, (dtype, shape) in (self.layout | {"written": ("|b1", ())}).items():
@@ -52,10 +69,14 @@ class RowWriter:
         if set(estimates) != set(self.names) or set(weights) != set(WEIGHTS):
             raise GhptError(f"got {[*estimates, *weights]}, not {[*self.names, *WEIGHTS]}")
 
-    def write(self, rows: Int[Tensor, " B"], values: Mapping[str, Tensor], weights: Mapping[str, Tensor]) -> None:
+    def write(
+        self, rows: Int[Tensor, " B"], values: Mapping[str, Tensor], weights: Mapping[str, Tensor]
+    ) -> None:
         """Write items to their row numbers: a value for each array of the layout."""
         index = rows.cpu().numpy()
-        for name, value in (values | {f"weights_{summary}": value for summary, value in weights.items()}).items():
+        for name, value in (
+            values | {f"weights_{summary}": value for summary, value in weights.items()}
+        ).items():
             self._put(name, index, value.detach().cpu().numpy())
         self._put("written", index, np.ones(len(index), bool))
 
@@ -72,7 +93,9 @@ class RowWriter:
         """
         missing = self.count - int(self._map("written").sum())
         if missing:
-            raise GhptError(f"{path}: {missing} of {self.count} {self.items} have no prediction; nothing was written")
+            raise GhptError(
+                f"{path}: {missing} of {self.count} {self.items} have no prediction; nothing was written"
+            )
         meta = {"format_version": FORMAT_VERSION, "unit": "mm", "names": self.names, **meta}
         tables = {**tables, "meta": np.array(json.dumps(meta, allow_nan=False))}
         with atomic_write(path, verify=verify) as handle, zipfile.ZipFile(handle, "w") as archive:
@@ -84,7 +107,8 @@ class RowWriter:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _put(self, name: str, index: Int[np.ndarray, " B"], values: np.ndarray) -> None:
-        # Not through a memory map: where the disk is full that ends the process without a word (SIGBUS).
+        # Not through a memory map: where the disk is full that ends the process without a word
+        # (SIGBUS).
         dtype, shape = (self.layout | {"written": ("|b1", ())})[name]
         rows = np.empty((len(index), *shape), dtype)
         rows[:] = values
@@ -96,7 +120,8 @@ class RowWriter:
                 handle.write(rows[start:stop].tobytes())
 
     def _map(self, name: str) -> np.memmap:
-        # Mapped anew for each use: what a map has touched counts as the process's memory while it is open.
+        # Mapped anew for each use: what a map has touched counts as the process's memory while it
+        # is open.
         dtype, shape = (self.layout | {"written": ("|b1", ())})[name]
         return np.memmap(self.folder / name, dtype, "r+", shape=(self.count, *shape))
 
@@ -104,9 +129,11 @@ class RowWriter:
 def read_tables(
     path: Path, texts: Sequence[str]
 ) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], dict[str, Any], tuple[str, ...]]:
-    """Members, text tables, meta and names of a file of rows; nothing in it is executed or unpacked.
+    """Members, text tables, meta and names of a file of rows; nothing in it is executed or
+    unpacked.
 
-    Raises GhptDataError if it is missing, damaged (every byte is compared with its checksum) or of another version.
+    Raises GhptDataError if it is missing, damaged (every byte is compared with its checksum) or of
+    another version.
     """
     try:
         members = members_of(path)
@@ -115,10 +142,14 @@ def read_tables(
     except FileNotFoundError as error:
         raise GhptDataError(path, "", "there is no such file", "Run test.py first") from error
     except (OSError, ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
-        raise GhptDataError(path, "", f"is not a readable predictions file ({error})", MEND) from error
+        raise GhptDataError(
+            path, "", f"is not a readable predictions file ({error})", MEND
+        ) from error
     version = meta.get("format_version") if isinstance(meta, dict) else None
     if version != FORMAT_VERSION:
-        raise GhptDataError(path, "meta.format_version", f"is {version!r}; this ghpt reads {FORMAT_VERSION}", MEND)
+        raise GhptDataError(
+            path, "meta.format_version", f"is {version!r}; this ghpt reads {FORMAT_VERSION}", MEND
+        )
     names = meta.get("names")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
         raise GhptDataError(path, "meta.names", "is not a list of selections", MEND)
@@ -126,8 +157,12 @@ def read_tables(
 
 
 def check_arrays(path: Path, members: Mapping[str, Member], layout: Layout, count: int) -> None:
-    """Raise GhptDataError unless every array of the layout (and of the weights) is there, with ``count`` rows."""
-    for name, (dtype, shape) in (layout | {f"weights_{summary}": ("<f4", ()) for summary in WEIGHTS}).items():
+    """Raise GhptDataError unless every array of the layout (and of the weights) is there, with
+    ``count`` rows.
+    """
+    for name, (dtype, shape) in (
+        layout | {f"weights_{summary}": ("<f4", ()) for summary in WEIGHTS}
+    ).items():
         if name not in members or members[name][1:] != (np.dtype(dtype), (count, *shape)):
             raise GhptDataError(path, name, f"is not {dtype} of shape {(count, *shape)}", MEND)
 

@@ -10,14 +10,16 @@ from torch import Tensor, nn
 from ghpt.errors import check
 
 ROWS = 400
-"""Feature vectors that the network takes at a time on a CPU where no gradient is wanted: what lies between two layers
-stays in the cache, which is a fifth faster."""
+"""Feature vectors that the network takes at a time on a CPU where no gradient is wanted: what lies
+between two layers stays in the cache, which is a fifth faster.
+"""
 
 MOST_LAYERS = 100
 
 
 class Standardise(nn.Module):
-    """Subtract the training mean and divide by the training deviation, feature by feature; clip what is left.
+    """Subtract the training mean and divide by the training deviation, feature by feature; clip
+    what is left.
 
     The statistics are buffers: they travel in the checkpoint with the weights.
     """
@@ -35,7 +37,9 @@ class Standardise(nn.Module):
         self.register_buffer("fitted", torch.tensor(False))
 
     def fit(self, features: Float[Tensor, "N D"]) -> None:
-        """Set the statistics. A feature that hardly varies keeps its scale, rather than being blown up."""
+        """Set the statistics. A feature that hardly varies keeps its scale, rather than being blown
+        up.
+        """
         features = features.double()
         deviation = features.std(dim=0, correction=0)
         self.mean.copy_(features.mean(dim=0))
@@ -47,10 +51,12 @@ class Standardise(nn.Module):
 
 
 class Scorer(nn.Module):
-    """Multi-layer perceptron with ReLUs on standardised features (tab:hyperparameters: 1000-900-900-900-700).
+    """Multi-layer perceptron with ReLUs on standardised features (tab:hyperparameters:
+    1000-900-900-900-700).
 
-    ``bfloat16``: training multiplies matrices in bfloat16, about twice as fast where the processor can (weights and
-    optimiser stay float32; gradients are rounded, so several processes agree to 1e-2 only). Testing never does.
+    ``bfloat16``: training multiplies matrices in bfloat16, about twice as fast where the processor
+    can (weights and optimiser stay float32; gradients are rounded, so several processes agree to
+    1e-2 only). Testing never does.
     """
 
     def __init__(self, size: int, layers: Sequence[int], clip: float, bfloat16: bool) -> None:
@@ -68,10 +74,16 @@ class Scorer(nn.Module):
         self.network = nn.Sequential(*hidden, nn.Linear(widths[-1], 1))
 
     def forward(self, features: Float[Tensor, "*B D"]) -> Float[Tensor, "*B"]:
-        """One logit for each feature vector: higher is more plausible. Not a weight; weights sum to 1."""
+        """One logit for each feature vector: higher is more plausible. Not a weight; weights sum to
+        1.
+        """
         standard = self.standardise(features)
-        with torch.autocast(features.device.type, torch.bfloat16, enabled=self.bfloat16 and self.training):
+        with torch.autocast(
+            features.device.type, torch.bfloat16, enabled=self.bfloat16 and self.training
+        ):
             if torch.is_grad_enabled() or features.device.type != "cpu":
                 return self.network(standard)[..., 0].to(features.dtype)
             parts = standard.reshape(-1, features.shape[-1]).split(ROWS)
-            return torch.cat([self.network(part)[:, 0] for part in parts]).reshape(features.shape[:-1])
+            return torch.cat([self.network(part)[:, 0] for part in parts]).reshape(
+                features.shape[:-1]
+            )

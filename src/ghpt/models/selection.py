@@ -1,4 +1,6 @@
-"""Hypothesis selection (paper, sections 3 and 4): every selection is a vector of weights over the pool."""
+"""Hypothesis selection (paper, sections 3 and 4): every selection is a vector of weights over the
+pool.
+"""
 
 import torch
 import torch.nn.functional as F
@@ -13,21 +15,27 @@ SELECTIONS = ("weight", "average", "most", "least", "stochastic", "random", "bes
 
 
 def limit_spread(logits: Float[Tensor, "B H"], spread: float | None) -> Float[Tensor, "B H"]:
-    """Centre each pool's logits and shrink them where their standard deviation exceeds ``spread`` (None: as they are).
+    """Centre each pool's logits and shrink them where their standard deviation exceeds ``spread``
+    (None: as they are).
 
-    Not in the paper, whose scores lie between 0 and 1 and so cannot differ much either. Without a limit the weights
-    collapse onto one or two hypotheses, and a scorer is surest of itself on poses unlike those that it was trained on.
+    Not in the paper, whose scores lie between 0 and 1 and so cannot differ much either. Without a
+    limit the weights collapse onto one or two hypotheses, and a scorer is surest of itself on poses
+    unlike those that it was trained on.
     """
     if spread is None:
         return logits
     centred = logits - logits.mean(dim=-1, keepdim=True)
-    return centred * (spread / centred.square().mean(dim=-1, keepdim=True).clamp_min(spread**2).sqrt())
+    return centred * (
+        spread / centred.square().mean(dim=-1, keepdim=True).clamp_min(spread**2).sqrt()
+    )
 
 
 def softmax_weights(
     logits: Float[Tensor, "B H"], temperature: float, noise: Float[Tensor, "B H"] | None = None
 ) -> Float[Tensor, "B H"]:
-    """The (Gumbel-)softmax of eq:gumbel-softmax; with ``noise`` from Gumbel(0, 1) in training, without it at test."""
+    """The (Gumbel-)softmax of eq:gumbel-softmax; with ``noise`` from Gumbel(0, 1) in training,
+    without it at test.
+    """
     return torch.softmax((logits if noise is None else logits + noise) / temperature, dim=-1)
 
 
@@ -38,7 +46,8 @@ def selection_weights(
     temperature: float,
     keys: Int[Tensor, " B"],
 ) -> Float[Tensor, "B H"]:
-    """Weights that sum to 1 over the pool and, given to ``Problem.combine``, make the named selection.
+    """Weights that sum to 1 over the pool and, given to ``Problem.combine``, make the named
+    selection.
 
     ``errors`` is used by best and worst alone, ``keys`` by stochastic and random.
     """
@@ -56,5 +65,7 @@ def selection_weights(
         scores = logits if name in ("most", "least") else -errors
         index = scores.argmax(dim=-1) if name in ("most", "best") else scores.argmin(dim=-1)
     else:
-        raise GhptConfigError("selection", f"{name!r} is unknown", f"Existing: {', '.join(SELECTIONS)}.")
+        raise GhptConfigError(
+            "selection", f"{name!r} is unknown", f"Existing: {', '.join(SELECTIONS)}."
+        )
     return F.one_hot(index, count).to(logits.dtype)

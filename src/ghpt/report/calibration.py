@@ -18,7 +18,12 @@ from ghpt.models.estimators.classical import Baseline
 from ghpt.models.relative_pose.scale import SEGMENTS
 from ghpt.recording import Recording
 from ghpt.report.escape import escaped, plain
-from ghpt.report.rig_comparison import held_out_errors, rig_difference, segment_variation, triangulate_recording
+from ghpt.report.rig_comparison import (
+    held_out_errors,
+    rig_difference,
+    segment_variation,
+    triangulate_recording,
+)
 from ghpt.report.tables import NONE, markdown
 
 Numbers = dict[str, Any]
@@ -26,29 +31,40 @@ _COLOURS = {"error": "red", "warning": "yellow"}
 
 
 def explains(recordings: Mapping[str, Recording], estimator: Baseline, frames: int) -> Numbers:
-    """How well each calibration of the same key points explains them: name -> held-out-view errors (pixels) over the
-    joints that all of them estimate, overall and by view, and the variation of the segments' lengths; over at most so
-    many ``frames``, evenly spread."""
+    """How well each calibration of the same key points explains them: name -> held-out-view errors
+    (pixels) over the joints that all of them estimate, overall and by view, and the variation of
+    the segments' lengths; over at most so many ``frames``, evenly spread.
+    """
     recordings = {name: spread(recording, frames) for name, recording in recordings.items()}
     if not recordings:
         return {}
-    held_out = {name: held_out_errors(recording, estimator) for name, recording in recordings.items()}
+    held_out = {
+        name: held_out_errors(recording, estimator) for name, recording in recordings.items()
+    }
     measured = torch.stack([counted for _, counted in held_out.values()]).all(0)
     result = {}
     for name, recording in recordings.items():
         errors = held_out[name][0]
         variation, known = segment_variation(*triangulate_recording(recording, estimator))
-        views = {view: _quantiles(errors[:, v][measured[:, v]]) for v, view in enumerate(recording.camera_names)}
+        views = {
+            view: _quantiles(errors[:, v][measured[:, v]])
+            for v, view in enumerate(recording.camera_names)
+        }
         lengths = dict(zip(SEGMENTS, _known(variation, known), strict=True))
         result[name] = {
             "held_out": _quantiles(errors[measured]) | {"views": views},
-            "segments": {"median": float(variation[known].median()) if known.any() else None, "each": lengths},
+            "segments": {
+                "median": float(variation[known].median()) if known.any() else None,
+                "each": lengths,
+            },
         }
     return result
 
 
 def differences(recording: Recording, reference: Recording) -> Numbers:
-    """From the reference's calibration of the same cameras, after the similarity between the worlds."""
+    """From the reference's calibration of the same cameras, after the similarity between the
+    worlds.
+    """
     apart = rig_difference(recording.cameras, reference.cameras)
     names = recording.camera_names
     return {
@@ -89,7 +105,10 @@ def camera_rows(numbers: Numbers) -> tuple[list[str], list[list[str]]]:
         row = [name, _number(camera["reprojection_px"], 1), _number(camera["inliers"], 0, 100)]
         row += [_number(camera["rotation_sd_deg"], 2), _number(camera["centre_sd_mm"], 1)]
         if apart:
-            row += [_number(apart["rotation_deg"].get(name), 2), _number(apart["centre_mm"].get(name), 1)]
+            row += [
+                _number(apart["rotation_deg"].get(name), 2),
+                _number(apart["centre_mm"].get(name), 1),
+            ]
         rows.append(row if camera["calibrated"] else [name, *[NONE] * (len(header) - 1)])
     return header, rows
 
@@ -127,9 +146,20 @@ def calibration_report(numbers: Numbers) -> str:
     if explained:
         names = list(explained)
         views = explained[names[0]]["held_out"]["views"]
-        rows = [[view, *(_number(explained[n]["held_out"]["views"][view][q], 1) for n in names for q in _QUANTILES)]
-                for view in views]  # fmt: skip
-        rows.append(["all", *(_number(explained[n]["held_out"][q], 1) for n in names for q in _QUANTILES)])
+        rows = [
+            [
+                view,
+                *(
+                    _number(explained[n]["held_out"]["views"][view][q], 1)
+                    for n in names
+                    for q in _QUANTILES
+                ),
+            ]
+            for view in views
+        ]
+        rows.append(
+            ["all", *(_number(explained[n]["held_out"][q], 1) for n in names for q in _QUANTILES)]
+        )
         parts += [
             "## Held-out views",
             "Each joint is triangulated from the other views and projected into the one left out, on the same joints "
@@ -138,7 +168,7 @@ def calibration_report(numbers: Numbers) -> str:
             "## Segments",
             "Variation of their lengths over the frames, % (1.4826 x median deviation over median).",
             markdown(["segment", *names], _segment_rows(explained)),
-        ]  # fmt: skip
+        ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -151,7 +181,9 @@ _QUANTILES = ("median", "p90")
 
 def _segment_rows(explained: Numbers) -> list[list[str]]:
     each = [found["segments"]["each"] for found in explained.values()]
-    return [[name.replace("_", " "), *(_number(of[name], 1, 100) for of in each)] for name in SEGMENTS]
+    return [
+        [name.replace("_", " "), *(_number(of[name], 1, 100) for of in each)] for name in SEGMENTS
+    ]
 
 
 def spread(recording: Recording, frames: int) -> Recording:
@@ -172,8 +204,11 @@ def _quantiles(errors: Float[Tensor, " N"]) -> Numbers:
     if not len(errors):
         return {"median": None, "p90": None, "count": 0}
     ordered = errors.sort().values
-    return {"median": float(ordered[(len(errors) - 1) // 2]), "p90": float(ordered[int(0.9 * (len(errors) - 1))]),
-            "count": len(errors)}  # fmt: skip
+    return {
+        "median": float(ordered[(len(errors) - 1) // 2]),
+        "p90": float(ordered[int(0.9 * (len(errors) - 1))]),
+        "count": len(errors),
+    }
 
 
 def _known(values: Float[Tensor, " N"], known: Bool[Tensor, " N"]) -> Sequence[float | None]:

@@ -17,7 +17,8 @@ from ghpt.models.selection import SELECTIONS
 from ghpt.report.tables import title
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 
-# Okabe and Ito's palette: told apart by all kinds of colour vision, and left from right by dashes too.
+# Okabe and Ito's palette: told apart by all kinds of colour vision, and left from right by dashes
+# too.
 LEFT, RIGHT, MIDDLE, TRUTH = "#0072B2", "#D55E00", "#000000", "#BBBBBB"
 SELECTION_COLOURS = dict(
     zip(
@@ -26,10 +27,14 @@ SELECTION_COLOURS = dict(
         strict=True,
     )
 )
-SELECTION_HATCHES = dict(zip(SELECTIONS, ("", "//", "...", "\\\\", "xx", "--", "", "oo"), strict=True))
+SELECTION_HATCHES = dict(
+    zip(SELECTIONS, ("", "//", "...", "\\\\", "xx", "--", "", "oo"), strict=True)
+)
 """The same in print without colours."""
-_SIDES = tuple("left" if "left" in a + b else "right" if "right" in a + b else "middle"
-               for a, b in ((JOINTS[i], JOINTS[j]) for i, j in BONES))  # fmt: skip
+_SIDES = tuple(
+    "left" if "left" in a + b else "right" if "right" in a + b else "middle"
+    for a, b in ((JOINTS[i], JOINTS[j]) for i, j in BONES)
+)
 _STYLES = {"left": (LEFT, "solid"), "right": (RIGHT, (0, (3, 1))), "middle": (MIDDLE, "solid")}
 
 
@@ -39,10 +44,12 @@ def skeletons(
     up: Float[np.ndarray, "3"],
     heading: str,
 ) -> Figure:
-    """One row: the truth, then each pose over the truth in grey, all centred at the pelvis and on one scale.
+    """One row: the truth, then each pose over the truth in grey, all centred at the pelvis and on
+    one scale.
 
-    World frame, mm; a joint of a pose is NaN where it is missing, the truth is whole. The view is orthographic,
-    from the front of the true person and turned by 30 degrees; ``up`` points away from the ground.
+    World frame, mm; a joint of a pose is NaN where it is missing, the truth is whole. The view is
+    orthographic, from the front of the true person and turned by 30 degrees; ``up`` points away
+    from the ground.
     """
     figure = Figure(figsize=(2.2 * (len(poses) + 1), 4.2), layout="constrained")
     view = _view(truth, up)
@@ -52,20 +59,28 @@ def skeletons(
         centre = truth[PELVIS] if np.isnan(pose[PELVIS]).any() else pose[PELVIS]
         shown[name] = pose - centre
     every_joint = np.concatenate([pose @ view.T for pose in shown.values()])
-    low, high = np.nanmin(every_joint, axis=0) - 80, np.nanmax(every_joint, axis=0) + 80
+    low = np.nanmin(every_joint, axis=0) - 80
+    high = np.nanmax(every_joint, axis=0) + 80
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
     for axes, (name, pose) in zip(panels, shown.items(), strict=True):
         caption = ""
         if name != "truth":
-            axes.add_collection(LineCollection(_segments(true @ view.T), colors=TRUTH, linewidths=4))
+            axes.add_collection(
+                LineCollection(_segments(true @ view.T), colors=TRUTH, linewidths=4)
+            )
             errors = np.linalg.norm(pose - true, axis=-1)
             caption = "\nmissing" if np.isnan(errors).all() else f"\n{np.nanmean(errors):.1f} mm"
         _draw(axes, pose @ view.T)
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[])
+        axes.set(
+            xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[]
+        )
         axes.set_title(name + caption, fontsize=11)
         axes.spines[:].set_visible(False)
     _scale_bar(panels[0], low)
-    handles = [Line2D([], [], color=c, linestyle=s, linewidth=2, label=side) for side, (c, s) in _STYLES.items()]
+    handles = [
+        Line2D([], [], color=c, linestyle=s, linewidth=2, label=side)
+        for side, (c, s) in _STYLES.items()
+    ]
     if poses:
         handles.append(Line2D([], [], color=TRUTH, linewidth=4, label="truth"))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
@@ -74,7 +89,9 @@ def skeletons(
 
 
 def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
-    """The paper's fig:pose-prior: S^2 of a subject's six parts under the eight selections, on a log scale."""
+    """The paper's fig:pose-prior: S^2 of a subject's six parts under the eight selections, on a log
+    scale.
+    """
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
     selections = [name for name in SELECTIONS if name in metrics["selections"]]
@@ -83,8 +100,18 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
         prior = metrics["selections"][name]["pose_prior"][subject]
         heights = [np.nan if prior[part] is None else prior[part] for part in PARTS]
         place = np.arange(len(PARTS)) + (i - (len(selections) - 1) / 2) * width
-        colour, hatch = SELECTION_COLOURS[name], SELECTION_HATCHES[name]
-        axes.bar(place, heights, width, color=colour, hatch=hatch, edgecolor="black", linewidth=0.4, label=name)
+        colour = SELECTION_COLOURS[name]
+        hatch = SELECTION_HATCHES[name]
+        axes.bar(
+            place,
+            heights,
+            width,
+            color=colour,
+            hatch=hatch,
+            edgecolor="black",
+            linewidth=0.4,
+            label=name,
+        )
     axes.set_yscale("log")
     axes.set_xticks(range(len(PARTS)), [part.replace("_", " ") for part in PARTS])
     axes.set_ylabel("S²: variance of left / right length")
@@ -125,20 +152,29 @@ def _view(truth: Float[np.ndarray, "17 3"], up: Float[np.ndarray, "3"]) -> Float
         across = np.roll(up, 1)
     across = across / np.linalg.norm(across)
     front = np.cross(across, up)
-    turn, tilt = np.deg2rad(30), np.deg2rad(10)
+    turn = np.deg2rad(30)
+    tilt = np.deg2rad(10)
     right = np.cos(turn) * across + np.sin(turn) * front
     toward = np.cross(right, up)
     return np.stack((right, np.cos(tilt) * up - np.sin(tilt) * toward))
 
 
-def _segments(points: Float[np.ndarray, "17 2"], sides: Collection[str] = tuple(_STYLES)) -> Float[np.ndarray, "L 2 2"]:
-    segments = points[np.array([bone for bone, side in zip(BONES, _SIDES, strict=True) if side in sides])]
+def _segments(
+    points: Float[np.ndarray, "17 2"], sides: Collection[str] = tuple(_STYLES)
+) -> Float[np.ndarray, "L 2 2"]:
+    segments = points[
+        np.array([bone for bone, side in zip(BONES, _SIDES, strict=True) if side in sides])
+    ]
     return segments[~np.isnan(segments).any((1, 2))]
 
 
 def _draw(axes: Axes, points: Float[np.ndarray, "17 2"]) -> None:
     for side, (colour, style) in _STYLES.items():
-        axes.add_collection(LineCollection(_segments(points, [side]), colors=colour, linestyles=[style], linewidths=2))
+        axes.add_collection(
+            LineCollection(
+                _segments(points, [side]), colors=colour, linestyles=[style], linewidths=2
+            )
+        )
     axes.plot(points[:, 0], points[:, 1], "o", color=MIDDLE, markersize=3)
 
 

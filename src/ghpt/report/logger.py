@@ -17,7 +17,9 @@ _log = logging.getLogger(__name__)
 
 
 class _QuietThread(event_file_writer._AsyncWriterThread):  # type: ignore[misc]
-    """What writes the events. Its failure is raised again at the next event, where it is forgiven and said."""
+    """What writes the events. Its failure is raised again at the next event, where it is forgiven
+    and said.
+    """
 
     def run(self) -> None:
         with suppress(Exception):
@@ -32,7 +34,9 @@ def _forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
     def wrapped(self: "ForgivingTensorBoard", *args: Any, **kwargs: Any) -> Any:
         try:
             return method(self, *args, **kwargs)
-        except Exception as error:  # a full disk, a lost mount: the numbers matter less than the run
+        except (
+            Exception
+        ) as error:  # a full disk, a lost mount: the numbers matter less than the run
             self.failures += 1
             if self.failures == 1:
                 _log.warning("TensorBoard logging fails (%s); training goes on without it", error)
@@ -53,7 +57,9 @@ class ForgivingTensorBoard(TensorBoardLogger):
 
     @property
     def experiment(self) -> Any:
-        """The writer. An event file that cannot even be begun stops the training: its folder is of no use."""
+        """The writer. An event file that cannot even be begun stops the training: its folder is of
+        no use.
+        """
         with errors_name(Path(self.log_dir)):
             return super().experiment
 

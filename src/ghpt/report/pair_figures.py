@@ -18,11 +18,15 @@ from ghpt.report.pair_tables import NAMES
 
 # Okabe and Ito's palette again; told apart in grey print by markers and dashes.
 METHOD_STYLES = {
-    "weight": ("#0072B2", "-", "o"), "average": ("#56B4E9", (0, (4, 1)), "v"), "eight_point": ("#D55E00", "--", "s"),
-    "ransac": ("#E69F00", "-.", "D"), "usac_magsac": ("#009E73", (0, (1, 1)), "^"),
-    "usac_accurate": ("#999999", (0, (5, 1, 1, 1)), "<"), "poselib": ("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"),
+    "weight": ("#0072B2", "-", "o"),
+    "average": ("#56B4E9", (0, (4, 1)), "v"),
+    "eight_point": ("#D55E00", "--", "s"),
+    "ransac": ("#E69F00", "-.", "D"),
+    "usac_magsac": ("#009E73", (0, (1, 1)), "^"),
+    "usac_accurate": ("#999999", (0, (5, 1, 1, 1)), "<"),
+    "poselib": ("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"),
     "rig": ("#000000", (0, (6, 2)), "X"),
-}  # fmt: skip
+}
 OTHER_STYLE = ("#F0E442", ":", "*")
 _MANY_CAMERAS = 8
 """With more cameras than these only the estimates from the first camera are drawn."""
@@ -36,12 +40,17 @@ def rig_figure(
     estimates: Mapping[str, RelativePoseEstimate],
     heading: str,
 ) -> Figure:
-    """A rig from above and from the side: its true cameras, and over them the target camera of every pair, put after
-    the pair's true reference camera as each of ``estimates`` (N poses, mm) has it; points X* as dots."""
+    """A rig from above and from the side: its true cameras, and over them the target camera of
+    every pair, put after the pair's true reference camera as each of ``estimates`` (N poses, mm)
+    has it; points X* as dots.
+    """
     if len(names) > _MANY_CAMERAS:
         first = pair[:, 0] == pair[:, 0].min()
         pair = pair[first]
-        estimates = {k: RelativePoseEstimate(e.R[first], e.t[first], e.estimated[first]) for k, e in estimates.items()}
+        estimates = {
+            k: RelativePoseEstimate(e.R[first], e.t[first], e.estimated[first])
+            for k, e in estimates.items()
+        }
     right, forward, up = _axes_of(cameras)
     centre = cameras.centre.numpy()
     extent = float(np.linalg.norm(np.ptp(centre, axis=0)))
@@ -61,16 +70,38 @@ def rig_figure(
             stalks = np.stack((start, start + times * difference), axis=1)
             axes.add_collection(LineCollection(stalks, colors=colour, linewidths=1.6, zorder=3))
             axes.plot(*stalks[:, 1].T, marker, color=colour, markersize=5, zorder=4)
-        _limits(axes, (cameras.centre.numpy() @ view.T) / 1000, points.numpy() @ view.T / 1000, size / 1000)
+        _limits(
+            axes,
+            (cameras.centre.numpy() @ view.T) / 1000,
+            points.numpy() @ view.T / 1000,
+            size / 1000,
+        )
         axes.set_title(caption, fontsize=10)
     if len(names) <= _MANY_CAMERAS:
-        _name(panels[0], names, centre @ views[0].T / 1000, centre.mean(0) @ views[0].T / 1000, size / 1000)
+        _name(
+            panels[0],
+            names,
+            centre @ views[0].T / 1000,
+            centre.mean(0) @ views[0].T / 1000,
+            size / 1000,
+        )
     handles = [Line2D([], [], color=TRUTH, linewidth=4.5, label="true cameras")]
     for name, estimate in estimates.items():
         colour, style, marker = METHOD_STYLES.get(name, OTHER_STYLE)
-        label = f"{NAMES.get(name, name)}: {_said(estimate, off[name][1])}; stalks: {times} times that"
+        label = (
+            f"{NAMES.get(name, name)}: {_said(estimate, off[name][1])}; stalks: {times} times that"
+        )
         handles.append(
-            Line2D([], [], color=colour, linestyle=style, linewidth=1.2, marker=marker, markersize=5, label=label)
+            Line2D(
+                [],
+                [],
+                color=colour,
+                linestyle=style,
+                linewidth=1.2,
+                marker=marker,
+                markersize=5,
+                label=label,
+            )
         )
     figure.legend(handles=handles, loc="outside lower center", ncols=1, frameon=False, fontsize=9)
     figure.suptitle(wrapped(heading, 110), fontsize=10)
@@ -78,8 +109,9 @@ def rig_figure(
 
 
 def _axes_of(cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right, forward and up in the world, unit vectors: up is what the images have above on average, right is the first
-    camera's."""
+    """Right, forward and up in the world, unit vectors: up is what the images have above on
+    average, right is the first camera's.
+    """
     up = -cameras.R[:, 1].mean(dim=0).numpy()
     x = cameras.R[0, 0].numpy()
     if not np.linalg.norm(up) > 0.1:  # cameras turned all ways
@@ -99,9 +131,18 @@ def _targets(cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseE
 
 
 def _draw(
-    axes: Axes, cameras: Cameras, size: float, view: np.ndarray, colour: str, style: object, width: float, order: int
+    axes: Axes,
+    cameras: Cameras,
+    size: float,
+    view: np.ndarray,
+    colour: str,
+    style: object,
+    width: float,
+    order: int,
 ) -> None:
-    """Each camera as a pyramid ``size`` (mm) deep, as wide as its image if the principal point is the middle."""
+    """Each camera as a pyramid ``size`` (mm) deep, as wide as its image if the principal point is
+    the middle.
+    """
     K = cameras.K.numpy()
     corner = np.stack((K[:, 0, 2] / K[:, 0, 0], K[:, 1, 2] / K[:, 1, 1], np.ones(len(K))), axis=-1)
     signs = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
@@ -110,14 +151,17 @@ def _draw(
     edges = np.stack((corners, np.roll(corners, -1, axis=1)), axis=2)
     sides = np.stack((apex, corners), axis=2)
     segments = np.concatenate((edges, sides), axis=1).reshape(-1, 2, 3) @ view.T / 1000
-    collection = LineCollection(segments, colors=colour, linestyles=[style], linewidths=width, zorder=order)
+    collection = LineCollection(
+        segments, colors=colour, linestyles=[style], linewidths=width, zorder=order
+    )
     axes.add_collection(collection)
 
 
 def _limits(axes: Axes, centres: np.ndarray, points: np.ndarray, size: float) -> None:
     """About the true rig: an estimate that is far out is left out of the figure."""
     everything = np.concatenate((centres, points))
-    low, high = everything.min(0) - 2 * size, everything.max(0) + 2 * size
+    low = everything.min(0) - 2 * size
+    high = everything.max(0) + 2 * size
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="m")
     axes.tick_params(labelsize=8)
     axes.grid(color="#EEEEEE", linewidth=0.6)
@@ -125,15 +169,23 @@ def _limits(axes: Axes, centres: np.ndarray, points: np.ndarray, size: float) ->
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _name(axes: Axes, names: Sequence[str], places: np.ndarray, middle: np.ndarray, size: float) -> None:
+def _name(
+    axes: Axes, names: Sequence[str], places: np.ndarray, middle: np.ndarray, size: float
+) -> None:
     for number, (name, place) in enumerate(zip(names, places, strict=True), start=1):
         away = place - middle
         away = away / max(np.linalg.norm(away), 1e-9)
-        axes.text(*(place + 0.8 * size * away), f"{number}: {name}", ha="center", va="center", fontsize=8)
+        axes.text(
+            *(place + 0.8 * size * away), f"{number}: {name}", ha="center", va="center", fontsize=8
+        )
 
 
-def _off(cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseEstimate) -> tuple[np.ndarray, np.ndarray]:
-    """True centres of the target cameras that were estimated, and what the estimated ones differ by; world, mm."""
+def _off(
+    cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseEstimate
+) -> tuple[np.ndarray, np.ndarray]:
+    """True centres of the target cameras that were estimated, and what the estimated ones differ
+    by; world, mm.
+    """
     true = cameras.centre[pair[estimate.estimated][:, 1]]
     return true.numpy(), (_targets(cameras, pair, estimate).centre - true).numpy()
 
@@ -141,12 +193,16 @@ def _off(cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseEstim
 def _enlargement(differences: Float[np.ndarray, "N 3"], extent: float) -> int:
     """A round number of times by which the differences are seen in a figure of the rig."""
     largest = float(np.linalg.norm(differences, axis=-1).max(initial=0))
-    return max((times for times in (1, 2, 5, 10, 20, 50, 100) if times * largest <= 0.15 * extent), default=1)
+    return max(
+        (times for times in (1, 2, 5, 10, 20, 50, 100) if times * largest <= 0.15 * extent),
+        default=1,
+    )
 
 
 def _said(estimate: RelativePoseEstimate, differences: Float[np.ndarray, "N 3"]) -> str:
     """How far the estimated centres are from the true ones, in words."""
-    total, missing = len(estimate.estimated), int((~estimate.estimated).sum())
+    total = len(estimate.estimated)
+    missing = int((~estimate.estimated).sum())
     if missing == total:
         return "no pair was estimated"
     distance = np.linalg.norm(differences, axis=-1)

@@ -23,7 +23,9 @@ SHOWN = ("weight", "rig")
 _CHUNK = 2048
 
 
-def write_pair_events(folder: str | Path, predictions: PairPredictions, metrics: Mapping[str, Any]) -> int:
+def write_pair_events(
+    folder: str | Path, predictions: PairPredictions, metrics: Mapping[str, Any]
+) -> int:
     """Write a test run's scalars, histograms, figure and hyper-parameters, as ``write_parts`` does."""
     return write_parts(
         folder,
@@ -31,7 +33,9 @@ def write_pair_events(folder: str | Path, predictions: PairPredictions, metrics:
             "scalars": lambda writer: _scalars(writer, metrics),
             "the weights": lambda writer: _weights(writer, predictions),
             "the rig": lambda writer: _rig(writer, predictions, metrics),
-            "the hyper-parameters": lambda writer: write_hyperparameters(writer, predictions.meta, metrics, "E_3D"),
+            "the hyper-parameters": lambda writer: write_hyperparameters(
+                writer, predictions.meta, metrics, "E_3D"
+            ),
         },
     )
 
@@ -52,7 +56,10 @@ def _add(writer: SummaryWriter, of: str, name: str, numbers: Mapping[str, Any]) 
 
 def _weights(writer: SummaryWriter, predictions: PairPredictions) -> None:
     chunks = [chunk.weights for chunk in predictions.chunks(_CHUNK)]
-    write_weights(writer, {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS})
+    write_weights(
+        writer,
+        {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS},
+    )
 
 
 def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[str, Any]) -> None:
@@ -61,10 +68,15 @@ def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[s
     chunks = [predictions.read(row, row + 1) for row in rows]
     rig = int(chunks[0].rig[0])
     estimates = {
-        name: RelativePoseEstimate(*(torch.cat([getattr(c.estimates[name], field.name) for c in chunks])
-                                     for field in fields(RelativePoseEstimate)))
-        for name in SHOWN if name in predictions.names
-    }  # fmt: skip
+        name: RelativePoseEstimate(
+            *(
+                torch.cat([getattr(c.estimates[name], field.name) for c in chunks])
+                for field in fields(RelativePoseEstimate)
+            )
+        )
+        for name in SHOWN
+        if name in predictions.names
+    }
     heading = f"{title(metrics)}\nrig of {predictions.rig_name[rig]}, the draw of median E_3D under {SHOWN[0]}"
     figure = rig_figure(
         predictions.cameras.index(rig),
@@ -79,7 +91,8 @@ def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[s
 
 def _typical_draw(predictions: PairPredictions) -> list[int]:
     """The rows of a draw that is median in E_3D under the first shown selection."""
-    errors, draws = [], []
+    errors = []
+    draws = []
     for chunk in predictions.chunks(_CHUNK):
         errors.append(pair_errors(predictions, chunk, SHOWN[0])["E_3D"].double())
         draws.append(chunk.draw)

@@ -10,12 +10,15 @@ from ghpt.models.collect import Collect
 
 @dataclass(frozen=True)
 class Report:
-    """One instance for each problem. ``metrics`` below is what ``evaluate`` returns, the content of metrics.json."""
+    """One instance for each problem. ``metrics`` below is what ``evaluate`` returns, the content of
+    metrics.json.
+    """
 
     settings: type
     """The settings that test.py needs for this problem alone, a TypedDict."""
     estimators: Callable[[Mapping[str, Any], Any], dict[str, Callable[[Any], Any]]]
-    """Configuration and model -> what is tested beside the selections, by name: each takes a batch."""
+    """Configuration and model -> what is tested beside the selections, by name: each takes a batch.
+    """
     collect: type[Collect]
     """Writes predictions.npz."""
     open: Callable[[Path], Any]

@@ -42,15 +42,19 @@ class Similarity:
 
 
 def align(cameras: Cameras, reference: Cameras, rigid: bool = False) -> Similarity:
-    """The similarity (with scale 1 if ``rigid``) that brings a rig onto a reference rig with the same V >= 2 cameras.
+    """The similarity (with scale 1 if ``rigid``) that brings a rig onto a reference rig with the
+    same V >= 2 cameras.
 
-    Its rotation is the mean (chordal) of the cameras' own; scale and translation then fit the centres in least
-    squares. Scale 1 where the centres of either rig coincide.
+    Its rotation is the mean (chordal) of the cameras' own; scale and translation then fit the
+    centres in least squares. Scale 1 where the centres of either rig coincide.
     """
     R = nearest_rotation((reference.R.mT @ cameras.R).sum(0))
-    source, target = cameras.centre @ R.mT, reference.centre
-    a, b = source - source.mean(0), target - target.mean(0)
-    variance, product = float((a * a).sum()), float((a * b).sum())
+    source = cameras.centre @ R.mT
+    target = reference.centre
+    a = source - source.mean(0)
+    b = target - target.mean(0)
+    variance = float((a * a).sum())
+    product = float((a * b).sum())
     scale = product / variance if variance > 0 and product > 0 and not rigid else 1.0
     return Similarity(R, scale, target.mean(0) - scale * source.mean(0))
 
@@ -77,8 +81,11 @@ def rig_difference(cameras: Cameras, reference: Cameras) -> RigDifference:
 def triangulate_recording(
     recording: Recording, estimator: Baseline, without: int | None = None
 ) -> tuple[Float[Tensor, "T J 3"], Bool[Tensor, "T J"]]:
-    """The recording's joints (world, mm) by ``estimator``, and which are estimated; ``without`` leaves out a view."""
-    points, estimated = [], []
+    """The recording's joints (world, mm) by ``estimator``, and which are estimated; ``without``
+    leaves out a view.
+    """
+    points = []
+    estimated = []
     for first in range(0, len(recording), _FRAMES):
         rows = slice(first, first + _FRAMES)
         seen = torch.from_numpy(recording.seen[rows].copy())
@@ -87,23 +94,29 @@ def triangulate_recording(
         count = len(seen)
         rig = recording.cameras
         batch = KeyPointBatch(
-            sample=torch.arange(first, first + count), recording=torch.zeros(count, dtype=torch.int64),
+            sample=torch.arange(first, first + count),
+            recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
             key_points=torch.from_numpy(recording.key_points[rows]).double(),
-            confidence=torch.from_numpy(recording.confidence[rows]).double(), seen=seen,
+            confidence=torch.from_numpy(recording.confidence[rows]).double(),
+            seen=seen,
             truth=torch.zeros(count, seen.shape[-1], 3),
             truth_seen=torch.zeros(count, seen.shape[-1], dtype=torch.bool),
-        )  # fmt: skip
+        )
         result = estimator(batch)
         points.append(result.points)
         estimated.append(result.estimated)
     return torch.cat(points), torch.cat(estimated)
 
 
-def held_out_errors(recording: Recording, estimator: Baseline) -> tuple[Float[Tensor, "T V J"], Bool[Tensor, "T V J"]]:
-    """For each view the distance (pixels) of its key points from the joints that the *other* views give, and where
-    there is one: seen in the view, estimated without it, and in front of it."""
-    errors, measured = [], []
+def held_out_errors(
+    recording: Recording, estimator: Baseline
+) -> tuple[Float[Tensor, "T V J"], Bool[Tensor, "T V J"]]:
+    """For each view the distance (pixels) of its key points from the joints that the *other* views
+    give, and where there is one: seen in the view, estimated without it, and in front of it.
+    """
+    errors = []
+    measured = []
     key_points = torch.from_numpy(recording.key_points).double()
     for view in range(len(recording.camera_names)):
         points, estimated = triangulate_recording(recording, estimator, without=view)
@@ -118,8 +131,9 @@ def held_out_errors(recording: Recording, estimator: Baseline) -> tuple[Float[Te
 def segment_variation(
     points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]
 ) -> tuple[Float[Tensor, " L"], Bool[Tensor, " L"]]:
-    """How much each body part's length varies over the frames, 1.4826 x median deviation over the median, and which
-    parts were seen in two frames or more."""
+    """How much each body part's length varies over the frames, 1.4826 x median deviation over the
+    median, and which parts were seen in two frames or more.
+    """
     a, b = torch.tensor(BONES).unbind(1)
     both = estimated[:, a] & estimated[:, b]
     length = torch.where(both, (points[:, a] - points[:, b]).norm(dim=-1), torch.nan)
@@ -129,15 +143,21 @@ def segment_variation(
     return torch.where(known, spread / torch.where(known, median, 1.0), 0.0), known
 
 
-def upright(points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"], cameras: Cameras) -> Similarity:
-    """To a world with z along the people's mean direction from hips to neck, the floor at their lowest ankles, the
-    origin below where they mostly are, and x where the first camera looks. Only as true as they stood upright."""
+def upright(
+    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"], cameras: Cameras
+) -> Similarity:
+    """To a world with z along the people's mean direction from hips to neck, the floor at their
+    lowest ankles, the origin below where they mostly are, and x where the first camera looks. Only
+    as true as they stood upright.
+    """
     trunk = (points[:, THORAX] - points[:, PELVIS])[estimated[:, THORAX] & estimated[:, PELVIS]]
     trunk = torch.nn.functional.normalize(trunk, dim=-1).sum(0)
     z = trunk if float(trunk.norm()) > 0 else -cameras.R[0, 1]
     z = z / z.norm()
     x = cameras.R[0, 2] - (cameras.R[0, 2] @ z) * z
-    x = x if float(x.norm()) > 1e-3 else cameras.R[0, 0] - (cameras.R[0, 0] @ z) * z  # it looks straight down
+    x = (
+        x if float(x.norm()) > 1e-3 else cameras.R[0, 0] - (cameras.R[0, 0] @ z) * z
+    )  # it looks straight down
     x = x / x.norm()
     R = torch.stack((x, torch.linalg.cross(z, x), z))
     there = points[estimated] @ R.mT

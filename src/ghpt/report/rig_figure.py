@@ -1,4 +1,6 @@
-"""A rig seen from above and from the side: cameras with their uncertainty, the people, and the true cameras."""
+"""A rig seen from above and from the side: cameras with their uncertainty, the people, and the true
+cameras.
+"""
 
 from __future__ import annotations
 
@@ -35,8 +37,9 @@ def rig_figure(
     reference: Cameras | None = None,
     reference_name: str = "",
 ) -> Figure:
-    """Metres. ``cameras``, ``covariance`` (of turn and centre), ``points`` and ``reference`` are in one world, and
-    ``upright`` leads to one whose z is up."""
+    """Metres. ``cameras``, ``covariance`` (of turn and centre), ``points`` and ``reference`` are in
+    one world, and ``upright`` leads to one whose z is up.
+    """
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     panels = figure.subplots(1, 2)
     spread = upright.R @ covariance[:, 3:, 3:] @ upright.R.T / 1e6
@@ -66,7 +69,12 @@ def rig_figure(
         axes.spines[["top", "right"]].set_visible(False)
     times = f", {magnified} x" if magnified > 1 else ""
     handles = [
-        Line2D([], [], color=ESTIMATED, label=f"calibrated; ellipse: {_DEVIATIONS:g} standard deviations{times}")
+        Line2D(
+            [],
+            [],
+            color=ESTIMATED,
+            label=f"calibrated; ellipse: {_DEVIATIONS:g} standard deviations{times}",
+        )
     ]
     if other is not None:
         handles.append(Line2D([], [], color=REFERENCE, linestyle="--", label=reference_name))
@@ -76,27 +84,44 @@ def rig_figure(
     return figure
 
 
-def _frustums(axes: Axes, cameras: Cameras, length: float, plane: tuple[int, int], colour: str, style: str) -> None:
+def _frustums(
+    axes: Axes, cameras: Cameras, length: float, plane: tuple[int, int], colour: str, style: str
+) -> None:
     """Pyramids of the images (as large as twice the principal point), their tops at the centres."""
     corners = torch.tensor([[0.0, 0], [2, 0], [2, 2], [0, 2]], dtype=torch.float64)
     pixels = corners * cameras.K[:, None, :2, 2]
-    rays = torch.cat((pixels, torch.ones_like(pixels[..., :1])), -1) @ torch.linalg.inv(cameras.K).mT
+    rays = (
+        torch.cat((pixels, torch.ones_like(pixels[..., :1])), -1) @ torch.linalg.inv(cameras.K).mT
+    )
     centre = cameras.centre / 1000
     ends = (centre[:, None] + length * rays @ cameras.R).numpy()[..., list(plane)]
     tops = np.broadcast_to(centre.numpy()[:, None, list(plane)], ends.shape)
-    segments = np.concatenate([np.stack([tops, ends], -2), np.stack([ends, np.roll(ends, 1, axis=1)], -2)], 1)
-    axes.add_collection(LineCollection(segments.reshape(-1, 2, 2), colors=colour, linestyles=style, linewidths=1.2))
+    segments = np.concatenate(
+        [np.stack([tops, ends], -2), np.stack([ends, np.roll(ends, 1, axis=1)], -2)], 1
+    )
+    axes.add_collection(
+        LineCollection(segments.reshape(-1, 2, 2), colors=colour, linestyles=style, linewidths=1.2)
+    )
     axes.plot(*tops[:, 0].T, "o", color=colour, markersize=3)
 
 
-def _ellipse(axes: Axes, centre: Float[np.ndarray, " 2"], covariance: Float[np.ndarray, "2 2"], magnified: int) -> None:
+def _ellipse(
+    axes: Axes,
+    centre: Float[np.ndarray, " 2"],
+    covariance: Float[np.ndarray, "2 2"],
+    magnified: int,
+) -> None:
     values, vectors = np.linalg.eigh(covariance)
     width, height = 2 * magnified * _DEVIATIONS * np.sqrt(values.clip(0))[::-1]
     angle = np.degrees(np.arctan2(*vectors[::-1, 1]))
-    axes.add_patch(Ellipse(tuple(centre), width, height, angle=angle, color=ESTIMATED, alpha=0.25, linewidth=0))
+    axes.add_patch(
+        Ellipse(tuple(centre), width, height, angle=angle, color=ESTIMATED, alpha=0.25, linewidth=0)
+    )
 
 
-def _people(axes: Axes, points: Float[np.ndarray, "T J 2"], estimated: Bool[np.ndarray, "T J"]) -> None:
+def _people(
+    axes: Axes, points: Float[np.ndarray, "T J 2"], estimated: Bool[np.ndarray, "T J"]
+) -> None:
     """The middle of the person in every frame, and some skeletons."""
     frames = np.flatnonzero(estimated.any(1))
     if not len(frames):

@@ -16,16 +16,32 @@ from ghpt.paper.published import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 from ghpt.report.escape import code, escaped, plain
 
 NAMES = {
-    "h36m": "Human3.6M", "panoptic": "Panoptic",
+    "h36m": "Human3.6M",
+    "panoptic": "Panoptic",
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
-    "view_weights": "view weights", "weighted_linear": "weighted linear", "ransac": "RANSAC",
-    "adaptive_ransac": "adaptive RANSAC", "m_estimator": "M-estimator", "lo_ransac": "LO-RANSAC",
-}  # fmt: skip
+    "view_weights": "view weights",
+    "weighted_linear": "weighted linear",
+    "ransac": "RANSAC",
+    "adaptive_ransac": "adaptive RANSAC",
+    "m_estimator": "M-estimator",
+    "lo_ransac": "LO-RANSAC",
+}
 """What people call a data set or a row, where it is not its name in metrics.json."""
 
 NONE = "–"
-COLUMNS = ("selection", "absolute", "relative", "aligned", "6 joints", "coverage", "paper", "difference")
-_TERMINAL = dict(zip(COLUMNS, ("selection", "abs", "rel", "PA", "6 j", "cov %", "paper", "diff %"), strict=True))
+COLUMNS = (
+    "selection",
+    "absolute",
+    "relative",
+    "aligned",
+    "6 joints",
+    "coverage",
+    "paper",
+    "difference",
+)
+_TERMINAL = dict(
+    zip(COLUMNS, ("selection", "abs", "rel", "PA", "6 j", "cov %", "paper", "diff %"), strict=True)
+)
 _CAPTION = """abs: in the world; rel: relative to the pelvis; PA: Procrustes-aligned
 6 j: rel, elbows wrists knees; cov: joints estimated; diff: rel to paper"""
 _MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
@@ -53,15 +69,23 @@ def title(metrics: Mapping[str, Any]) -> str:
 
 
 def main_rows(metrics: Mapping[str, Any]) -> Rows:
-    """A row of ``COLUMNS`` for each selection and baseline; the paper's number where it has one for this test."""
-    rows, (trained, _) = [], trained_on(metrics)
+    """A row of ``COLUMNS`` for each selection and baseline; the paper's number where it has one for
+    this test.
+    """
+    rows = []
+    (trained, _) = trained_on(metrics)
     for name, numbers in metrics["selections"].items():
         paper = paper_value(metrics["data"], name, trained) if metrics["split"] == "test" else None
         ours = numbers["mpjpe_relative"]
-        rows.append([
-            NAMES.get(name, name), *(_mm(numbers[mean]) for mean in _MEANS), _percent(numbers["coverage"]),
-            _mm(paper), NONE if None in (paper, ours) else f"{100 * (ours / paper - 1):+.1f} %",
-        ])  # fmt: skip
+        rows.append(
+            [
+                NAMES.get(name, name),
+                *(_mm(numbers[mean]) for mean in _MEANS),
+                _percent(numbers["coverage"]),
+                _mm(paper),
+                NONE if None in (paper, ours) else f"{100 * (ours / paper - 1):+.1f} %",
+            ]
+        )
     return rows
 
 
@@ -100,11 +124,19 @@ def report(metrics: Mapping[str, Any]) -> str:
     if any("without_damaged" in numbers for numbers in selections.values()):
         parts += [
             "## Without S9's takes with damaged ground truth",
-            markdown(COLUMNS[:5], ([NAMES.get(name, name), *(_mm(numbers["without_damaged"][m]) for m in _MEANS)]
-                                   for name, numbers in selections.items())),
-        ]  # fmt: skip
+            markdown(
+                COLUMNS[:5],
+                (
+                    [NAMES.get(name, name), *(_mm(numbers["without_damaged"][m]) for m in _MEANS)]
+                    for name, numbers in selections.items()
+                ),
+            ),
+        ]
     parts += ["## Actions", "Relative MPJPE, mm.", markdown(*action_table(metrics))]
-    parts += ["## Pose prior", "Variance over frames of the ratio of left to right part, times 1000."]
+    parts += [
+        "## Pose prior",
+        "Variance over frames of the ratio of left to right part, times 1000.",
+    ]
     for subject in next(iter(selections.values()))["pose_prior"]:
         parts += [f"### {escaped(subject)}", markdown(*prior_table(metrics, subject))]
     return "\n\n".join(part for part in parts if part) + "\n"
@@ -117,13 +149,23 @@ def write_report(path: str | Path, metrics: Mapping[str, Any]) -> None:
 
 
 def action_table(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
-    """Header and rows: relative MPJPE of an action under the main selections, and the paper's for ``weight``."""
+    """Header and rows: relative MPJPE of an action under the main selections, and the paper's for
+    ``weight``.
+    """
     selections = metrics["selections"]
     names = [name for name in _PER_ACTION if name in selections]
     trained, _ = trained_on(metrics)
-    paper = QUANTITATIVE if (trained, metrics["data"], metrics["split"]) == ("h36m", "h36m", "test") else {}
+    paper = (
+        QUANTITATIVE
+        if (trained, metrics["data"], metrics["split"]) == ("h36m", "h36m", "test")
+        else {}
+    )
     rows = [
-        [action, *(_mm(selections[name]["per_action"][action]) for name in names), _mm(paper.get(action))]
+        [
+            action,
+            *(_mm(selections[name]["per_action"][action]) for name in names),
+            _mm(paper.get(action)),
+        ]
         for action in next(iter(selections.values()))["per_action"]
     ]
     mean = _mm(QUANTITATIVE_MEAN if paper else None)
@@ -133,11 +175,18 @@ def action_table(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
 
 def prior_table(metrics: Mapping[str, Any], subject: str) -> tuple[list[str], Rows]:
     """Header and rows: 1000 S^2 of a subject's six parts under each selection."""
-    selections = {name: numbers for name, numbers in metrics["selections"].items() if name in SELECTIONS}
+    selections = {
+        name: numbers for name, numbers in metrics["selections"].items() if name in SELECTIONS
+    }
     rows = []
     for part in PARTS:
         values = [numbers["pose_prior"][subject][part] for numbers in selections.values()]
-        rows.append([part.replace("_", " "), *(NONE if v is None else _three_digits(1000 * v) for v in values)])
+        rows.append(
+            [
+                part.replace("_", " "),
+                *(NONE if v is None else _three_digits(1000 * v) for v in values),
+            ]
+        )
     return ["part", *selections], rows
 
 
@@ -151,8 +200,11 @@ def max_difference(values: Iterable[float]) -> float:
     return 100 * (max(values) / min(values) - 1)
 
 
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], text: Collection[int] = (0,)) -> str:
-    """A Markdown table, also aligned as plain text; the columns ``text`` to the left, numbers to the right.
+def markdown(
+    header: Sequence[str], rows: Iterable[Sequence[str]], text: Collection[int] = (0,)
+) -> str:
+    """A Markdown table, also aligned as plain text; the columns ``text`` to the left, numbers to
+    the right.
 
     Cells are escaped, unless they are ``Markdown`` already.
     """
@@ -160,11 +212,14 @@ def markdown(header: Sequence[str], rows: Iterable[Sequence[str]], text: Collect
     widths = [max(len(row[i]) for row in table) for i in range(len(header))]
     lines = [
         " | ".join(
-            cell.ljust(w) if i in text else cell.rjust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+            cell.ljust(w) if i in text else cell.rjust(w)
+            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
         )
         for row in table
     ]
-    rule = "|".join(("-" * (w + 2)) if i in text else "-" * (w + 1) + ":" for i, w in enumerate(widths))
+    rule = "|".join(
+        ("-" * (w + 2)) if i in text else "-" * (w + 1) + ":" for i, w in enumerate(widths)
+    )
     return "\n".join([f"| {lines[0]} |", f"|{rule}|", *(f"| {line} |" for line in lines[1:])])
 
 
@@ -176,7 +231,9 @@ def _about_the_paper(metrics: Mapping[str, Any]) -> str:
         "Its RANSAC is quoted from Iskakov et al., on their own detections."
     )
     if metrics["source"] == "embedded":
-        fitted = "random, average, best, worst" + (" and RANSAC" if metrics["data"] == "h36m" else "")
+        fitted = "random, average, best, worst" + (
+            " and RANSAC" if metrics["data"] == "h36m" else ""
+        )
         note += (
             f" These data are synthetic: their detector model was fitted to the paper's {fitted} here,"
             " and to no row of a trained scorer."

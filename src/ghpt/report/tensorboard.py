@@ -1,4 +1,6 @@
-"""A test run in TensorBoard. It shows what metrics.json holds; it can fail without costing the run anything."""
+"""A test run in TensorBoard. It shows what metrics.json holds; it can fail without costing the run
+anything.
+"""
 
 import logging
 from collections.abc import Callable, Iterator, Mapping
@@ -29,7 +31,9 @@ _log = logging.getLogger(__name__)
 
 
 def write_events(folder: str | Path, predictions: Predictions, metrics: Mapping[str, Any]) -> int:
-    """Write a test run's scalars, histograms, figures and hyper-parameters, as ``write_parts`` does."""
+    """Write a test run's scalars, histograms, figures and hyper-parameters, as ``write_parts``
+    does.
+    """
     return write_parts(
         folder,
         {
@@ -47,7 +51,8 @@ def write_events(folder: str | Path, predictions: Predictions, metrics: Mapping[
 def write_parts(folder: str | Path, parts: Mapping[str, Callable[[SummaryWriter], None]]) -> int:
     """Write each part (what it is called -> what writes it) as events in ``folder``.
 
-    Never raises: the number of parts that failed is returned, and the first is said as a logged warning.
+    Never raises: the number of parts that failed is returned, and the first is said as a logged
+    warning.
     """
     failures: list[Exception] = []
 
@@ -56,7 +61,11 @@ def write_parts(folder: str | Path, parts: Mapping[str, Callable[[SummaryWriter]
             return write()
         except Exception as error:
             if not failures:
-                _log.warning("TensorBoard: %s cannot be written (%s); the test's files are complete", part, error)
+                _log.warning(
+                    "TensorBoard: %s cannot be written (%s); the test's files are complete",
+                    part,
+                    error,
+                )
             failures.append(error)
 
     writer = attempt("the event file", lambda: SummaryWriter(str(folder)))
@@ -76,7 +85,10 @@ def _scalars(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
 
 def _weights(writer: SummaryWriter, predictions: Predictions) -> None:
     chunks = [chunk.weights for _, chunk in _sample(predictions)]
-    write_weights(writer, {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS})
+    write_weights(
+        writer,
+        {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS},
+    )
 
 
 def write_weights(writer: SummaryWriter, weights: Mapping[str, Float[Tensor, " N"]]) -> None:
@@ -88,7 +100,9 @@ def write_weights(writer: SummaryWriter, weights: Mapping[str, Float[Tensor, " N
 
 def _skeletons(writer: SummaryWriter, predictions: Predictions, metrics: Mapping[str, Any]) -> None:
     """The whole frame whose error under ``weight`` is the median: neither a good nor a bad one."""
-    rows, errors, truth = [], [], []
+    rows = []
+    errors = []
+    truth = []
     for start, chunk in _sample(predictions):
         error, whole = _relative_error(chunk)
         rows.append(start + whole.nonzero()[:, 0])
@@ -108,7 +122,9 @@ def _skeletons(writer: SummaryWriter, predictions: Predictions, metrics: Mapping
 
 def _pose_prior(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
     for subject in next(iter(metrics["selections"].values()))["pose_prior"]:
-        writer.add_image(f"pose_prior/{subject}", image(pose_prior_bars(metrics, subject)), 0, dataformats="HWC")
+        writer.add_image(
+            f"pose_prior/{subject}", image(pose_prior_bars(metrics, subject)), 0, dataformats="HWC"
+        )
 
 
 def write_hyperparameters(
@@ -117,9 +133,15 @@ def write_hyperparameters(
     """The settings of a test run beside each selection's ``error``."""
     trained, source = trained_on(metrics)
     values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
-    values |= {"trained_on": trained, "trained_on_source": source, "hypotheses": meta.get("hypotheses")}
+    values |= {
+        "trained_on": trained,
+        "trained_on_source": source,
+        "hypotheses": meta.get("hypotheses"),
+    }
     numbers = {
-        f"final/{name}": numbers[error] for name, numbers in metrics["selections"].items() if numbers[error] is not None
+        f"final/{name}": numbers[error]
+        for name, numbers in metrics["selections"].items()
+        if numbers[error] is not None
     }
     # writer.add_hparams would write them to a second event file.
     for summary in hparams({k: v for k, v in values.items() if v is not None}, numbers):
@@ -129,17 +151,26 @@ def write_hyperparameters(
 
 
 def _sample(predictions: Predictions) -> Iterator[tuple[int, PredictionChunk]]:
-    """At most ``_SAMPLE`` blocks with their first row, so that memory does not grow with the frames."""
+    """At most ``_SAMPLE`` blocks with their first row, so that memory does not grow with the
+    frames.
+    """
     starts = range(0, len(predictions), _BLOCK)
     chosen = sorted({round(i) for i in np.linspace(0, len(starts) - 1, min(len(starts), _SAMPLE))})
-    return ((starts[i], predictions.read(starts[i], min(starts[i] + _BLOCK, len(predictions)))) for i in chosen)
+    return (
+        (starts[i], predictions.read(starts[i], min(starts[i] + _BLOCK, len(predictions))))
+        for i in chosen
+    )
 
 
 def _relative_error(chunk: PredictionChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
     """Each frame's error under the first shown selection, mm, and which frames are whole."""
-    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], chunk.truth, chunk.truth_seen, "relative")
+    errors, counted = joint_errors(
+        chunk.estimates[SHOWN[0]], chunk.truth, chunk.truth_seen, "relative"
+    )
     return errors.mean(-1), counted.all(-1)
 
 
 def _with_nan(estimate: PoseEstimate) -> Float[np.ndarray, "J 3"]:
-    return estimate.points[0].double().masked_fill(~estimate.estimated[0, :, None], torch.nan).numpy()
+    return (
+        estimate.points[0].double().masked_fill(~estimate.estimated[0, :, None], torch.nan).numpy()
+    )

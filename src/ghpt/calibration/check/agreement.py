@@ -29,7 +29,9 @@ class Agreement:
     error: Float[Tensor, " V"]
     """Held out: against the points of the core's other views; at most LARGEST."""
     points: Float[Tensor, "V F J 3"]
-    """For each view what the core's other views give (all of the core where they are fewer than two)."""
+    """For each view what the core's other views give (all of the core where they are fewer than
+    two).
+    """
     known: Bool[Tensor, "V F J"]
 
     @property
@@ -39,11 +41,15 @@ class Agreement:
 
 
 def errors(
-    rays: Rays, R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"], points: Float[Tensor, "F J 3"],
+    rays: Rays,
+    R: Float[Tensor, "*B 3 3"],
+    t: Float[Tensor, "*B 3"],
+    points: Float[Tensor, "F J 3"],
     known: Bool[Tensor, "F J"],
-) -> Float[Tensor, "*B F J"]:  # fmt: skip
-    """Of views' rays from given points, in sizes of the person; NaN where there is nothing to compare, at most
-    LARGEST (behind the camera as well)."""
+) -> Float[Tensor, "*B F J"]:
+    """Of views' rays from given points, in sizes of the person; NaN where there is nothing to
+    compare, at most LARGEST (behind the camera as well).
+    """
     in_camera = points @ R[..., None, :, :].mT + t[..., None, None, :]
     depth = in_camera[..., 2]
     front = depth > 0
@@ -60,12 +66,21 @@ def median(error: Float[Tensor, "*B F J"]) -> Float[Tensor, "*B"]:
     return torch.where(enough, flat.nanmedian(-1).values.nan_to_num(LARGEST), LARGEST)
 
 
-def pair_errors(rays: Rays, setup: Setup, pairs: Int[Tensor, "P 2"], step: int) -> Float[Tensor, "P V"]:
-    """Median error of every view from the points that a pair of views triangulates, over every ``step``-th frame."""
-    xy, seen, size = rays.xy[:, ::step], rays.seen[:, ::step], rays.size[:, ::step]
-    frames, views = xy.shape[1], len(setup)
+def pair_errors(
+    rays: Rays, setup: Setup, pairs: Int[Tensor, "P 2"], step: int
+) -> Float[Tensor, "P V"]:
+    """Median error of every view from the points that a pair of views triangulates, over every
+    ``step``-th frame.
+    """
+    xy = rays.xy[:, ::step]
+    seen = rays.seen[:, ::step]
+    size = rays.size[:, ::step]
+    frames = xy.shape[1]
+    views = len(setup)
     eye = torch.eye(views, dtype=torch.bool)
-    chosen = (eye[pairs[:, 0]] | eye[pairs[:, 1]])[None, :, None].expand(frames, -1, xy.shape[2], -1)
+    chosen = (eye[pairs[:, 0]] | eye[pairs[:, 1]])[None, :, None].expand(
+        frames, -1, xy.shape[2], -1
+    )
     K = torch.eye(3, dtype=torch.float64).expand(frames, views, 3, 3)
     rig = Cameras(K, setup.R.expand(frames, -1, -1, -1), setup.t.expand(frames, -1, -1))
     points, ok = triangulate_subsets(rig, xy.transpose(0, 1), seen.transpose(0, 1), chosen)
@@ -85,7 +100,9 @@ def all_pairs(views: int, most: int) -> Int[Tensor, "P 2"]:
 
 
 def core_of(pair_error: Float[Tensor, "P V"], level: float) -> Bool[Tensor, " V"]:
-    """The views within ``level`` of the points of the pair that most agree with, or if none do that pair's."""
+    """The views within ``level`` of the points of the pair that most agree with, or if none do that
+    pair's.
+    """
     best = pair_error.clamp(max=level).sum(-1) + 1e-3 * pair_error.sum(-1)
     row = pair_error[best.argmin()]
     core = row <= level
@@ -94,13 +111,17 @@ def core_of(pair_error: Float[Tensor, "P V"], level: float) -> Bool[Tensor, " V"
     return core
 
 
-def agreement(look: Look, setup: Setup, estimator: MEstimator, level: float, most_pairs: int) -> Agreement:
+def agreement(
+    look: Look, setup: Setup, estimator: MEstimator, level: float, most_pairs: int
+) -> Agreement:
     """Whose rays meet, and each view's held-out error."""
     rays = look.all(setup)
     step = max(1, rays.xy.shape[1] // 32)
     core = core_of(pair_errors(rays, setup, all_pairs(len(setup), most_pairs), step), level)
     points, known = triangulated(rays, setup, _without(core), estimator)
-    each = [errors(_at(rays, v), setup.R[v], setup.t[v], points[v], known[v]) for v in range(len(setup))]
+    each = [
+        errors(_at(rays, v), setup.R[v], setup.t[v], points[v], known[v]) for v in range(len(setup))
+    ]
     return Agreement(core, median(torch.stack(each)), points, known)
 
 
@@ -114,18 +135,29 @@ def triangulated(
     rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: Baseline
 ) -> tuple[Float[Tensor, "G F J 3"], Bool[Tensor, "G F J"]]:
     """Points from G choices of views by an estimator, in normalised image coordinates."""
-    groups, (frames, joints) = len(used), rays.seen.shape[1:]
+    groups = len(used)
+    (frames, joints) = rays.seen.shape[1:]
     seen = (rays.seen.transpose(0, 1) & used[:, None, :, None]).flatten(0, 1)
     count = groups * frames
     batch = KeyPointBatch(
-        sample=torch.arange(count), recording=torch.zeros(count, dtype=torch.int64),
-        cameras=Cameras(*(x.expand(count, *x.shape) for x in (torch.eye(3, dtype=torch.float64).expand_as(setup.R),
-                                                             setup.R, setup.t))),
-        key_points=rays.xy.transpose(0, 1).repeat(groups, 1, 1, 1), confidence=seen.double(), seen=seen,
-        truth=torch.zeros(count, joints, 3), truth_seen=torch.zeros(count, joints, dtype=torch.bool),
-    )  # fmt: skip
+        sample=torch.arange(count),
+        recording=torch.zeros(count, dtype=torch.int64),
+        cameras=Cameras(
+            *(
+                x.expand(count, *x.shape)
+                for x in (torch.eye(3, dtype=torch.float64).expand_as(setup.R), setup.R, setup.t)
+            )
+        ),
+        key_points=rays.xy.transpose(0, 1).repeat(groups, 1, 1, 1),
+        confidence=seen.double(),
+        seen=seen,
+        truth=torch.zeros(count, joints, 3),
+        truth_seen=torch.zeros(count, joints, dtype=torch.bool),
+    )
     found = estimator(batch)
-    return found.points.unflatten(0, (groups, frames)), found.estimated.unflatten(0, (groups, frames))
+    return found.points.unflatten(0, (groups, frames)), found.estimated.unflatten(
+        0, (groups, frames)
+    )
 
 
 def _at(rays: Rays, view: int) -> Rays:

@@ -1,4 +1,6 @@
-"""Good recordings spoilt on purpose, one mistake at a time: to demonstrate the doctor and to test it."""
+"""Good recordings spoilt on purpose, one mistake at a time: to demonstrate the doctor and to test
+it.
+"""
 
 from __future__ import annotations
 
@@ -23,7 +25,8 @@ def _pose(case: Case, views: Sequence[int], code: str) -> Case:
     """The inverse of the mend of ``code``."""
     evidence, setup = case
     at = list(views)
-    R, t = setup.R.clone(), setup.t.clone()
+    R = setup.R.clone()
+    t = setup.t.clone()
     if code == "centre_for_translation":
         t[at] = -(R[at].mT @ t[at][..., None])[..., 0]
     elif code == "camera_to_world_flipped":
@@ -47,7 +50,8 @@ def _resolution(case: Case, views: Sequence[int], ratio: float) -> Case:
 
 def _undistorted(case: Case, views: Sequence[int]) -> Case:
     evidence, setup = case
-    pixels, seen = evidence.pixels.clone(), evidence.seen.clone()
+    pixels = evidence.pixels.clone()
+    seen = evidence.seen.clone()
     for v in views:
         pixels[v], seen[v] = ideal(pixels[v], seen[v], setup.K[v], setup.lens[v])
     return replace(evidence, pixels=pixels, seen=seen), setup
@@ -56,17 +60,22 @@ def _undistorted(case: Case, views: Sequence[int]) -> Case:
 def _lens_missing(case: Case, views: Sequence[int]) -> Case:
     """Images through a lens that the file does not have."""
     evidence, setup = _undistorted(case, views)
-    pixels, lens = evidence.pixels.clone(), setup.lens.clone()
+    pixels = evidence.pixels.clone()
+    lens = setup.lens.clone()
     for v in views:
         flat = pixels[v].flatten(0, -2)
-        pixels[v] = distort(flat, setup.K[v], torch.tensor(_LENS, dtype=torch.float64)).reshape(pixels[v].shape)
+        pixels[v] = distort(flat, setup.K[v], torch.tensor(_LENS, dtype=torch.float64)).reshape(
+            pixels[v].shape
+        )
         lens[v] = 0.0
     return replace(evidence, pixels=pixels), replace(setup, lens=lens)
 
 
 def _moved(case: Case, views: Sequence[int], degrees: float, millimetres: float) -> Case:
     evidence, setup = case
-    turn = vector_to_matrix(torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64) * torch.pi / 180 * degrees)
+    turn = vector_to_matrix(
+        torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64) * torch.pi / 180 * degrees
+    )
     way = millimetres * torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
     for v in views:
         R = turn @ setup.R[v]
@@ -77,7 +86,8 @@ def _moved(case: Case, views: Sequence[int], degrees: float, millimetres: float)
 def _late(case: Case, views: Sequence[int], by: int) -> Case:
     """Their frame n + by shows what the others' frame n shows."""
     evidence, setup = case
-    pixels, seen = evidence.pixels.clone(), evidence.seen.clone()
+    pixels = evidence.pixels.clone()
+    seen = evidence.seen.clone()
     for v in views:
         pixels[v], seen[v] = pixels[v].roll(by, 0), seen[v].roll(by, 0)
         seen[v, slice(0, by) if by > 0 else slice(by, None)] = False
@@ -94,7 +104,8 @@ def _exchanged(case: Case, views: Sequence[int]) -> Case:
 
 def _mirrored(case: Case, views: Sequence[int], image: bool, sides: bool) -> Case:
     evidence, setup = case
-    pixels, seen = evidence.pixels.clone(), evidence.seen.clone()
+    pixels = evidence.pixels.clone()
+    seen = evidence.seen.clone()
     for v in views:
         if image:
             pixels[v, ..., 0] = setup.width[v] - 1 - pixels[v, ..., 0]
@@ -105,8 +116,9 @@ def _mirrored(case: Case, views: Sequence[int], image: bool, sides: bool) -> Cas
 
 @dataclass(frozen=True)
 class Breakage:
-    """One way to spoil a recording; ``said``: the code of the finding that names it; ``every``: whether it is of all
-    views or of the last alone."""
+    """One way to spoil a recording; ``said``: the code of the finding that names it; ``every``:
+    whether it is of all views or of the last alone.
+    """
 
     said: str
     every: bool
@@ -140,7 +152,9 @@ BREAKAGES: dict[str, Breakage] = {
     "early": Breakage("out_of_sync", False, partial(_late, by=-10)),
     "exchanged": Breakage("views_swapped", False, _exchanged),
     "mirrored_image": Breakage("mirrored_image", False, partial(_mirrored, image=True, sides=True)),
-    "mirrored_key_points": Breakage("mirrored_key_points", False, partial(_mirrored, image=True, sides=False)),
+    "mirrored_key_points": Breakage(
+        "mirrored_key_points", False, partial(_mirrored, image=True, sides=False)
+    ),
     "sides_swapped": Breakage("sides_swapped", False, partial(_mirrored, image=False, sides=True)),
 }
 """By kind."""

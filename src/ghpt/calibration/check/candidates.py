@@ -12,8 +12,14 @@ from torch import Tensor
 from ghpt.calibration.check.setup import Setup
 from ghpt.calibration.repair import RESOLUTIONS
 
-UNITS = {1e3: "metres for millimetres", 1e2: "decimetres for millimetres", 1e1: "centimetres for millimetres",
-         1e-1: "ten times too large", 1e-2: "a hundred times too large", 1e-3: "millimetres for metres"}  # fmt: skip
+UNITS = {
+    1e3: "metres for millimetres",
+    1e2: "decimetres for millimetres",
+    1e1: "centimetres for millimetres",
+    1e-1: "ten times too large",
+    1e-2: "a hundred times too large",
+    1e-3: "millimetres for metres",
+}
 _FLIP = torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64))
 _FPS = (24.0, 25.0, 30.0, 50.0, 60.0, 100.0, 120.0)
 RADIAL = tuple(k / 20 for k in range(-9, 10) if k)
@@ -61,14 +67,28 @@ def _flipped_inverse(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 
 POSES: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], str]] = {
-    "rotation_transposed": (_transposed, "R of {camera} is camera to world where world to camera is wanted; "
-                                         "transpose R"),
-    "centre_for_translation": (_from_centre, "t of {camera} is the camera's centre C; give t = -R C"),
-    "camera_to_world": (_inverse, "R and t of {camera} are camera to world; invert them: R^T and -R^T t"),
-    "axes_flipped": (_flipped, "the axes of {camera} are y up, z backward (OpenGL); turn them: y down, z forward"),
-    "camera_to_world_flipped": (_flipped_inverse, "R and t of {camera} are camera to world with y up and z backward "
-                                                  "(OpenGL, Blender); invert them, then turn y and z"),
-}  # fmt: skip
+    "rotation_transposed": (
+        _transposed,
+        "R of {camera} is camera to world where world to camera is wanted; transpose R",
+    ),
+    "centre_for_translation": (
+        _from_centre,
+        "t of {camera} is the camera's centre C; give t = -R C",
+    ),
+    "camera_to_world": (
+        _inverse,
+        "R and t of {camera} are camera to world; invert them: R^T and -R^T t",
+    ),
+    "axes_flipped": (
+        _flipped,
+        "the axes of {camera} are y up, z backward (OpenGL); turn them: y down, z forward",
+    ),
+    "camera_to_world_flipped": (
+        _flipped_inverse,
+        "R and t of {camera} are camera to world with y up and z backward "
+        "(OpenGL, Blender); invert them, then turn y and z",
+    ),
+}
 
 
 def of_file(setup: Setup) -> Iterator[Candidate]:
@@ -82,20 +102,35 @@ def of_file(setup: Setup) -> Iterator[Candidate]:
         yield Candidate("resolution", (), text, replace(setup, K=_scaled(setup.K, ratio)), ratio)
     if setup.lens.any():
         text = "key points of all cameras are undistorted already; give no distortion with them"
-        yield Candidate("already_undistorted", (), text, replace(setup, lens=torch.zeros_like(setup.lens)), 0.0)
+        yield Candidate(
+            "already_undistorted", (), text, replace(setup, lens=torch.zeros_like(setup.lens)), 0.0
+        )
     for k1 in RADIAL:
-        yield Candidate("lens", (), f"lenses of all cameras do not fit: k1 = {k1:g} fits better; calibrate them",
-                        replace(setup, lens=_radial(k1).expand_as(setup.lens).clone()), k1, True)  # fmt: skip
+        yield Candidate(
+            "lens",
+            (),
+            f"lenses of all cameras do not fit: k1 = {k1:g} fits better; calibrate them",
+            replace(setup, lens=_radial(k1).expand_as(setup.lens).clone()),
+            k1,
+            True,
+        )
     mirrored = replace(setup, mirrored=tuple(not m for m in setup.mirrored))
     text = "the images of all cameras are mirrored; give u as width - 1 - u"
     yield Candidate("mirrored_key_points", (), text, mirrored, 0.0)
-    yield Candidate("mirrored_image", (), f"{text}, with left and right joints exchanged",
-                    replace(mirrored, sides=tuple(not s for s in setup.sides)), 0.0)  # fmt: skip
+    yield Candidate(
+        "mirrored_image",
+        (),
+        f"{text}, with left and right joints exchanged",
+        replace(mirrored, sides=tuple(not s for s in setup.sides)),
+        0.0,
+    )
 
 
 def of_view(setup: Setup, view: int) -> Iterator[Candidate]:
     """Mistakes that concern one camera, but for shifts, exchanges and its place."""
-    R, t, K = setup.R[view], setup.t[view], setup.K[view]
+    R = setup.R[view]
+    t = setup.t[view]
+    K = setup.K[view]
     for code, (mend, text) in POSES.items():
         turned, moved = mend(R, t)
         yield Candidate(code, (view,), text, setup.changed(view, R=turned, t=moved), 0.0)
@@ -104,29 +139,43 @@ def of_view(setup: Setup, view: int) -> Iterator[Candidate]:
         yield Candidate("unit", (view,), text, setup.changed(view, t=factor * t), factor)
     for ratio in RESOLUTIONS:
         text = f"intrinsics of {{camera}} fit its key points when scaled by {ratio:.3g}; give both at one resolution"
-        yield Candidate("resolution", (view,), text, setup.changed(view, K=_scaled(K, ratio)), ratio)
+        yield Candidate(
+            "resolution", (view,), text, setup.changed(view, K=_scaled(K, ratio)), ratio
+        )
     if setup.lens[view].any():
         text = "key points of {camera} are undistorted already; give no distortion with them"
-        yield Candidate("already_undistorted", (view,), text,
-                        setup.changed(view, lens=torch.zeros_like(setup.lens[view])), 0.0)  # fmt: skip
+        yield Candidate(
+            "already_undistorted",
+            (view,),
+            text,
+            setup.changed(view, lens=torch.zeros_like(setup.lens[view])),
+            0.0,
+        )
     for k1 in RADIAL:
         text = f"the lens of {{camera}} does not fit: k1 = {k1:g} fits better; calibrate its intrinsics"
         yield Candidate("lens", (view,), text, setup.changed(view, lens=_radial(k1)), k1, True)
-    mirrored, sides = not setup.mirrored[view], not setup.sides[view]
+    mirrored = not setup.mirrored[view]
+    sides = not setup.sides[view]
     text = "left and right joints of {camera} are exchanged; exchange them back"
     yield Candidate("sides_swapped", (view,), text, setup.changed(view, sides=sides), 0.0)
     text = "key points of {camera} are those of a mirrored image; give u as width - 1 - u"
-    yield Candidate("mirrored_key_points", (view,), text, setup.changed(view, mirrored=mirrored), 0.0)
+    yield Candidate(
+        "mirrored_key_points", (view,), text, setup.changed(view, mirrored=mirrored), 0.0
+    )
     text = "the image of {camera} is mirrored; give u as width - 1 - u with left and right joints exchanged"
-    yield Candidate("mirrored_image", (view,), text, setup.changed(view, mirrored=mirrored, sides=sides), 0.0)
+    yield Candidate(
+        "mirrored_image", (view,), text, setup.changed(view, mirrored=mirrored, sides=sides), 0.0
+    )
 
 
 def shifted(setup: Setup, view: int, by: int) -> Candidate:
     """Out of step: ``by`` frames later than now."""
     total = setup.shift[view] + by
     way = "late" if total > 0 else "early"
-    text = (f"{{camera}} is {abs(total)} frames {way}: its frame n{total:+d} goes with frame n of the others; "
-            "shift its frames")  # fmt: skip
+    text = (
+        f"{{camera}} is {abs(total)} frames {way}: its frame n{total:+d} goes with frame n of the others; "
+        "shift its frames"
+    )
     return Candidate("out_of_sync", (view,), text, setup.changed(view, shift=total), float(total))
 
 
@@ -143,7 +192,13 @@ def exchanged(setup: Setup, one: int, other: int) -> Candidate:
     """Two cameras with each other's key points, and all that goes with these."""
     new = setup
     for a, b in ((one, other), (other, one)):
-        new = new.changed(a, source=setup.source[b], shift=setup.shift[b], sides=setup.sides[b], rate=setup.rate[b])
+        new = new.changed(
+            a,
+            source=setup.source[b],
+            shift=setup.shift[b],
+            sides=setup.sides[b],
+            rate=setup.rate[b],
+        )
     text = "key points of {camera} are those of {other}, and the reverse; exchange the two names"
     return Candidate("views_swapped", (one, other), text, new, 0.0)
 

@@ -1,4 +1,6 @@
-"""What the doctor looks at: a choice of frames, each with the frames around it, as the detector gave them."""
+"""What the doctor looks at: a choice of frames, each with the frames around it, as the detector
+gave them.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,9 @@ AtRate = Callable[[int, float], tuple[Float[Tensor, "S F J 2"], Bool[Tensor, "S 
 
 @dataclass(frozen=True)
 class Evidence:
-    """F frames of V views of one person, each with its 2N neighbours in time (S = 2N + 1, the frame itself at N)."""
+    """F frames of V views of one person, each with its 2N neighbours in time (S = 2N + 1, the frame
+    itself at N).
+    """
 
     names: tuple[str, ...]
     pixels: Float[Tensor, "V S F J 2"]
@@ -34,8 +38,9 @@ class Evidence:
     seen: Bool[Tensor, "V S F J"]
     frame: Int[Tensor, " F"]
     at_rate: AtRate | None = None
-    """The pixels of a view, and what is seen, if its frame numbers count ``ratio`` times as fast as the others'; None
-    where the recording is not at hand."""
+    """The pixels of a view, and what is seen, if its frame numbers count ``ratio`` times as fast as
+    the others'; None where the recording is not at hand.
+    """
 
     @property
     def reach(self) -> int:
@@ -51,24 +56,34 @@ def gather(
     frames: int,
     reach: int,
 ) -> tuple[Evidence, CameraFile, tuple[int, ...]]:
-    """At most ``frames`` frames, evenly spread over those in which people are seen; their cameras in the order of the
-    views; and which of the key points' views these are. ``reach``: the largest shift, at most a quarter of the frames.
+    """At most ``frames`` frames, evenly spread over those in which people are seen; their cameras
+    in the order of the views; and which of the key points' views these are. ``reach``: the largest
+    shift, at most a quarter of the frames.
 
-    Raises GhptDataError where views and cameras do not match, without extrinsics, and with fewer than two views.
+    Raises GhptDataError where views and cameras do not match, without extrinsics, and with fewer
+    than two views.
     """
     pairs = matched(points.path, points.views, cameras, match, views)
     if len(pairs) < 2:
-        raise GhptDataError(points.path, "views", f"{len(pairs)} with a camera", "Give two views or more.")
-    at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
+        raise GhptDataError(
+            points.path, "views", f"{len(pairs)} with a camera", "Give two views or more."
+        )
+    at = [view for view, _ in pairs]
+    ordered = cameras.select([camera for _, camera in pairs])
     if ordered.cameras is None:
         mend = "Calibrate them first: python calibrate.py --help"
-        raise GhptDataError(cameras.path, "extrinsics", "are missing: there is nothing to check", mend)
+        raise GhptDataError(
+            cameras.path, "extrinsics", "are missing: there is nothing to check", mend
+        )
     return of_points(points, at, ordered, frames, reach), ordered, tuple(at)
 
 
-def of_points(points: KeyPoints, at: Sequence[int], cameras: CameraFile, frames: int, reach: int) -> Evidence:
-    """The evidence of the views ``at``, whose cameras these are. Raises GhptDataError for key points that are no
-    pixels."""
+def of_points(
+    points: KeyPoints, at: Sequence[int], cameras: CameraFile, frames: int, reach: int
+) -> Evidence:
+    """The evidence of the views ``at``, whose cameras these are. Raises GhptDataError for key
+    points that are no pixels.
+    """
     at = list(at)
     arrays = points.key_points[:, at], points.confidence[:, at], points.seen[:, at]
     check_pixels(points.path, arrays[0], arrays[2], cameras)
@@ -77,20 +92,33 @@ def of_points(points: KeyPoints, at: Sequence[int], cameras: CameraFile, frames:
 
 
 def choose(
-    names: tuple[str, ...], pixels: Float[np.ndarray, "T V J 2"], seen: Bool[np.ndarray, "T V J"],
-    frame: Int[np.ndarray, " T"], frames: int, reach: int, where: str,
-) -> Evidence:  # fmt: skip
-    """The evidence of a recording's detected pixels; a frame number that is left out is a gap in time."""
+    names: tuple[str, ...],
+    pixels: Float[np.ndarray, "T V J 2"],
+    seen: Bool[np.ndarray, "T V J"],
+    frame: Int[np.ndarray, " T"],
+    frames: int,
+    reach: int,
+    where: str,
+) -> Evidence:
+    """The evidence of a recording's detected pixels; a frame number that is left out is a gap in
+    time.
+    """
     usable = np.flatnonzero((seen.sum(1) >= 2).sum(-1) >= _LEAST_JOINTS)
     if not len(usable):
         mend = "Check that the views show the same person at the same time."
-        raise GhptDataError(where, "key points", f"no frame has {_LEAST_JOINTS} joints in two views", mend)
-    rows = usable[np.unique(np.linspace(0, len(usable) - 1, min(frames, len(usable))).round().astype(int))]
+        raise GhptDataError(
+            where, "key points", f"no frame has {_LEAST_JOINTS} joints in two views", mend
+        )
+    rows = usable[
+        np.unique(np.linspace(0, len(usable) - 1, min(frames, len(usable))).round().astype(int))
+    ]
     reach = min(reach, len(usable) // 4)
     seen = seen & np.isfinite(pixels).all(-1)
     order = (2, 0, 1, 3)
 
-    def around(moments: Float[np.ndarray, " F"], views: int | slice) -> tuple[np.ndarray, np.ndarray]:
+    def around(
+        moments: Float[np.ndarray, " F"], views: int | slice
+    ) -> tuple[np.ndarray, np.ndarray]:
         """What is nearest to the moments (numbers of frames) and their neighbours: [S, F, ...]."""
         wanted = moments[None] + np.arange(-reach, reach + 1)[:, None]
         index = np.searchsorted(frame, np.rint(wanted)).clip(0, len(frame) - 1)
@@ -115,8 +143,9 @@ def choose(
 def moment(
     frame: Int[np.ndarray, " T"], rate: float, shift: int
 ) -> tuple[Int[np.ndarray, " T"], Bool[np.ndarray, " T"]]:
-    """The rows of a view at the others' frames, and where it has one: for a view whose numbers count ``rate`` times as
-    fast and are ``shift`` later."""
+    """The rows of a view at the others' frames, and where it has one: for a view whose numbers
+    count ``rate`` times as fast and are ``shift`` later.
+    """
     wanted = frame[0] + rate * (frame - frame[0]) + shift
     rows = np.searchsorted(frame, np.rint(wanted)).clip(0, len(frame) - 1)
     return rows, np.abs(frame[rows] - wanted) <= _NEAR

@@ -1,4 +1,6 @@
-"""The doctor: tries each mistake undone, keeps what clearly brings the views together, and looks again."""
+"""The doctor: tries each mistake undone, keeps what clearly brings the views together, and looks
+again.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +20,16 @@ from ghpt.calibration.check.agreement import (
     pair_errors,
     triangulated,
 )
-from ghpt.calibration.check.candidates import RATES, UNITS, Candidate, at_rate, exchanged, of_file, of_view, shifted
+from ghpt.calibration.check.candidates import (
+    RATES,
+    UNITS,
+    Candidate,
+    at_rate,
+    exchanged,
+    of_file,
+    of_view,
+    shifted,
+)
 from ghpt.calibration.check.evidence import Evidence
 from ghpt.calibration.check.resection import resect
 from ghpt.calibration.check.setup import Look, Setup
@@ -34,7 +45,9 @@ _FITTED_LENS = 0.85
 """A lens that was fitted must explain so much more than none."""
 
 _ONE_FRAME = 0.85
-"""A shift by one frame must explain so much more than a longer one: cameras without a trigger are half a frame off."""
+"""A shift by one frame must explain so much more than a longer one: cameras without a trigger are
+half a frame off.
+"""
 
 
 @dataclass(frozen=True)
@@ -75,12 +88,13 @@ class Checkup:
 class Doctor:
     """Settings of the examination; errors are held-out medians in sizes of the person in the image.
 
-    ``level``: largest error of a view that agrees. ``discrete``, ``shifted``, ``lens``, ``lenses``, ``fitted``: what
-    the undoing of a mistake must leave at most of the error of the views it is about: of one of few possibilities, a
-    shift in time, one camera's lens, all lenses, and a camera's place. ``least``: and by how much it must lessen it.
-    ``astray``: a view that stays worse than this is said to be off. ``rated``: other frame
-    rates are tried for a view that is worse. ``pairs``: most pairs of views tried. ``rounds``:
-    most mistakes in one recording. ``consensus``: what the person is measured with.
+    ``level``: largest error of a view that agrees. ``discrete``, ``shifted``, ``lens``, ``lenses``,
+    ``fitted``: what the undoing of a mistake must leave at most of the error of the views it is
+    about: of one of few possibilities, a shift in time, one camera's lens, all lenses, and a
+    camera's place. ``least``: and by how much it must lessen it. ``astray``: a view that stays
+    worse than this is said to be off. ``rated``: other frame rates are tried for a view that is
+    worse. ``pairs``: most pairs of views tried. ``rounds``: most mistakes in one recording.
+    ``consensus``: what the person is measured with.
     """
 
     frames: int
@@ -101,7 +115,12 @@ class Doctor:
 
     def __post_init__(self) -> None:
         for name in ("discrete", "shifted", "lens", "lenses", "fitted"):
-            check(0 < getattr(self, name) < 1, name, f"is {getattr(self, name)}", "It must lie between 0 and 1.")
+            check(
+                0 < getattr(self, name) < 1,
+                name,
+                f"is {getattr(self, name)}",
+                "It must lie between 0 and 1.",
+            )
         for name in ("frames", "level", "astray", "pairs", "rounds"):
             check(getattr(self, name) > 0, name, f"is {getattr(self, name)}", "It must be > 0.")
         check(self.shift >= 0, "shift", f"is {self.shift}", "It must not be negative.")
@@ -118,7 +137,8 @@ class Doctor:
                 break
             candidate, after = chosen
             findings = [*findings, self._finding(look, setup, candidate, now, after)]
-            setup, now = candidate.setup, after
+            setup = candidate.setup
+            now = after
         findings += self._left(look, setup, now)
         height = self._stature(look, setup, now)
         setup, height, told = self._told(setup, height)
@@ -132,30 +152,39 @@ class Doctor:
     def _best(self, look: Look, setup: Setup, now: Agreement) -> tuple[Candidate, Agreement] | None:
         """The mistake whose undoing gains most, among those that pass."""
         tried = sorted(self._promising(look, setup, now), key=lambda pair: -pair[0])
-        best, most = None, 0.0
+        best = None
+        most = 0.0
         for _, candidate in tried[:8]:
             after = self._agreement(look, candidate.setup)
             old, new = self._contrast(look, setup, candidate, now, after)
             gain = max(now.cost - after.cost, self._gain(candidate, old, new, len(setup)))
-            gain *= (self.fitted if candidate.fitted else 1.0) ** (1 if candidate.views else 2)  # one lens before all
+            gain *= (self.fitted if candidate.fitted else 1.0) ** (
+                1 if candidate.views else 2
+            )  # one lens before all
             if self._passes(candidate, old, new) and after.cost <= 1.02 * now.cost and gain > most:
-                best, most = (candidate, after), gain
+                best = (candidate, after)
+                most = gain
         return best
 
     def _contrast(
         self, look: Look, setup: Setup, candidate: Candidate, now: Agreement, after: Agreement
     ) -> tuple[float, float]:
-        """Error of the views that a candidate is about before and after, over the quarter of their key points that it
-        moves most: elsewhere a shift or a lens shows nothing but the detector's noise."""
-        pairs = [self._of_moved(look, setup, candidate.setup, v, now, after)
-                 for v in candidate.views or range(len(setup))]  # fmt: skip
+        """Error of the views that a candidate is about before and after, over the quarter of their
+        key points that it moves most: elsewhere a shift or a lens shows nothing but the detector's
+        noise.
+        """
+        pairs = [
+            self._of_moved(look, setup, candidate.setup, v, now, after)
+            for v in candidate.views or range(len(setup))
+        ]
         old, new = torch.tensor(pairs, dtype=torch.float64).mean(0).tolist()
         return old, new
 
     def _of_moved(
         self, look: Look, setup: Setup, other: Setup, view: int, now: Agreement, after: Agreement
     ) -> tuple[float, float]:
-        old, new = look.view(setup, view), look.view(other, view)
+        old = look.view(setup, view)
+        new = look.view(other, view)
         error = errors(old, setup.R[view], setup.t[view], now.points[view], now.known[view])
         tried = errors(new, other.R[view], other.t[view], after.points[view], after.known[view])
         distance = (new.xy - old.xy).norm(dim=-1) / old.size[:, None].clamp(min=1e-12)
@@ -163,7 +192,9 @@ class Doctor:
         if int(both.sum()) < _FEW:  # nothing was triangulated before: there is no common ground
             return float(median(error)), float(median(tried))
         both &= distance >= distance[both].quantile(0.75)
-        return float(median(torch.where(both, error, torch.nan))), float(median(torch.where(both, tried, torch.nan)))
+        return float(median(torch.where(both, error, torch.nan))), float(
+            median(torch.where(both, tried, torch.nan))
+        )
 
     def _passes(self, candidate: Candidate, old: float, new: float) -> bool:
         return new <= self._ratio(candidate) * old and new <= old - self.least
@@ -172,7 +203,9 @@ class Doctor:
         if candidate.code == "out_of_sync":
             return self.shifted * (_ONE_FRAME if abs(candidate.value) == 1 else 1.0)
         if candidate.code in ("already_undistorted", "lens"):
-            return (self.lens if candidate.views else self.lenses) * (_FITTED_LENS if candidate.fitted else 1.0)
+            return (self.lens if candidate.views else self.lenses) * (
+                _FITTED_LENS if candidate.fitted else 1.0
+            )
         return self.fitted if candidate.fitted else self.discrete
 
     @staticmethod
@@ -190,7 +223,9 @@ class Doctor:
         pairs = all_pairs(len(setup), self.pairs)
 
         def cost(one: Setup) -> float:
-            return float(pair_errors(look.all(one), one, pairs, step).clamp(max=LARGEST).mean(-1).amin())
+            return float(
+                pair_errors(look.all(one), one, pairs, step).clamp(max=LARGEST).mean(-1).amin()
+            )
 
         as_is = cost(setup)
         found = [(as_is - cost(candidate.setup), candidate) for candidate in of_file(setup)]
@@ -234,8 +269,10 @@ class Doctor:
         R, t = found
         turn = float(rotation_deg(R, setup.R[view]))
         way = float((R.mT @ t - setup.R[view].mT @ setup.t[view]).norm())
-        text = (f"{{camera}} is not where the file has it: its key points fit a camera turned by {turn:.1f}° and "
-                f"moved by {way:.0f} mm; calibrate it again")  # fmt: skip
+        text = (
+            f"{{camera}} is not where the file has it: its key points fit a camera turned by {turn:.1f}° and "
+            f"moved by {way:.0f} mm; calibrate it again"
+        )
         return [Candidate("moved", (view,), text, setup.changed(view, R=R, t=t), turn, True)]
 
     def _exchanges(self, look: Look, setup: Setup, now: Agreement) -> list[tuple[float, Candidate]]:
@@ -251,32 +288,60 @@ class Doctor:
 
     def _against(self, look: Look, setup: Setup, now: Agreement, view: int) -> float:
         rays = look.view(setup, view)
-        return float(median(errors(rays, setup.R[view], setup.t[view], now.points[view], now.known[view])))
+        return float(
+            median(errors(rays, setup.R[view], setup.t[view], now.points[view], now.known[view]))
+        )
 
-    def _finding(self, look: Look, setup: Setup, candidate: Candidate, now: Agreement, after: Agreement) -> Finding:
+    def _finding(
+        self, look: Look, setup: Setup, candidate: Candidate, now: Agreement, after: Agreement
+    ) -> Finding:
         names = [look.evidence.names[view] for view in candidate.views]
         about = list(candidate.views) or slice(None)
         before = float(self._pixels(look, setup, now.error)[about].mean())
         then = float(self._pixels(look, candidate.setup, after.error)[about].mean())
-        text = candidate.text.format(camera=names[0] if names else "", other=names[-1] if names else "")
+        text = candidate.text.format(
+            camera=names[0] if names else "", other=names[-1] if names else ""
+        )
         return Finding(candidate.code, tuple(names), text, candidate.value, before, then, True)
 
     def _left(self, look: Look, setup: Setup, now: Agreement) -> list[Finding]:
         """Views that nothing that was tried brings to the others."""
-        names, pixels = look.evidence.names, self._pixels(look, setup, now.error)
+        names = look.evidence.names
+        pixels = self._pixels(look, setup, now.error)
         off = now.error > self.astray
         if off.all():
             text = "no two views agree, and no mistake that is known explains it; calibrate again: python calibrate.py"
-            return [Finding("nothing_agrees", (), text, 0.0, float(pixels.mean()), float(pixels.mean()), False)]
+            return [
+                Finding(
+                    "nothing_agrees",
+                    (),
+                    text,
+                    0.0,
+                    float(pixels.mean()),
+                    float(pixels.mean()),
+                    False,
+                )
+            ]
         found = []
         for view in torch.nonzero(off)[:, 0].tolist():
             text = f"{names[view]} does not agree with the others, and no mistake that is known explains it"
-            found.append(Finding("off", (names[view],), text, float(now.error[view]), float(pixels[view]),
-                                 float(pixels[view]), False))  # fmt: skip
+            found.append(
+                Finding(
+                    "off",
+                    (names[view],),
+                    text,
+                    float(now.error[view]),
+                    float(pixels[view]),
+                    float(pixels[view]),
+                    False,
+                )
+            )
         return found
 
     def _stature(self, look: Look, setup: Setup, now: Agreement) -> float:
-        """Of the person that all views together show (mm), as every command measures it; 0 where no views agree."""
+        """Of the person that all views together show (mm), as every command measures it; 0 where no
+        views agree.
+        """
         if not bool((now.error < self.level).any()):
             return 0.0
         points, known = triangulated(look.all(setup), setup, now.core[None], self.consensus)
@@ -284,7 +349,9 @@ class Doctor:
 
     @staticmethod
     def _told(setup: Setup, height: float) -> tuple[Setup, float, float | None]:
-        """The setup and the person in mm, and the unit that the person tells where the file does not say it."""
+        """The setup and the person in mm, and the unit that the person tells where the file does
+        not say it.
+        """
         unit = unit_of(height / setup.unit_mm) if height and setup.unit_mm is not None else None
         if unit is None:
             return setup, height, None
@@ -297,8 +364,10 @@ class Doctor:
             return setup, [], height
         for factor, words in UNITS.items():
             if low <= factor * height <= high:
-                text = (f"the person measures {height:.3g} mm in the cameras' world: translations are {words}; "
-                        f"multiply them by {factor:g}")  # fmt: skip
+                text = (
+                    f"the person measures {height:.3g} mm in the cameras' world: translations are {words}; "
+                    f"multiply them by {factor:g}"
+                )
                 found = Finding("unit", (), text, factor, 0.0, 0.0, True)
                 return replace(setup, t=factor * setup.t), [found], factor * height
         text = f"the person measures {height:.3g} mm in the cameras' world; check the length that gave the scale"

@@ -24,8 +24,10 @@ MENDED = ("cameras.toml", "keypoints.npz")
 def write_mended(
     output: Path, cameras: CameraFile, checkup: Checkup, points: KeyPoints | None, at: Sequence[int]
 ) -> None:
-    """``cameras.toml``; and ``keypoints.npz``, the 17 joints, where a view was shifted, thinned to the others'
-    frames, mirrored or its sides exchanged. Exchanged views are mended by their cameras' names alone."""
+    """``cameras.toml``; and ``keypoints.npz``, the 17 joints, where a view was shifted, thinned to
+    the others' frames, mirrored or its sides exchanged. Exchanged views are mended by their
+    cameras' names alone.
+    """
     setup = checkup.setup
     names = tuple(cameras.names[source] for source in setup.source)
     size = (2 * cameras.K[:, :2, 2] + 1).round().long() if cameras.size is None else cameras.size
@@ -41,8 +43,12 @@ def _changes_points(setup: Setup) -> bool:
     return rates or any(setup.shift) or any(setup.mirrored) or any(setup.sides)
 
 
-def mended_points(points: KeyPoints, at: Sequence[int], cameras: CameraFile, checkup: Checkup) -> KeyPoints:
-    """The key points as the mended cameras are to be shown them, in the order and by the names of these."""
+def mended_points(
+    points: KeyPoints, at: Sequence[int], cameras: CameraFile, checkup: Checkup
+) -> KeyPoints:
+    """The key points as the mended cameras are to be shown them, in the order and by the names of
+    these.
+    """
     setup = checkup.setup
     at = list(at)
     arrays = points.key_points[:, at], points.confidence[:, at], points.seen[:, at]
@@ -58,5 +64,14 @@ def mended_points(points: KeyPoints, at: Sequence[int], cameras: CameraFile, che
             pixels[:, view, :, 0] = setup.width[view] - 1 - pixels[:, view, :, 0]
     names = tuple(cameras.names[source] for source in setup.source)
     several = tuple(points.several[at[source]] for source in setup.source)
-    return KeyPoints(points.path, names, JOINTS, points.frame, pixels.astype(np.float64), sure.astype(np.float64),
-                     seen, points.rate_hz, several)  # fmt: skip
+    return KeyPoints(
+        points.path,
+        names,
+        JOINTS,
+        points.frame,
+        pixels.astype(np.float64),
+        sure.astype(np.float64),
+        seen,
+        points.rate_hz,
+        several,
+    )

@@ -60,13 +60,23 @@ class Setup:
 
 def as_filed(cameras: CameraFile) -> Setup:
     """What the files say."""
-    rig, views = cameras.cameras, len(cameras)
+    rig = cameras.cameras
+    views = len(cameras)
     width = 2 * cameras.K[:, 0, 2] + 1 if cameras.size is None else cameras.size[:, 0].double()
     off = (False,) * views
     return Setup(
-        cameras.K, cameras.distortion, rig.R, rig.t, tuple(range(views)), (0,) * views, off, off,
-        tuple(width.tolist()), (1.0,) * views, None if cameras.unit_known else cameras.unit_mm,
-    )  # fmt: skip
+        cameras.K,
+        cameras.distortion,
+        rig.R,
+        rig.t,
+        tuple(range(views)),
+        (0,) * views,
+        off,
+        off,
+        tuple(width.tolist()),
+        (1.0,) * views,
+        None if cameras.unit_known else cameras.unit_mm,
+    )
 
 
 @dataclass(frozen=True)
@@ -107,7 +117,9 @@ class Look:
 
     def _one(self, setup: Setup, view: int, shift: int) -> Rays:
         if abs(shift) > self.evidence.reach:
-            raise ValueError(f"a shift of {shift} frames is beyond the evidence's {self.evidence.reach}")
+            raise ValueError(
+                f"a shift of {shift} frames is beyond the evidence's {self.evidence.reach}"
+            )
         key = self._key(setup, view, shift)
         if key not in self._kept:
             pixels, seen = self._pixels(setup, view, self.evidence.reach + shift)
@@ -120,20 +132,26 @@ class Look:
         return (*how, *setup.K[view].flatten().tolist(), *setup.lens[view].tolist())
 
     def _pixels(self, setup: Setup, view: int, at: int | slice) -> tuple[Tensor, Tensor]:
-        source, evidence = setup.source[view], self.evidence
+        source = setup.source[view]
+        evidence = self.evidence
         if setup.rate[view] == 1 or evidence.at_rate is None:
-            pixels, seen = evidence.pixels[source][at], evidence.seen[source][at]
+            pixels = evidence.pixels[source][at]
+            seen = evidence.seen[source][at]
         else:
             pixels, seen = (values[at] for values in evidence.at_rate(source, setup.rate[view]))
         if setup.mirrored[view]:
             pixels = torch.stack((setup.width[view] - 1 - pixels[..., 0], pixels[..., 1]), dim=-1)
         if setup.sides[view]:
-            pixels, seen = pixels[..., list(MIRROR), :], seen[..., list(MIRROR)]
+            pixels = pixels[..., list(MIRROR), :]
+            seen = seen[..., list(MIRROR)]
         return pixels, seen
 
 
 def rays(
-    pixels: Float[Tensor, "F J 2"], seen: Bool[Tensor, "F J"], K: Float[Tensor, "3 3"], lens: Float[Tensor, " 5"]
+    pixels: Float[Tensor, "F J 2"],
+    seen: Bool[Tensor, "F J"],
+    K: Float[Tensor, "3 3"],
+    lens: Float[Tensor, " 5"],
 ) -> Rays:
     """Pixels out of the lens; those that no ray reaches are not seen."""
     straight, seen = ideal(pixels, seen, K, lens)
@@ -143,7 +161,10 @@ def rays(
 
 
 def ideal(
-    pixels: Float[Tensor, "*B J 2"], seen: Bool[Tensor, "*B J"], K: Float[Tensor, "3 3"], lens: Float[Tensor, " 5"]
+    pixels: Float[Tensor, "*B J 2"],
+    seen: Bool[Tensor, "*B J"],
+    K: Float[Tensor, "3 3"],
+    lens: Float[Tensor, " 5"],
 ) -> tuple[Float[Tensor, "*B J 2"], Bool[Tensor, "*B J"]]:
     """Pinhole pixels of pixels seen through a lens, and which of them are seen and exist."""
     seen = seen & (pixels.abs() < _FAR).all(-1)
@@ -155,4 +176,6 @@ def ideal(
 
 
 def _stack(each: list[Rays]) -> Rays:
-    return Rays(*(torch.stack([getattr(one, name) for one in each]) for name in ("xy", "seen", "size")))
+    return Rays(
+        *(torch.stack([getattr(one, name) for one in each]) for name in ("xy", "seen", "size"))
+    )

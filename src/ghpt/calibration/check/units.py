@@ -22,38 +22,49 @@ _log = logging.getLogger(__name__)
 
 
 def unit_of(height: float) -> float | None:
-    """The unit (mm) in which a stature is a person's; None where there is none. It is never more than one: human
-    statures span less than a factor of ten."""
+    """The unit (mm) in which a stature is a person's; None where there is none. It is never more
+    than one: human statures span less than a factor of ten.
+    """
     fits = (mm for mm in UNITS_MM if HUMAN[0] <= mm * height <= HUMAN[1])
     return next(fits, None)
 
 
 def unit_for(height: float) -> float:
-    """The unit (mm) to suggest for a person of this height in it: one that rulers have, or that of an adult."""
+    """The unit (mm) to suggest for a person of this height in it: one that rulers have, or that of
+    an adult.
+    """
     rulers = (*UNITS_MM, 100.0, 25.4, 304.8)
     fits = (mm for mm in rulers if STATURES[0] <= mm * height <= STATURES[1])
     return next(fits, float(f"{_ADULT / height:.4g}"))
 
 
-def decide_unit(cameras: CameraFile, batch: KeyPointBatch, estimator: Baseline, ask: bool) -> CameraFile:
-    """The cameras in mm, by the size of the person whom they show in these frames; as they are where the file says its
-    unit, and where the views do not agree on a person, which is another mistake.
+def decide_unit(
+    cameras: CameraFile, batch: KeyPointBatch, estimator: Baseline, ask: bool
+) -> CameraFile:
+    """The cameras in mm, by the size of the person whom they show in these frames; as they are
+    where the file says its unit, and where the views do not agree on a person, which is another
+    mistake.
 
     Raises GhptDataError where no limb is seen or no unit fits, unless ``ask`` is false.
     """
     if cameras.unit_known or cameras.t is None:
         return cameras
     found = estimator.triangulate(batch)
-    placed, explained = found.placed, _EXPLAINS.explained(batch, found.points, found.placed)
+    placed = found.placed
+    explained = _EXPLAINS.explained(batch, found.points, found.placed)
     if float(explained.sum()) < _AGREE * float(placed.sum()):
         return cameras
     height = float(stature(found.points, explained)) / cameras.unit_mm
     unit = unit_of(height)
     if unit is not None:
-        where, words, metres = cameras.path, UNITS_MM[unit], height * unit / 1000
+        where = cameras.path
+        words = UNITS_MM[unit]
+        metres = height * unit / 1000
         text = f"the file does not say its unit: {words}, by the person, who then measures {metres:.2f} m"
         _log.info("%s: %s (unit_mm=%g).", where, text, unit)
-        return replace(cameras, t=cameras.t * (unit / cameras.unit_mm), unit_known=True, unit_mm=unit)
+        return replace(
+            cameras, t=cameras.t * (unit / cameras.unit_mm), unit_known=True, unit_mm=unit
+        )
     if not ask:
         return cameras
     problem = "the file does not say its unit of length, and the person's size, of whom no limb is seen, does not tell"

@@ -20,12 +20,19 @@ def check_cameras(frames: Frames, doctor: Doctor) -> Checkup | None:
     """What the camera check finds on a bounded number of frames; None where no frame shows enough."""
     if frames.detected is None:
         return None
-    rows, file = _windows(len(frames)), frames.detected.cameras
+    rows = _windows(len(frames))
+    file = frames.detected.cameras
     pixels, _, seen = frames.detected.read(rows)
     pixels = np.asarray(pixels, np.float64)
     try:
         evidence = choose(
-            file.names, pixels, np.array(seen), frames.frame[rows], doctor.frames, doctor.shift, frames.source
+            file.names,
+            pixels,
+            np.array(seen),
+            frames.frame[rows],
+            doctor.frames,
+            doctor.shift,
+            frames.source,
         )
     except GhptDataError:  # no frame has enough joints in two views: nothing can be told
         return None

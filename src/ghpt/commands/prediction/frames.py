@@ -29,9 +29,9 @@ from ghpt.skeleton import JOINTS
 _NEAR = 1e5
 """Distance (mm, along an axis) from the world's zero up to which a rig stays where it is.
 
-float32, in which hypotheses are scored and estimators compared, has steps of 0.008 mm there; farther
-away they pass 0.01 mm, and reach half a metre in national grids (5,000 km). Nearer rigs are left alone
-because their scores would change in the last digit, for nothing."""
+float32, in which hypotheses are scored and estimators compared, has steps of 0.008 mm there;
+farther away they pass 0.01 mm, and reach half a metre in national grids (5,000 km). Nearer rigs are
+left alone because their scores would change in the last digit, for nothing."""
 _WHOLE = 1000.0
 """The origin of a rig farther away has whole metres, so that people can read it and add it."""
 MEASURED = 64
@@ -94,13 +94,18 @@ class Frames:
         A frame's ``sample`` is its own number, so its random draws are the same in any batch.
         """
         key_points, confidence, seen = (torch.from_numpy(values) for values in self.read(rows))
-        count, rig = len(rows), self.cameras.relative_to(self.origin)
+        count = len(rows)
+        rig = self.cameras.relative_to(self.origin)
         return KeyPointBatch(
-            sample=torch.from_numpy(self.frame[rows]), recording=torch.zeros(count, dtype=torch.int64),
+            sample=torch.from_numpy(self.frame[rows]),
+            recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
-            key_points=key_points, confidence=confidence, seen=seen,
-            truth=torch.zeros(count, len(JOINTS), 3), truth_seen=torch.zeros(count, len(JOINTS), dtype=torch.bool),
-        )  # fmt: skip
+            key_points=key_points,
+            confidence=confidence,
+            seen=seen,
+            truth=torch.zeros(count, len(JOINTS), 3),
+            truth_seen=torch.zeros(count, len(JOINTS), dtype=torch.bool),
+        )
 
     def spread(self, most: int) -> Int[np.ndarray, " N"]:
         """At most so many rows, evenly spread."""
@@ -119,7 +124,9 @@ class Frames:
 
 
 def frames_of_views(views: Views, source: str, title: str) -> Frames:
-    """Of key points in memory. Raises GhptDataError for less than two views, and for cameras without extrinsics."""
+    """Of key points in memory. Raises GhptDataError for less than two views, and for cameras
+    without extrinsics.
+    """
 
     def read(rows: Int[np.ndarray, " N"]) -> Seen:
         return views.key_points[rows], views.confidence[rows], views.seen[rows]
@@ -128,24 +135,36 @@ def frames_of_views(views: Views, source: str, title: str) -> Frames:
     cameras = views.cameras
     rig = calibrated(source, cameras)
     detected = Detected(replace(cameras, distortion=torch.zeros_like(cameras.distortion)), read)
-    return Frames(title, source, cameras.names, rig, views.frame.astype(np.int64), rate, read, detected)
+    return Frames(
+        title, source, cameras.names, rig, views.frame.astype(np.int64), rate, read, detected
+    )
 
 
 def in_unit(frames: Frames, estimator: Baseline) -> Frames:
-    """With cameras in mm where their file does not say its unit (``ghpt.calibration.check.units.decide_unit``)."""
+    """With cameras in mm where their file does not say its unit
+    (``ghpt.calibration.check.units.decide_unit``).
+    """
     if frames.detected is None or frames.detected.cameras.unit_known:
         return frames
-    file = decide_unit(frames.detected.cameras, frames.batch(frames.spread(MEASURED)), estimator, ask=True)
+    file = decide_unit(
+        frames.detected.cameras, frames.batch(frames.spread(MEASURED)), estimator, ask=True
+    )
     return replace(frames, cameras=file.cameras, detected=replace(frames.detected, cameras=file))
 
 
 def calibrated(where: str, cameras: CameraFile) -> Cameras:
-    """The cameras that the views have. Raises GhptDataError unless they are two or more with extrinsics."""
+    """The cameras that the views have. Raises GhptDataError unless they are two or more with
+    extrinsics.
+    """
     if len(cameras) < 2:
         mend = "A place in space takes two views or more of the same moment."
-        raise GhptDataError(where, "views", f"there is only {', '.join(cameras.names) or 'none'}", mend)
+        raise GhptDataError(
+            where, "views", f"there is only {', '.join(cameras.names) or 'none'}", mend
+        )
     if cameras.cameras is None:
-        raise GhptDataError(cameras.path, "rotation, translation", "not all cameras have extrinsics", _MEND)
+        raise GhptDataError(
+            cameras.path, "rotation, translation", "not all cameras have extrinsics", _MEND
+        )
     return cameras.cameras
 
 

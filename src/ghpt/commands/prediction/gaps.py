@@ -1,4 +1,6 @@
-"""Filling and smoothing, on request alone, and marked: nothing is invented outside of what was observed."""
+"""Filling and smoothing, on request alone, and marked: nothing is invented outside of what was
+observed.
+"""
 
 from __future__ import annotations
 
@@ -30,9 +32,10 @@ Chunks = Callable[[], Iterator[Reconstruction]]
 class Gaps:
     """What is done to a joint's path over the frames.
 
-    ``longest``: gaps of at most so many frames are interpolated between the observed frames on both sides (None: none);
-    ``interpolation``: ``pchip`` or ``linear``; ``cut_off_hz``: of a zero-phase Butterworth low-pass filter of fourth
-    order over every run of frames with a position (None: no filter), which takes ``rate_hz``.
+    ``longest``: gaps of at most so many frames are interpolated between the observed frames on both
+    sides (None: none); ``interpolation``: ``pchip`` or ``linear``; ``cut_off_hz``: of a zero-phase
+    Butterworth low-pass filter of fourth order over every run of frames with a position (None: no
+    filter), which takes ``rate_hz``.
     """
 
     longest: int | None
@@ -42,7 +45,12 @@ class Gaps:
 
     def __post_init__(self) -> None:
         known = ("pchip", "linear")
-        check(self.interpolation in known, "interpolation", f"is {self.interpolation!r}", f"Existing: {known}.")
+        check(
+            self.interpolation in known,
+            "interpolation",
+            f"is {self.interpolation!r}",
+            f"Existing: {known}.",
+        )
         if self.cut_off_hz is None:
             return
         rate = _known("smooth", self.rate_hz, "Give rate_hz=60, say.")
@@ -54,9 +62,14 @@ class Gaps:
         return self.longest is None and self.cut_off_hz is None
 
     def __call__(
-        self, frame: Int[np.ndarray, " T"], points: Float[np.ndarray, "T 3"], state: Int[np.ndarray, " T"]
+        self,
+        frame: Int[np.ndarray, " T"],
+        points: Float[np.ndarray, "T 3"],
+        state: Int[np.ndarray, " T"],
     ) -> tuple[Float[np.ndarray, "T 3"], Int[np.ndarray, " T"]]:
-        """One joint's path, filled and smoothed, with its states; frames without a position keep their reason."""
+        """One joint's path, filled and smoothed, with its states; frames without a position keep
+        their reason.
+        """
         step = frame_step(frame)
         if self.longest is not None:
             points, state = self._fill(frame, points, state, step)
@@ -71,22 +84,29 @@ class Gaps:
         after = np.searchsorted(known, np.arange(len(frame)))
         inside = (state != State.OBSERVED) & (after > 0) & (after < len(known))
         rows = np.flatnonzero(inside)
-        left, right = known[after[rows] - 1], known[after[rows]]
+        left = known[after[rows] - 1]
+        right = known[after[rows]]
         rows = rows[frame[right] - frame[left] <= (self.longest + 1) * step]
-        x, y = frame[known].astype(np.float64), points[known].astype(np.float64)
-        points, state = points.copy(), state.copy()
+        x = frame[known].astype(np.float64)
+        y = points[known].astype(np.float64)
+        points = points.copy()
+        state = state.copy()
         if len(rows):
             points[rows] = _interpolated(x, y, frame[rows].astype(np.float64), self.interpolation)
             state[rows] = State.FILLED
         return points, state
 
-    def _smooth(self, frame: np.ndarray, points: np.ndarray, placed: Bool[np.ndarray, " T"], step: int) -> np.ndarray:
+    def _smooth(
+        self, frame: np.ndarray, points: np.ndarray, placed: Bool[np.ndarray, " T"], step: int
+    ) -> np.ndarray:
         sections = butter(_ORDER, self.cut_off_hz, fs=self.rate_hz, output="sos")
         points = points.copy()
         for run in runs(frame, placed, step):
             if len(run) > 1:
                 padding = min(3 * (_ORDER + 1), len(run) - 1)
-                points[run] = sosfiltfilt(sections, points[run].astype(np.float64), axis=0, padlen=padding)
+                points[run] = sosfiltfilt(
+                    sections, points[run].astype(np.float64), axis=0, padlen=padding
+                )
         return points
 
 
@@ -119,7 +139,9 @@ def frame_step(frame: Int[np.ndarray, " T"]) -> int:
     return int(np.median(np.diff(frame))) if len(frame) > 1 else 1
 
 
-def runs(frame: Int[np.ndarray, " T"], placed: Bool[np.ndarray, " T"], step: int) -> list[Int[np.ndarray, " N"]]:
+def runs(
+    frame: Int[np.ndarray, " T"], placed: Bool[np.ndarray, " T"], step: int
+) -> list[Int[np.ndarray, " N"]]:
     """The rows of each unbroken run of placed frames; a frame number that is left out breaks it."""
     rows = np.flatnonzero(placed)
     broken = (np.diff(rows) > 1) | (np.diff(frame[rows]) > step)
@@ -134,7 +156,9 @@ def _interpolated(x: np.ndarray, y: np.ndarray, at: np.ndarray, kind: str) -> np
 
 @contextmanager
 def _scratch(folder: Path, dtype: str, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
-    """An array of zeros in a nameless file of ``folder``. Raises OSError if the disk lacks the space."""
+    """An array of zeros in a nameless file of ``folder``. Raises OSError if the disk lacks the
+    space.
+    """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     with tempfile.TemporaryFile(dir=folder) as handle:
         allocate(handle, size, folder)
@@ -145,22 +169,29 @@ def _scratch(folder: Path, dtype: str, shape: tuple[int, ...]) -> Iterator[np.nd
 def after(gaps: Gaps, shards: Shards, joints: int, folder: Path) -> Iterator[Chunks]:
     """The shards as they are to be written: as they are, or filled and smoothed.
 
-    Joint by joint, each over all frames, so that no border between chunks shows: memory holds one joint's path, the
-    others are in a nameless temporary file in ``folder``. Raises OSError if the disk lacks the space for it.
+    Joint by joint, each over all frames, so that no border between chunks shows: memory holds one
+    joint's path, the others are in a nameless temporary file in ``folder``. Raises OSError if the
+    disk lacks the space for it.
     """
     if gaps.nothing:
         yield shards.chunks
         return
     frames = shards.frames
-    paths, states = (joints, frames, 3), (joints, frames)
+    paths = (joints, frames, 3)
+    states = (joints, frames)
     with _scratch(folder, "<f8", paths) as points, _scratch(folder, "|i1", states) as state:
         frame = np.zeros(frames, np.int64)
         for shard, part in enumerate(shards.chunks()):
             rows = slice(shards.rows(shard).start, shards.rows(shard).stop)
             frame[rows] = part.frame.numpy()
-            points[:, rows], state[:, rows] = part.points.numpy().transpose(1, 0, 2), part.state.numpy().T
+            points[:, rows], state[:, rows] = (
+                part.points.numpy().transpose(1, 0, 2),
+                part.state.numpy().T,
+            )
         for joint in range(joints):
-            points[joint], state[joint] = gaps(frame, np.array(points[joint]), np.array(state[joint]))
+            points[joint], state[joint] = gaps(
+                frame, np.array(points[joint]), np.array(state[joint])
+            )
 
         def chunks() -> Iterator[Reconstruction]:
             for shard, part in enumerate(shards.chunks()):
@@ -169,6 +200,8 @@ def after(gaps: Gaps, shards: Shards, joints: int, folder: Path) -> Iterator[Chu
                     np.ascontiguousarray(points[:, rows].transpose(1, 0, 2)),
                     np.ascontiguousarray(state[:, rows].T),
                 )
-                yield replace(part, points=torch.from_numpy(changed[0]), state=torch.from_numpy(changed[1]))
+                yield replace(
+                    part, points=torch.from_numpy(changed[0]), state=torch.from_numpy(changed[1])
+                )
 
         yield chunks

@@ -19,17 +19,25 @@ Rows = list[list[str]]
 def summary_lines(numbers: Numbers) -> list[str]:
     """What one sentence each says of the recording as a whole."""
     share = numbers["share"]
-    missing = ", ".join(f"{100 * part:.1f} % {state.replace('_', ' ')}" for state, part in share.items()
-                        if part and state not in ("observed", "filled"))  # fmt: skip
+    missing = ", ".join(
+        f"{100 * part:.1f} % {state.replace('_', ' ')}"
+        for state, part in share.items()
+        if part and state not in ("observed", "filled")
+    )
     lines = [
         f"Estimator: {numbers['estimator_text']}.",
         f"{numbers['frames']} frames, {len(numbers['cameras'])} views: {100 * share['observed']:.1f} % of the joints "
-        f"observed" + (f", {100 * share['filled']:.1f} % filled" if share["filled"] else "")
+        f"observed"
+        + (f", {100 * share['filled']:.1f} % filled" if share["filled"] else "")
         + (f"; missing: {missing}." if missing else "."),
-    ]  # fmt: skip
+    ]
     swapped = {view: n for view, n in numbers["swapped"].items() if n}
     if swapped:
-        lines.append("Left and right exchanged in " + ", ".join(f"{n} frames of {v}" for v, n in swapped.items()) + ".")
+        lines.append(
+            "Left and right exchanged in "
+            + ", ".join(f"{n} frames of {v}" for v, n in swapped.items())
+            + "."
+        )
     if numbers["stature_mm"]:
         lines.append(f"The person measures {numbers['stature_mm'] / 1000:.2f} m.")
     if numbers["smooth_hz"]:
@@ -41,8 +49,10 @@ def error_rows(numbers: Numbers) -> tuple[list[str], Rows]:
     """For each view the reprojection and held-out errors of the estimator."""
     own = next(iter(numbers["evaluation"]["estimators"].values()))
     header = ["view", "reprojected px", "90 %", "left out px", "90 %"]
-    rows = [[view, *_pair(own["reprojection"]["views"][view]), *_pair(own["held_out"]["views"][view])]
-            for view in numbers["cameras"]]  # fmt: skip
+    rows = [
+        [view, *_pair(own["reprojection"]["views"][view]), *_pair(own["held_out"]["views"][view])]
+        for view in numbers["cameras"]
+    ]
     return header, [*rows, ["all", *_pair(own["reprojection"]), *_pair(own["held_out"])]]
 
 
@@ -51,8 +61,15 @@ def comparison_rows(numbers: Numbers) -> tuple[list[str], Rows]:
     header = ["estimator", "reproj. px", "90 %", "left out px", "90 %", "segm. %", "joints %"]
     rows = []
     for name, found in numbers["evaluation"]["estimators"].items():
-        rows.append([NAMES.get(name, name.replace("_", " ")), *_pair(found["reprojection"]), *_pair(found["held_out"]),
-                     number(found["segments"]["median"], 1, 100), number(found["placed"], 1, 100)])  # fmt: skip
+        rows.append(
+            [
+                NAMES.get(name, name.replace("_", " ")),
+                *_pair(found["reprojection"]),
+                *_pair(found["held_out"]),
+                number(found["segments"]["median"], 1, 100),
+                number(found["placed"], 1, 100),
+            ]
+        )
     return header, rows
 
 
@@ -82,11 +99,20 @@ def print_verdict(verdict: Numbers, console: Console | None = None) -> None:
 
 def prediction_report(numbers: Numbers) -> str:
     """The Markdown report."""
-    evaluation, origin = numbers["evaluation"], numbers["provenance"]
-    observed = [[name.replace("_", " "), number(share, 1, 100)] for name, share in numbers["observed"].items()]
+    evaluation = numbers["evaluation"]
+    origin = numbers["provenance"]
+    observed = [
+        [name.replace("_", " "), number(share, 1, 100)]
+        for name, share in numbers["observed"].items()
+    ]
     estimators = evaluation["estimators"]
-    segments = [[name.replace("_", " "), *(number(found["segments"]["each"][name], 1, 100)
-                                            for found in estimators.values())] for name in SEGMENTS]  # fmt: skip
+    segments = [
+        [
+            name.replace("_", " "),
+            *(number(found["segments"]["each"][name], 1, 100) for found in estimators.values()),
+        ]
+        for name in SEGMENTS
+    ]
     parts = [
         f"# Prediction of {escaped(numbers['data'])}",
         f"ghpt {origin['ghpt']}, commit `{origin['commit'] or NONE}`, seed {origin['seed']}: "
@@ -109,7 +135,7 @@ def prediction_report(numbers: Numbers) -> str:
         "## Segments",
         "Variation of their lengths over the frames, % (1.4826 x median deviation over median).",
         markdown(["segment", *(NAMES.get(n, n.replace("_", " ")) for n in estimators)], segments),
-    ]  # fmt: skip
+    ]
     return "\n\n".join(parts) + "\n"
 
 
@@ -117,9 +143,13 @@ def _verdict(verdict: Numbers) -> list[str]:
     """Paragraphs of the report."""
     parts = [f"**{verdict['level']}**"]
     for finding in verdict["findings"]:
-        against = f" ({finding['value']:.3g}, limit {finding['limit']:g})" if finding["limit"] else ""
-        parts.append(f"- {finding['level']}, `{finding['code']}`: {escaped(finding['text'])}{against}.\n"
-                     f"  Next: {code(finding['command'])}")  # fmt: skip
+        against = (
+            f" ({finding['value']:.3g}, limit {finding['limit']:g})" if finding["limit"] else ""
+        )
+        parts.append(
+            f"- {finding['level']}, `{finding['code']}`: {escaped(finding['text'])}{against}.\n"
+            f"  Next: {code(finding['command'])}"
+        )
     if verdict["undecidable"]:
         parts.append(f"Not decidable: {escaped('; '.join(verdict['undecidable']))}.")
     return parts

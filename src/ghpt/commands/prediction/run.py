@@ -28,8 +28,9 @@ _log = logging.getLogger(__name__)
 
 
 class ShardPrediction(L.LightningModule):
-    """Predicts the shards that are missing; each process takes its share of them. ``weights``: what moves to the
-    device with it."""
+    """Predicts the shards that are missing; each process takes its share of them. ``weights``: what
+    moves to the device with it.
+    """
 
     def __init__(
         self,
@@ -41,8 +42,12 @@ class ShardPrediction(L.LightningModule):
         bar: bool,
     ) -> None:
         super().__init__()
-        self.frames, self.predictor, self.weights = frames, predictor, weights
-        self.shards, self.size, self.bar = shards, batch, bar
+        self.frames = frames
+        self.predictor = predictor
+        self.weights = weights
+        self.shards = shards
+        self.size = batch
+        self.bar = bar
         self.pending = shards.missing()
         self.tick: Callable[[int], None] = lambda frames: None
         self.shown = ExitStack()
@@ -80,12 +85,23 @@ def predicted(
     folder: Path,
     key: str,
     settings: dict[str, Any],
-) -> Iterator[Shards | None]:  # fmt: skip
-    """Predict what is missing of a recording's shards and yield them; None in the processes beside the first."""
-    ours = {"logger": False, "enable_checkpointing": False, "enable_progress_bar": False, "default_root_dir": folder}
+) -> Iterator[Shards | None]:
+    """Predict what is missing of a recording's shards and yield them; None in the processes beside
+    the first.
+    """
+    ours = {
+        "logger": False,
+        "enable_checkpointing": False,
+        "enable_progress_bar": False,
+        "default_root_dir": folder,
+    }
     trainer = make_trainer(settings["trainer"], **ours)
-    shards = Shards(folder, key, len(frames), settings["shard_frames"], clean=trainer.is_global_zero)
-    module = ShardPrediction(frames, predictor, weights, shards, settings["batch"], settings["progress_bar"])
+    shards = Shards(
+        folder, key, len(frames), settings["shard_frames"], clean=trainer.is_global_zero
+    )
+    module = ShardPrediction(
+        frames, predictor, weights, shards, settings["batch"], settings["progress_bar"]
+    )
     with closing(shards), _stop_told(shards, trainer.is_global_zero):
         if module.pending:
             with module.shown, told(trainer):
@@ -104,7 +120,9 @@ def _stop_told(shards: Shards, first: bool) -> Iterator[None]:
         if first:
             shards.look()
             done = len(shards) - len(shards.missing())
-            _log.warning("Stopped. %d of %d shards are in %s.", done, len(shards), shown(shards.folder))
+            _log.warning(
+                "Stopped. %d of %d shards are in %s.", done, len(shards), shown(shards.folder)
+            )
             _log.warning("The same command goes on with them.")
         raise
 
@@ -115,14 +133,21 @@ def to_cpu(part: Reconstruction) -> Reconstruction:
 
 def joined(parts: list[Reconstruction]) -> Reconstruction:
     """Successive parts as one."""
-    values = {f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Reconstruction)}
+    values = {
+        f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Reconstruction)
+    }
     return Reconstruction(**values)
 
 
 @contextmanager
 def _bar(frames: int, visible: bool) -> Iterator[Callable[[int], None]]:
     """What is to be called with the number of frames done."""
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
     with Progress(*columns, console=Console(stderr=True), disable=not visible) as bar:
         task = bar.add_task("Frames", total=frames)
         yield lambda done: bar.advance(task, done)

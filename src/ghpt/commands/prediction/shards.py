@@ -1,4 +1,6 @@
-"""A long reconstruction in parts of so many frames, each whole or absent, whatever kills the writer."""
+"""A long reconstruction in parts of so many frames, each whole or absent, whatever kills the
+writer.
+"""
 
 from __future__ import annotations
 
@@ -26,9 +28,15 @@ from ghpt.reconstruction import Reconstruction
 FORMAT_VERSION = 2
 MANIFEST = "manifest.jsonl"
 _DTYPES = {
-    "frame": "<i8", "points": "<f8", "state": "|i1", "error": "<f4", "views": "|b1", "covariance": "<f4",
-    "score": "<f4", "swapped": "|b1",
-}  # fmt: skip
+    "frame": "<i8",
+    "points": "<f8",
+    "state": "|i1",
+    "error": "<f4",
+    "views": "|b1",
+    "covariance": "<f4",
+    "score": "<f4",
+    "swapped": "|b1",
+}
 _MEND = "Run the prediction again: what is damaged is made anew"
 _SHARD = re.compile(r"\d{6,}\.npz")
 _log = logging.getLogger(__name__)
@@ -37,15 +45,22 @@ _log = logging.getLogger(__name__)
 class Shards:
     """The shards of ``frames`` frames in a folder: ``size`` of them in each, the rest in the last.
 
-    The manifest's first line says what they are of (``key``); a line is appended for a shard after it is in place, with
-    its SHA-256. Opening keeps the shards that the manifest vouches for and removes all else; of another key it keeps
-    none. ``clean=False`` only looks: for the processes beside the one that opened it. Raises GhptDataError if another
-    process has it open for writing.
+    The manifest's first line says what they are of (``key``); a line is appended for a shard after
+    it is in place, with its SHA-256. Opening keeps the shards that the manifest vouches for and
+    removes all else; of another key it keeps none. ``clean=False`` only looks: for the processes
+    beside the one that opened it. Raises GhptDataError if another process has it open for writing.
     """
 
     def __init__(self, folder: Path, key: str, frames: int, size: int, clean: bool = True) -> None:
-        self.folder, self.frames, self.size = folder, frames, size
-        self._header = {"version": FORMAT_VERSION, "key": key, "frames": frames, "shard_frames": size}
+        self.folder = folder
+        self.frames = frames
+        self.size = size
+        self._header = {
+            "version": FORMAT_VERSION,
+            "key": key,
+            "frames": frames,
+            "shard_frames": size,
+        }
         self._lock: BaseFileLock | None = None
         if clean:
             folder.mkdir(parents=True, exist_ok=True)
@@ -72,7 +87,9 @@ class Shards:
     def look(self) -> None:
         """Take in what other processes have written."""
         there = self._manifest()
-        self.kept |= {s: entry for s, entry in there.items() if s not in self.kept and self._vouched(s, entry)}
+        self.kept |= {
+            s: entry for s, entry in there.items() if s not in self.kept and self._vouched(s, entry)
+        }
 
     def missing(self) -> list[int]:
         """The shards that are not there yet."""
@@ -88,7 +105,11 @@ class Shards:
         data = content.getbuffer()
         with atomic_write(self.path(shard)) as handle:
             handle.write(data)
-        self.kept[shard] = {"shard": shard, "bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+        self.kept[shard] = {
+            "shard": shard,
+            "bytes": len(data),
+            "sha256": hashlib.sha256(data).hexdigest(),
+        }
         with errors_name(self.folder / MANIFEST):
             self._list(_line(self.kept[shard]))
 
@@ -103,13 +124,18 @@ class Shards:
 
     def read(self, shard: int) -> Reconstruction:
         """A shard that is there. Raises GhptDataError if it is no longer what was written."""
-        path, count = self.path(shard), len(self.rows(shard))
+        path = self.path(shard)
+        count = len(self.rows(shard))
         try:
             members = members_of(path)
             values = {name: read_rows(path, members[name], 0, count) for name in _DTYPES}
-            return Reconstruction(**{name: torch.from_numpy(array) for name, array in values.items()})
+            return Reconstruction(
+                **{name: torch.from_numpy(array) for name, array in values.items()}
+            )
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
-            raise GhptDataError(path, "", f"is not the shard that was written ({error})", _MEND) from error
+            raise GhptDataError(
+                path, "", f"is not the shard that was written ({error})", _MEND
+            ) from error
 
     def chunks(self) -> Iterator[Reconstruction]:
         """All of them, in order."""
@@ -119,7 +145,9 @@ class Shards:
         return self.folder / f"{shard:06d}.npz"
 
     def _check_folder(self) -> None:
-        """Raise GhptDataError for shards that no manifest speaks of: another program may have made them."""
+        """Raise GhptDataError for shards that no manifest speaks of: another program may have made
+        them.
+        """
         if (self.folder / MANIFEST).exists():
             return
         for path in self.folder.iterdir():
@@ -137,7 +165,11 @@ class Shards:
         if not entries or entries[0] != self._header:
             _log.info("%s is of other key points, cameras or settings: starting anew.", self.folder)
             return {}
-        return {e["shard"]: e for e in entries if type(e.get("shard")) is int and 0 <= e["shard"] < len(self)}
+        return {
+            e["shard"]: e
+            for e in entries
+            if type(e.get("shard")) is int and 0 <= e["shard"] < len(self)
+        }
 
     def _vouched(self, shard: int, entry: dict[str, Any]) -> bool:
         path = self.path(shard)

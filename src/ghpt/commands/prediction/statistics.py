@@ -1,4 +1,6 @@
-"""What a reconstruction is worth, without a truth: coverage, reprojection, held-out views, constancy of lengths."""
+"""What a reconstruction is worth, without a truth: coverage, reprojection, held-out views,
+constancy of lengths.
+"""
 
 from __future__ import annotations
 
@@ -25,13 +27,18 @@ _LEAST = 20
 """Key points for a median that a verdict may rest on."""
 
 
-def counts(chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: tuple[str, ...], total: int) -> Numbers:
-    """Over all ``total`` frames: how many, what share of the joints is in each state, how many views were exchanged,
-    and the person's stature (mm; None where no limb is observed)."""
-    frames, states = 0, torch.zeros(len(joints), len(State), dtype=torch.int64)
+def counts(
+    chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: tuple[str, ...], total: int
+) -> Numbers:
+    """Over all ``total`` frames: how many, what share of the joints is in each state, how many
+    views were exchanged, and the person's stature (mm; None where no limb is observed).
+    """
+    frames = 0
+    states = torch.zeros(len(joints), len(State), dtype=torch.int64)
     swapped = torch.zeros(len(cameras), dtype=torch.int64)
     every = max(1, -(-total // MEASURED_FRAMES))
-    points, observed = [], []
+    points = []
+    observed = []
     for chunk in chunks:
         measured = slice(-frames % every, None, every)
         points.append(chunk.points[measured].double())
@@ -39,7 +46,10 @@ def counts(chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: t
         frames += len(chunk)
         states += torch.stack([(chunk.state == state).sum(0) for state in State], dim=1)
         swapped += chunk.swapped.sum(0)
-    share = {state.name.lower(): float(states[:, state].sum()) / max(frames * len(joints), 1) for state in State}
+    share = {
+        state.name.lower(): float(states[:, state].sum()) / max(frames * len(joints), 1)
+        for state in State
+    }
     each = (states[:, State.OBSERVED].double() / max(frames, 1)).tolist()
     return {
         "frames": frames,
@@ -52,34 +62,61 @@ def counts(chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: t
 
 @torch.no_grad()
 def evaluate(
-    frames: Frames, swaps: Swaps | None, estimates: Mapping[str, Estimate], most: int,
+    frames: Frames,
+    swaps: Swaps | None,
+    estimates: Mapping[str, Estimate],
+    most: int,
     size: int,
-) -> Numbers:  # fmt: skip
-    """For each estimator, on at most so many frames, evenly spread, and with ``swaps`` undone for all:
-    reprojection errors by view; errors in views that
-    were left out, on the joints that all of them estimate without that view; variation of the segments' lengths."""
+) -> Numbers:
+    """For each estimator, on at most so many frames, evenly spread, and with ``swaps`` undone for
+    all: reprojection errors by view; errors in views that were left out, on the joints that all of
+    them estimate without that view; variation of the segments' lengths.
+    """
     rows = frames.spread(most)
-    parts = [_undone(frames.batch(rows[start : start + size]), swaps) for start in range(0, len(rows), size)]
+    parts = [
+        _undone(frames.batch(rows[start : start + size]), swaps)
+        for start in range(0, len(rows), size)
+    ]
     own = {name: [estimate(part) for part in parts] for name, estimate in estimates.items()}
-    held = {name: [_held_out(part, estimate) for part in parts] for name, estimate in estimates.items()}
-    counted = torch.stack([torch.cat([there for _, there in found]) for found in held.values()]).all(0)
+    held = {
+        name: [_held_out(part, estimate) for part in parts] for name, estimate in estimates.items()
+    }
+    counted = torch.stack(
+        [torch.cat([there for _, there in found]) for found in held.values()]
+    ).all(0)
     seen = torch.cat([part.seen for part in parts])
     result: Numbers = {}
     for name in estimates:
         placed = torch.cat([found.estimated for found in own[name]])
-        error = torch.cat([_errors(part, found) for part, found in zip(parts, own[name], strict=True)])
+        error = torch.cat(
+            [_errors(part, found) for part, found in zip(parts, own[name], strict=True)]
+        )
         measured = seen & placed[:, None] & error.isfinite()
-        variation, known = segment_variation(torch.cat([found.points.double() for found in own[name]]), placed)
-        lengths = [v if k else None for v, k in zip(variation.tolist(), known.tolist(), strict=True)]
+        variation, known = segment_variation(
+            torch.cat([found.points.double() for found in own[name]]), placed
+        )
+        lengths = [
+            v if k else None for v, k in zip(variation.tolist(), known.tolist(), strict=True)
+        ]
         result[name] = {
             "reprojection": _by_view(error, measured, frames.camera_names),
-            "held_out": _by_view(torch.cat([e for e, _ in held[name]]), counted, frames.camera_names),
-            "segments": {"median": float(variation[known].median()) if known.any() else None,
-                         "each": dict(zip(SEGMENTS, lengths, strict=True))},
+            "held_out": _by_view(
+                torch.cat([e for e, _ in held[name]]), counted, frames.camera_names
+            ),
+            "segments": {
+                "median": float(variation[known].median()) if known.any() else None,
+                "each": dict(zip(SEGMENTS, lengths, strict=True)),
+            },
             "placed": float(placed.double().mean()),
-            "scales": _scales(parts, error, measured, [e for e, _ in held[name]], [c for _, c in held[name]],
-                              frames.camera_names),
-        }  # fmt: skip
+            "scales": _scales(
+                parts,
+                error,
+                measured,
+                [e for e, _ in held[name]],
+                [c for _, c in held[name]],
+                frames.camera_names,
+            ),
+        }
     return {"frames": len(rows), "estimators": result}
 
 
@@ -101,9 +138,14 @@ def _errors(batch: KeyPointBatch, found: PoseEstimate) -> Float[Tensor, "B V J"]
     return reprojection_error(batch.cameras, batch.key_points, found.points)
 
 
-def _held_out(batch: KeyPointBatch, estimate: Estimate) -> tuple[Float[Tensor, "B V J"], Bool[Tensor, "B V J"]]:
-    """For each view the distance of its key points from the joints that the others give, and where there is one."""
-    errors, counted = [], []
+def _held_out(
+    batch: KeyPointBatch, estimate: Estimate
+) -> tuple[Float[Tensor, "B V J"], Bool[Tensor, "B V J"]]:
+    """For each view the distance of its key points from the joints that the others give, and where
+    there is one.
+    """
+    errors = []
+    counted = []
     for view in range(batch.seen.shape[1]):
         seen = batch.seen.clone()
         seen[:, view] = False
@@ -115,13 +157,22 @@ def _held_out(batch: KeyPointBatch, estimate: Estimate) -> tuple[Float[Tensor, "
 
 
 def _scales(
-    parts: list[KeyPointBatch], error: Float[Tensor, "T V J"], measured: Bool[Tensor, "T V J"],
-    held: list[Tensor], counted: list[Tensor], names: tuple[str, ...],
-) -> Numbers:  # fmt: skip
-    """Median errors in left-out views, in sizes of the person in the image; where two views leave none, ``all`` is None
-    and those of the views are reprojection errors. None for fewer than ``_LEAST`` key points."""
-    size = torch.cat([person_size(part.key_points, part.seen) for part in parts])[..., None].double()
-    left_out, there = torch.cat(held), torch.cat(counted) & (size > 0)
+    parts: list[KeyPointBatch],
+    error: Float[Tensor, "T V J"],
+    measured: Bool[Tensor, "T V J"],
+    held: list[Tensor],
+    counted: list[Tensor],
+    names: tuple[str, ...],
+) -> Numbers:
+    """Median errors in left-out views, in sizes of the person in the image; where two views leave
+    none, ``all`` is None and those of the views are reprojection errors. None for fewer than
+    ``_LEAST`` key points.
+    """
+    size = torch.cat([person_size(part.key_points, part.seen) for part in parts])[
+        ..., None
+    ].double()
+    left_out = torch.cat(held)
+    there = torch.cat(counted) & (size > 0)
     some = int(there.sum()) >= _LEAST
     values, known = (left_out, there) if some else (error, measured & (size > 0))
     relative = values / size.clamp(min=1e-12)
@@ -133,7 +184,9 @@ def _scales(
     return {"all": middle(relative[known]) if some else None, "views": views}
 
 
-def _by_view(errors: Float[Tensor, "T V J"], counted: Bool[Tensor, "T V J"], names: tuple[str, ...]) -> Numbers:
+def _by_view(
+    errors: Float[Tensor, "T V J"], counted: Bool[Tensor, "T V J"], names: tuple[str, ...]
+) -> Numbers:
     views = {name: quantiles(errors[:, v][counted[:, v]]) for v, name in enumerate(names)}
     return quantiles(errors[counted]) | {"views": views}
 

@@ -1,4 +1,6 @@
-"""Our npz file of key points, where its arrays are stored without compression: read in parts, however long it is."""
+"""Our npz file of key points, where its arrays are stored without compression: read in parts,
+however long it is.
+"""
 
 from __future__ import annotations
 
@@ -22,9 +24,17 @@ from ghpt.data.people.views import look_through, matched
 from ghpt.errors import GhptDataError
 
 _CHECKED = 2000
-"""Frames, evenly spread, by which the skeleton is recognised and the views are checked against their cameras."""
+"""Frames, evenly spread, by which the skeleton is recognised and the views are checked against
+their cameras.
+"""
 _PART = 4096
-_FORMS = {"key_points": ("f", 4), "confidence": ("f", 3), "seen": ("b", 3), "frame": ("iu", 1), "rate_hz": ("fiu", 0)}
+_FORMS = {
+    "key_points": ("f", 4),
+    "confidence": ("f", 3),
+    "seen": ("b", 3),
+    "frame": ("iu", 1),
+    "rate_hz": ("fiu", 0),
+}
 
 
 @dataclass(frozen=True)
@@ -45,28 +55,49 @@ class StoredKeyPoints:
         if "seen" in self.members:
             seen &= self._read("seen", rows)
         sure = (
-            self._read("confidence", rows).astype(np.float64) if "confidence" in self.members else np.ones(seen.shape)
+            self._read("confidence", rows).astype(np.float64)
+            if "confidence" in self.members
+            else np.ones(seen.shape)
         )
         sure = np.where(seen, np.nan_to_num(sure).clip(0, 1), 0)
         values = np.where(seen[..., None], values, 0)
-        return KeyPoints(str(self.path), self.views, self.joints, self.frame[rows], values, sure, seen, self.rate_hz,
-                         (0,) * len(self.views))  # fmt: skip
+        return KeyPoints(
+            str(self.path),
+            self.views,
+            self.joints,
+            self.frame[rows],
+            values,
+            sure,
+            seen,
+            self.rate_hz,
+            (0,) * len(self.views),
+        )
 
     def _read(self, name: str, rows: Int[np.ndarray, " N"]) -> np.ndarray:
         member = self.members[name]
         broken = np.flatnonzero(np.diff(rows) != 1) + 1
-        found = [read_rows(self.path, member, int(run[0]), int(run[-1]) + 1) for run in np.split(rows, broken)]
+        found = [
+            read_rows(self.path, member, int(run[0]), int(run[-1]) + 1)
+            for run in np.split(rows, broken)
+        ]
         return np.concatenate(found)
 
 
-def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -> StoredKeyPoints | None:
-    """The file, or None if it is not one that can be read in parts: `read_key_points` then reads it, or says what is
-    wrong with it. Raises GhptDataError if what is in it does not fit together."""
+def open_stored(
+    path: str | Path, skeleton: str | None, rate_hz: float | None
+) -> StoredKeyPoints | None:
+    """The file, or None if it is not one that can be read in parts: `read_key_points` then reads
+    it, or says what is wrong with it. Raises GhptDataError if what is in it does not fit together.
+    """
     path = Path(path)
     try:
         members = members_of(path)
         views = text_table(path, members, "views")
-        texts = {name: text_table(path, members, name) for name in ("joints", "skeleton") if name in members}
+        texts = {
+            name: text_table(path, members, name)
+            for name in ("joints", "skeleton")
+            if name in members
+        }
     except (OSError, ValueError, zipfile.BadZipFile):
         return None
     if "key_points" not in members or any(
@@ -77,16 +108,26 @@ def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -
         return None
     count, *shape, two = members["key_points"].shape
     lengths = {"confidence": (count, *shape), "seen": (count, *shape), "frame": (count,)}
-    if two != 2 or not count or any(members[n].shape != s for n, s in lengths.items() if n in members):
+    if (
+        two != 2
+        or not count
+        or any(members[n].shape != s for n, s in lengths.items() if n in members)
+    ):
         return None
     check_view_count(path, shape[0])
-    frame = read_rows(path, members["frame"], 0, count).astype(np.int64) if "frame" in members else np.arange(count)
+    frame = (
+        read_rows(path, members["frame"], 0, count).astype(np.int64)
+        if "frame" in members
+        else np.arange(count)
+    )
     if rate_hz is None and "rate_hz" in members:
         member = members["rate_hz"]
         rate_hz = float(np.fromfile(path, member.dtype, 1, offset=member.offset)[0])
     rate_hz = None if rate_hz is None else frame_rate(path, rate_hz)
     stored = StoredKeyPoints(path, members, views, (), frame, rate_hz)
-    spread = stored.part(np.unique(np.linspace(0, count - 1, min(_CHECKED, count)).astype(np.int64)))
+    spread = stored.part(
+        np.unique(np.linspace(0, count - 1, min(_CHECKED, count)).astype(np.int64))
+    )
     joints = texts.get("joints", ()) if skeleton is None and "skeleton" not in texts else ()
     if not joints:
         flat = spread.key_points.reshape(-1, shape[1], 2), spread.seen.reshape(-1, shape[1])
@@ -98,7 +139,12 @@ def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -
     for start in range(0, count, _PART):
         seen |= stored.part(np.arange(start, min(start + _PART, count))).seen.any((0, 2))
     for view in np.flatnonzero(~seen):
-        raise GhptDataError(path, f"view {views[view]}", "has no key point", "Detect this view again, or leave it out.")
+        raise GhptDataError(
+            path,
+            f"view {views[view]}",
+            "has no key point",
+            "Detect this view again, or leave it out.",
+        )
     return stored
 
 
@@ -112,7 +158,8 @@ def frames_of_stored(
     """Raises GhptDataError as ``look_through`` does, and as ``frames_of_views``."""
     path = str(stored.path)
     pairs = matched(path, stored.views, cameras, match or {}, views)
-    at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
+    at = [view for view, _ in pairs]
+    ordered = cameras.select([camera for _, camera in pairs])
     rig = calibrated(path, ordered)
     count = len(stored.frame)
     spread = np.unique(np.linspace(0, count - 1, min(_CHECKED, count)).astype(np.int64))
@@ -120,21 +167,30 @@ def frames_of_stored(
 
     def read(rows: Int[np.ndarray, " N"]) -> Seen:
         part = stored.part(rows)
-        pixels, seen = np.zeros((*part.seen[:, at].shape, 2), np.float32), part.seen[:, at].copy()
+        pixels = np.zeros((*part.seen[:, at].shape, 2), np.float32)
+        seen = part.seen[:, at].copy()
         for view, of in enumerate(at):
-            K, lens = ordered.K[view].numpy(), ordered.distortion[view].numpy()
-            pixels[:, view], seen[:, view] = undistorted(part.key_points[:, of], seen[:, view], K, lens)
+            K = ordered.K[view].numpy()
+            lens = ordered.distortion[view].numpy()
+            pixels[:, view], seen[:, view] = undistorted(
+                part.key_points[:, of], seen[:, view], K, lens
+            )
         return joints17(path, part.joints, pixels, part.confidence[:, at], seen)
 
     def detected(rows: Int[np.ndarray, " N"]) -> Seen:
         part = stored.part(rows)
-        return joints17(path, part.joints, part.key_points[:, at], part.confidence[:, at], part.seen[:, at])
+        return joints17(
+            path, part.joints, part.key_points[:, at], part.confidence[:, at], part.seen[:, at]
+        )
 
-    frame, rate = stored.frame, stored.rate_hz
+    frame = stored.frame
+    rate = stored.rate_hz
     return Frames(title, path, ordered.names, rig, frame, rate, read, Detected(ordered, detected))
 
 
-def _check_names(path: Path, names: Mapping[str, tuple[tuple[str, ...], int]], frame: Int[np.ndarray, " T"]) -> None:
+def _check_names(
+    path: Path, names: Mapping[str, tuple[tuple[str, ...], int]], frame: Int[np.ndarray, " T"]
+) -> None:
     for field, (found, expected) in names.items():
         if len(found) != expected or len(set(found)) != len(found):
             problem = f"names {len(found)} for {expected} of key_points, or one twice"

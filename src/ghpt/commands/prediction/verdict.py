@@ -57,7 +57,11 @@ class Verdict:
     def numbers(self) -> Numbers:
         """As plain data."""
         findings = [asdict(finding) | {"level": finding.level.words} for finding in self.findings]
-        return {"level": self.level.words, "findings": findings, "undecidable": list(self.undecidable)}
+        return {
+            "level": self.level.words,
+            "findings": findings,
+            "undecidable": list(self.undecidable),
+        }
 
 
 @dataclass(frozen=True)
@@ -72,13 +76,15 @@ class Commands:
 
 @dataclass(frozen=True)
 class Judge:
-    """Where a number speaks against a prediction; errors are medians in sizes of the person in the image.
+    """Where a number speaks against a prediction; errors are medians in sizes of the person in the
+    image.
 
     ``clean``: with a smaller error in every view the camera check is not asked. ``many``: with more
     views it is asked only if a view's error exceeds ``suspicious``, because its time grows with
     their square. ``error``, ``wrong``: errors of all views in left-out views to look at, and not to
     use. ``views``: least share of the views that agree, those with an error of at most ``astray``.
-    ``rejected``, ``lost``: shares of the placed joints that are rejected to look at, and not to use.
+    ``rejected``, ``lost``: shares of the placed joints that are rejected to look at, and not to
+    use.
     """
 
     clean: float
@@ -97,12 +103,18 @@ class Judge:
         check(self.rejected <= self.lost, "lost", f"is {self.lost}", "Give rejected or more.")
 
     def asks(self, errors: Mapping[str, float | None]) -> bool:
-        """Whether the camera check is worth its time. ``errors``: of each view, None where nothing tells it."""
+        """Whether the camera check is worth its time. ``errors``: of each view, None where nothing
+        tells it.
+        """
         limit = self.clean if len(errors) <= self.many else self.suspicious
         return any(error is None or error > limit for error in errors.values())
 
-    def __call__(self, numbers: Numbers, checkup: Checkup | None, unit_mm: float, commands: Commands) -> Verdict:
-        """``numbers``: what `predict` knows of the recording. ``unit_mm``: the unit that the cameras were read in."""
+    def __call__(
+        self, numbers: Numbers, checkup: Checkup | None, unit_mm: float, commands: Commands
+    ) -> Verdict:
+        """``numbers``: what `predict` knows of the recording. ``unit_mm``: the unit that the
+        cameras were read in.
+        """
         undecidable: list[str] = []
         mistakes = () if checkup is None else checkup.findings
         findings = [
@@ -115,7 +127,9 @@ class Judge:
         return Verdict(tuple(findings), tuple(undecidable))
 
     @staticmethod
-    def _size(height: float | None, unit_mm: float, commands: Commands, undecidable: list[str]) -> Iterator[Finding]:
+    def _size(
+        height: float | None, unit_mm: float, commands: Commands, undecidable: list[str]
+    ) -> Iterator[Finding]:
         if not height:
             undecidable.append("the person's size, because no limb is seen")
             return
@@ -131,15 +145,19 @@ class Judge:
         level = Level.LOOK if human else Level.DO_NOT_USE
         yield Finding("size", level, text, height, low if height < low else high, command)
 
-    def _errors(self, scales: Numbers, commands: Commands, undecidable: list[str]) -> Iterator[Finding]:
+    def _errors(
+        self, scales: Numbers, commands: Commands, undecidable: list[str]
+    ) -> Iterator[Finding]:
         views = {view: error for view, error in scales["views"].items() if error is not None}
         if not views:
             undecidable.append("the errors, because too few joints are seen by two views")
             return
-        error, whose = scales["all"], "a left-out view's"
+        error = scales["all"]
+        whose = "a left-out view's"
         if error is None:  # two views leave none: what they disagree by is shared among them
             undecidable.append("the error in left-out views, which takes three views")
-            error, whose = max(views.values()), "the worst view's"
+            error = max(views.values())
+            whose = "the worst view's"
         if error > self.error:
             text = f"{whose} key points lie {error:.1%} of the person's size from the joints"
             level = Level.DO_NOT_USE if error > self.wrong else Level.LOOK
@@ -151,7 +169,9 @@ class Judge:
         if agree < self.views * len(views):
             text = f"{agree} of {len(views)} views agree with the others"
             share = agree / len(views)
-            yield Finding("few_views_agree", Level.DO_NOT_USE, text, share, self.views, commands.cameras)
+            yield Finding(
+                "few_views_agree", Level.DO_NOT_USE, text, share, self.views, commands.cameras
+            )
 
     def _rejected(self, share: Mapping[str, float], commands: Commands) -> Iterator[Finding]:
         placed = share["rejected"] + share["observed"]
@@ -163,9 +183,15 @@ class Judge:
             yield Finding("rejected", level, text, part, limit, commands.cameras)
 
     @staticmethod
-    def _mistakes(mistakes: Sequence[Mistake], cameras: Sequence[str], commands: Commands) -> Iterator[Finding]:
+    def _mistakes(
+        mistakes: Sequence[Mistake], cameras: Sequence[str], commands: Commands
+    ) -> Iterator[Finding]:
         """What the camera check says, but for the size, which is said already."""
-        mistakes = [mistake for mistake in mistakes if mistake.code not in ("unit", "scale") or mistake.cameras]
+        mistakes = [
+            mistake
+            for mistake in mistakes
+            if mistake.code not in ("unit", "scale") or mistake.cameras
+        ]
         concerned = {name for mistake in mistakes for name in mistake.cameras or cameras}
         most = 2 * len(concerned) > len(cameras)
         for mistake in mistakes:
@@ -179,8 +205,13 @@ class Judge:
 
 
 def verdict_lines(numbers: Numbers) -> list[str]:
-    """The verdict as `Verdict.numbers` gives it: a sentence for each finding, then what to type, the first first."""
-    lines = [f"{finding['level']} ({finding['code']}): {finding['text']}." for finding in numbers["findings"]]
+    """The verdict as `Verdict.numbers` gives it: a sentence for each finding, then what to type,
+    the first first.
+    """
+    lines = [
+        f"{finding['level']} ({finding['code']}): {finding['text']}."
+        for finding in numbers["findings"]
+    ]
     if numbers["undecidable"]:
         lines.append(f"Not decidable: {'; '.join(numbers['undecidable'])}.")
     commands = dict.fromkeys(finding["command"] for finding in numbers["findings"])

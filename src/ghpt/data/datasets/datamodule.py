@@ -22,9 +22,9 @@ SPLITS = ("train", "validation", "test")
 class KeyPointDataModule(L.LightningDataModule):
     """Shared by all arrangements: preparation, choice of frames, batches.
 
-    ``root`` None means the embedded (synthetic) source, a path the real data set there. ``seed`` chooses the training
-    samples and their order. ``batch_size`` is the global one, divided among the processes. ``evaluate`` names the
-    split that ``test`` runs on.
+    ``root`` None means the embedded (synthetic) source, a path the real data set there. ``seed``
+    chooses the training samples and their order. ``batch_size`` is the global one, divided among
+    the processes. ``evaluate`` names the split that ``test`` runs on.
     """
 
     def __init__(
@@ -41,19 +41,42 @@ class KeyPointDataModule(L.LightningDataModule):
         workers: int,
     ) -> None:
         super().__init__()
-        for key, value in (("train_samples", train_samples), ("stride", stride), ("batch_size", batch_size)):
+        for key, value in (
+            ("train_samples", train_samples),
+            ("stride", stride),
+            ("batch_size", batch_size),
+        ):
             check(value >= 1, f"data.{key}", f"is {value}", "It must be >= 1.")
         check(workers >= 0, "data.workers", f"is {workers}", "It must be >= 0.")
-        check(1 <= least_joints <= 17, "data.least_joints", f"is {least_joints}", "It must be 1 to 17.")
-        check(evaluate in SPLITS, "data.evaluate", f"is {evaluate!r}", f"Existing: {', '.join(SPLITS)}.")
-        self.name, self.root, self.cache, self.seed = name, root, cache, seed
-        self.train_samples, self.least_joints, self.stride = train_samples, least_joints, stride
-        self.evaluate, self.batch_size, self.workers = evaluate, batch_size, workers
+        check(
+            1 <= least_joints <= 17,
+            "data.least_joints",
+            f"is {least_joints}",
+            "It must be 1 to 17.",
+        )
+        check(
+            evaluate in SPLITS,
+            "data.evaluate",
+            f"is {evaluate!r}",
+            f"Existing: {', '.join(SPLITS)}.",
+        )
+        self.name = name
+        self.root = root
+        self.cache = cache
+        self.seed = seed
+        self.train_samples = train_samples
+        self.least_joints = least_joints
+        self.stride = stride
+        self.evaluate = evaluate
+        self.batch_size = batch_size
+        self.workers = workers
         self.pairs: PairSettings | None = None
         self.frames: dict[str, Frames | Pairs] = {}
 
     def serve(self, problem: Any) -> None:
-        """Serve what ``problem`` takes: pairs of cameras where it has ``PairSettings`` (``pairs``), else frames."""
+        """Serve what ``problem`` takes: pairs of cameras where it has ``PairSettings`` (``pairs``),
+        else frames.
+        """
         self.pairs = getattr(problem, "pairs", None)
 
     @property
@@ -82,21 +105,34 @@ class KeyPointDataModule(L.LightningDataModule):
 
     def _roles(self, stage: str) -> dict[str, str]:
         """What the stage needs: role -> split."""
-        return {"test": self.evaluate} if stage == "test" else {"train": "train", "validation": "validation"}
+        return (
+            {"test": self.evaluate}
+            if stage == "test"
+            else {"train": "train", "validation": "validation"}
+        )
 
     def recordings(self, split: str) -> list[Recording]:
-        """The split's recordings, prepared first where they are not in the cache. Raises GhptDataError."""
+        """The split's recordings, prepared first where they are not in the cache. Raises
+        GhptDataError.
+        """
         recordings = prepared(
-            self.cache, self.key(split), lambda: self.make(split), {"source": self.source, "split": split}
+            self.cache,
+            self.key(split),
+            lambda: self.make(split),
+            {"source": self.source, "split": split},
         )
         if not sum(map(len, recordings)):
             mend = "Choose another split, or check what data.root holds."
-            raise GhptDataError(self.source, f"{self.name} {split}", "the split has no frames", mend)
+            raise GhptDataError(
+                self.source, f"{self.name} {split}", "the split has no frames", mend
+            )
         return recordings
 
     def _choose(self, recordings: Sequence[Recording], training: bool) -> Frames | Pairs:
         if self.pairs is not None:
-            return Pairs(recordings, self.pairs, self.seed, self.train_samples if training else None)
+            return Pairs(
+                recordings, self.pairs, self.seed, self.train_samples if training else None
+            )
         return Frames(recordings, self._random(recordings) if training else self._every(recordings))
 
     def _every(self, recordings: Sequence[Recording]) -> np.ndarray:
@@ -106,7 +142,9 @@ class KeyPointDataModule(L.LightningDataModule):
 
     def _random(self, recordings: Sequence[Recording]) -> np.ndarray:
         """``train_samples`` random frames that can teach."""
-        order = randomness.permutation(self.seed, "training samples", 0, sum(map(len, recordings))).numpy()
+        order = randomness.permutation(
+            self.seed, "training samples", 0, sum(map(len, recordings))
+        ).numpy()
         chosen = np.empty(0, dtype=np.int64)
         for first in range(0, len(order), 4 * self.train_samples):
             some = order[first : first + 4 * self.train_samples]
@@ -132,12 +170,16 @@ class KeyPointDataModule(L.LightningDataModule):
         return self._loader("test")
 
     def _loader(self, role: str, seed: int | None = None, done: Any = lambda: 0) -> FrameLoader:
-        rank, world = (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        rank, world = (
+            (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+        )
         order = BatchOrder(len(self.frames[role]), self.batch_size, rank, world, seed, done)
         return FrameLoader(self.frames[role], order, self.workers)
 
     def all_training_batches(self) -> Iterator[KeyPointBatch | PairBatch]:
-        """Every training sample once, in order, the same on every process: for the feature statistics."""
+        """Every training sample once, in order, the same on every process: for the feature
+        statistics.
+        """
         frames = self.frames["train"]
         for first in range(0, len(frames), self.batch_size):
             yield frames[range(first, min(first + self.batch_size, len(frames)))]

@@ -17,9 +17,11 @@ _FAR = 1e5
 def in_image(
     crop: Float[np.ndarray, "T V J 2"], boxes: Float[np.ndarray, "T V 2 2"]
 ) -> tuple[Float[np.ndarray, "T V J 2"], Bool[np.ndarray, "T V J"]]:
-    """Image pixels of points in pixels of the 384-high crop, and which are there: those of a zero box are not.
+    """Image pixels of points in pixels of the 384-high crop, and which are there: those of a zero
+    box are not.
 
-    ``boxes`` holds two corners (x, y); a crop keeps its aspect, so the height, the extent in y, gives the scale.
+    ``boxes`` holds two corners (x, y); a crop keeps its aspect, so the height, the extent in y,
+    gives the scale.
     """
     height = np.abs(boxes[..., 1, 1] - boxes[..., 0, 1])[..., None, None]
     pixels = crop * (height / CROP) + boxes[..., None, 0, :]
@@ -34,10 +36,15 @@ def undistorted(
 ) -> tuple[Float[np.ndarray, "T J 2"], Bool[np.ndarray, "T J"]]:
     """One camera's key points as an ideal pinhole would see them (float32), and which are seen.
 
-    Those that are not finite, or where the lens model cannot be inverted, are not seen; they become 0.
+    Those that are not finite, or where the lens model cannot be inverted, are not seen; they become
+    0.
     """
     seen = seen & (np.abs(pixels) < _FAR).all(-1)
-    raw = torch.from_numpy(np.where(seen[..., None], pixels, K[:2, 2]).astype(np.float64)).reshape(-1, 2)
+    raw = torch.from_numpy(np.where(seen[..., None], pixels, K[:2, 2]).astype(np.float64)).reshape(
+        -1, 2
+    )
     ideal, exists = undistort(raw, torch.from_numpy(K), torch.from_numpy(distortion))
     seen = seen & exists.numpy().reshape(seen.shape)
-    return np.where(seen[..., None], ideal.numpy().reshape(pixels.shape), 0).astype(np.float32), seen
+    return np.where(seen[..., None], ideal.numpy().reshape(pixels.shape), 0).astype(
+        np.float32
+    ), seen

@@ -17,7 +17,8 @@ from ghpt.skeleton import PELVIS
 class Frames(Dataset[KeyPointBatch]):
     """Chosen frames of recordings that share a number of views; one item is a whole batch.
 
-    ``frames`` are positions in the recordings laid end to end, in any order; sample i is ``frames[i]``.
+    ``frames`` are positions in the recordings laid end to end, in any order; sample i is
+    ``frames[i]``.
     """
 
     def __init__(self, recordings: Sequence[Recording], frames: np.ndarray) -> None:
@@ -25,7 +26,10 @@ class Frames(Dataset[KeyPointBatch]):
         self.frames = np.asarray(frames, dtype=np.int64)
         self.start = np.concatenate([[0], np.cumsum([len(r) for r in recordings])])
         self.cameras = Cameras(
-            *(torch.stack([getattr(r.cameras, name).double() for r in recordings]) for name in ("K", "R", "t"))
+            *(
+                torch.stack([getattr(r.cameras, name).double() for r in recordings])
+                for name in ("K", "R", "t")
+            )
         )
 
     def __len__(self) -> int:
@@ -60,11 +64,15 @@ class Frames(Dataset[KeyPointBatch]):
 
     def frame_numbers(self, samples: Sequence[int]) -> np.ndarray:
         """The data set's own frame numbers."""
-        return np.array([self.recordings[r].frame[t] for r, t in map(self.locate, samples)], dtype=np.int64)
+        return np.array(
+            [self.recordings[r].frame[t] for r, t in map(self.locate, samples)], dtype=np.int64
+        )
 
 
 def trainable(recordings: Sequence[Recording], frames: np.ndarray, joints: int) -> np.ndarray:
-    """Which frames have a truth, with the pelvis and at least ``joints`` joints both true and triangulable."""
+    """Which frames have a truth, with the pelvis and at least ``joints`` joints both true and
+    triangulable.
+    """
     data = Frames(recordings, frames)
     batch = data[range(len(frames))]
     usable = joints_with_enough_views(batch.seen) & batch.truth_seen
@@ -72,18 +80,30 @@ def trainable(recordings: Sequence[Recording], frames: np.ndarray, joints: int) 
 
 
 class BatchOrder(Sampler[list[int]]):
-    """The samples of each batch for one process: a pure function of the seed and the batches already done.
+    """The samples of each batch for one process: a pure function of the seed and the batches
+    already done.
 
-    A global batch is ``batch_size`` samples in the same order on any number of processes; process ``rank`` takes
-    every ``world``-th of them, so its share of the last one can be empty. ``done()`` says how many global batches
-    training has finished, over all epochs, so that a resumed run goes on where it was stopped.
+    A global batch is ``batch_size`` samples in the same order on any number of processes; process
+    ``rank`` takes every ``world``-th of them, so its share of the last one can be empty. ``done()``
+    says how many global batches training has finished, over all epochs, so that a resumed run goes
+    on where it was stopped.
     """
 
     def __init__(
-        self, count: int, batch_size: int, rank: int, world: int, seed: int | None, done: Callable[[], int]
+        self,
+        count: int,
+        batch_size: int,
+        rank: int,
+        world: int,
+        seed: int | None,
+        done: Callable[[], int],
     ) -> None:
-        self.count, self.batch_size, self.rank, self.world = count, batch_size, rank, world
-        self.seed, self.done = seed, done
+        self.count = count
+        self.batch_size = batch_size
+        self.rank = rank
+        self.world = world
+        self.seed = seed
+        self.done = done
 
     def __len__(self) -> int:
         return -(-self.count // self.batch_size)
@@ -96,15 +116,21 @@ class BatchOrder(Sampler[list[int]]):
             else randomness.permutation(self.seed, "order", epoch, self.count)
         )
         for batch in range(first, len(self)):
-            yield order[batch * self.batch_size : (batch + 1) * self.batch_size][self.rank :: self.world].tolist()
+            yield order[batch * self.batch_size : (batch + 1) * self.batch_size][
+                self.rank :: self.world
+            ].tolist()
 
 
 class FrameLoader(DataLoader[Any]):
-    """Loads batches in a ``BatchOrder``. It has no state to save, since the order knows where to go on."""
+    """Loads batches in a ``BatchOrder``. It has no state to save, since the order knows where to go
+    on.
+    """
 
     def __init__(self, frames: Dataset[Any], order: BatchOrder, workers: int) -> None:
         pin = torch.cuda.is_available()
-        super().__init__(frames, sampler=order, batch_size=None, num_workers=workers, pin_memory=pin)
+        super().__init__(
+            frames, sampler=order, batch_size=None, num_workers=workers, pin_memory=pin
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Empty; its being there tells Lightning that a run can be resumed within an epoch."""

@@ -1,4 +1,6 @@
-"""Human3.6M as the paper's authors prepare it: karfly's labels and 2D predictions in chunks per subject."""
+"""Human3.6M as the paper's authors prepare it: karfly's labels and 2D predictions in chunks per
+subject.
+"""
 
 from __future__ import annotations
 
@@ -32,16 +34,23 @@ _LAYOUT = "S<k>/ must hold all_2d_preds<n>.npy, all_bboxes<n>.npy and all_3d_gt<
 
 def human36m_files(root: Path, split: str) -> list[Path]:
     """The files that a split is made of. Raises GhptDataError if one is missing."""
-    return [_labels_file(root), *(f for s in _subjects(split) for chunk in _chunks(root / s) for f in chunk)]
+    return [
+        _labels_file(root),
+        *(f for s in _subjects(split) for chunk in _chunks(root / s) for f in chunk),
+    ]
 
 
-def human36m_recordings(root: Path, split: str, numbers: Sequence[int], damaged: bool) -> Iterator[Recording]:
-    """The takes of a split (train, validation, test) in the views ``numbers`` of the labels' cameras.
+def human36m_recordings(
+    root: Path, split: str, numbers: Sequence[int], damaged: bool
+) -> Iterator[Recording]:
+    """The takes of a split (train, validation, test) in the views ``numbers`` of the labels'
+    cameras.
 
-    ``damaged`` keeps the takes whose ground truth is `DAMAGED`. A view without a bounding box is not seen; the
-    detector's confidence is not in the files and taken as 1. Where the chunks are not the labels' frames, takes
-    cannot be told apart: a subject is then one recording of action ``unknown``, with a warning. Raises
-    GhptDataError if a file is missing, damaged or not what it should be.
+    ``damaged`` keeps the takes whose ground truth is `DAMAGED`. A view without a bounding box is
+    not seen; the detector's confidence is not in the files and taken as 1. Where the chunks are not
+    the labels' frames, takes cannot be told apart: a subject is then one recording of action
+    ``unknown``, with a warning. Raises GhptDataError if a file is missing, damaged or not what it
+    should be.
     """
     labels = read_labels(_labels_file(root))
     check_names(labels.path, numbers, range(len(labels.cameras)))
@@ -79,7 +88,9 @@ def _labels_file(root: Path) -> Path:
     for file in (root / LABELS_FILE, root / "extra" / LABELS_FILE):
         if file.is_file():
             return file
-    raise GhptDataError(root, "", f"there is no {LABELS_FILE}, nor extra/{LABELS_FILE}", "Put karfly's file there.")
+    raise GhptDataError(
+        root, "", f"there is no {LABELS_FILE}, nor extra/{LABELS_FILE}", "Put karfly's file there."
+    )
 
 
 def _chunks(folder: Path) -> list[tuple[Path, Path, Path]]:
@@ -99,17 +110,24 @@ def _chunks(folder: Path) -> list[tuple[Path, Path, Path]]:
 def _subject(root: Path, name: str, labels: Labels, views: list[int]) -> _Subject:
     if name not in labels.subjects:
         problem = f"there is no {name}"
-        raise GhptDataError(labels.path, "subject_names", problem, "Get the labels of all seven subjects.")
-    index, all_views = labels.subjects.index(name), len(labels.cameras)
+        raise GhptDataError(
+            labels.path, "subject_names", problem, "Get the labels of all seven subjects."
+        )
+    index = labels.subjects.index(name)
+    all_views = len(labels.cameras)
     camera_names = tuple(labels.cameras[v] for v in views)
     rig = (x[index][views] for x in (labels.K, labels.R, labels.t, labels.distortion))
     cameras, distortion = check_cameras(f"{labels.path} ({name})", camera_names, *rig)
-    predictions, boxes, truth = [], [], []
+    predictions = []
+    boxes = []
+    truth = []
     for files in _chunks(root / name):
         predictions.append(read_npy(files[0], (None, all_views, 17, 2), "f"))
         boxes.append(read_npy(files[1], (len(predictions[-1]), all_views, 2, 2), "fiu"))
         truth.append(read_npy(files[2], (len(predictions[-1]), 17, 3), "f"))
-    return _Subject(name, index, views, camera_names, cameras, distortion, predictions, boxes, truth)
+    return _Subject(
+        name, index, views, camera_names, cameras, distortion, predictions, boxes, truth
+    )
 
 
 def _takes(
@@ -121,17 +139,24 @@ def _takes(
     if len(rows) != length or not _same(labels, rows, subject.truth):
         if not damaged and any(take.startswith(f"{subject.name}/") for take in DAMAGED):
             problem = "the chunks' frames are not the labels', so damaged takes cannot be left out"
-            raise GhptDataError(labels.path, subject.name, problem, "Predict all frames of the labels, or set damaged.")
+            raise GhptDataError(
+                labels.path,
+                subject.name,
+                problem,
+                "Predict all frames of the labels, or set damaged.",
+            )
         problem = "the chunks' frames are not the labels', so this subject is one recording of unknown action"
         warnings.warn(f"{labels.path}: {subject.name}: {problem}", stacklevel=2)
         return {f"{subject.name}/unknown": ("unknown", np.arange(length), np.arange(length))}
     action = labels.action[rows]
     return {
         f"{subject.name}/{labels.actions[a]}": (
-            labels.actions[a].rsplit("-", 1)[0], np.flatnonzero(action == a), labels.frame[rows[action == a]],
+            labels.actions[a].rsplit("-", 1)[0],
+            np.flatnonzero(action == a),
+            labels.frame[rows[action == a]],
         )
         for a in np.unique(action)
-    }  # fmt: skip
+    }
 
 
 def _same(labels: Labels, rows: Int[np.ndarray, " T"], truth: list[np.ndarray]) -> bool:
@@ -143,9 +168,14 @@ def _same(labels: Labels, rows: Int[np.ndarray, " T"], truth: list[np.ndarray]) 
 
 
 def _recording(
-    subject: _Subject, take: str, action: str, rows: Int[np.ndarray, " T"], frame: Int[np.ndarray, " T"]
+    subject: _Subject,
+    take: str,
+    action: str,
+    rows: Int[np.ndarray, " T"],
+    frame: Int[np.ndarray, " T"],
 ) -> Recording:
-    frames, views = len(rows), len(subject.views)
+    frames = len(rows)
+    views = len(subject.views)
     key_points = np.empty((frames, views, 17, 2), np.float32)
     seen = np.empty((frames, views, 17), np.bool_)
     truth = np.empty((frames, 17, 3), np.float32)
@@ -158,20 +188,35 @@ def _recording(
         truth[block] = _pick(subject.truth, rows[block])
         for view in range(views):
             key_points[block, view], seen[block, view] = undistorted(
-                pixels[:, view], there[:, view], subject.cameras.K[view].numpy(), subject.distortion[view]
+                pixels[:, view],
+                there[:, view],
+                subject.cameras.K[view].numpy(),
+                subject.distortion[view],
             )
     truth_seen = np.isfinite(truth).all(-1)
     truth[~truth_seen] = 0
     return Recording(
-        name=take, subject=subject.name, action=action, rate_hz=_RATE_HZ, camera_names=subject.camera_names,
-        cameras=subject.cameras, key_points=key_points, confidence=np.ones(seen.shape, np.float32), seen=seen,
-        truth=truth, truth_seen=truth_seen, frame=frame.astype(np.int64),
-    )  # fmt: skip
+        name=take,
+        subject=subject.name,
+        action=action,
+        rate_hz=_RATE_HZ,
+        camera_names=subject.camera_names,
+        cameras=subject.cameras,
+        key_points=key_points,
+        confidence=np.ones(seen.shape, np.float32),
+        seen=seen,
+        truth=truth,
+        truth_seen=truth_seen,
+        frame=frame.astype(np.int64),
+    )
 
 
 def _pick(chunks: list[np.ndarray], rows: Int[np.ndarray, " T"]) -> np.ndarray:
     """Ascending rows of the chunks' concatenation."""
     starts = np.cumsum([0, *map(len, chunks)])
     return np.concatenate(
-        [chunk[rows[(rows >= a) & (rows < a + len(chunk))] - a] for a, chunk in zip(starts, chunks, strict=False)]
+        [
+            chunk[rows[(rows >= a) & (rows < a + len(chunk))] - a]
+            for a, chunk in zip(starts, chunks, strict=False)
+        ]
     )

@@ -1,8 +1,9 @@
-"""karfly's ``human36m-multiview-labels-GTbboxes.npy``: a pickled dict, read without running anything it holds.
+"""karfly's ``human36m-multiview-labels-GTbboxes.npy``: a pickled dict, read without running
+anything it holds.
 
-A pickle names functions to call. The reader admits the four names that numpy's arrays need, and none of them is
-numpy's: each stands for plain bookkeeping here, from which arrays are then built with their sizes checked
-(numpy's own unpickling trusts the sizes and flags it is given).
+A pickle names functions to call. The reader admits the four names that numpy's arrays need, and
+none of them is numpy's: each stands for plain bookkeeping here, from which arrays are then built
+with their sizes checked (numpy's own unpickling trusts the sizes and flags it is given).
 """
 
 from __future__ import annotations
@@ -53,27 +54,47 @@ class Labels:
 
 
 def read_labels(path: Path) -> Labels:
-    """Read and check a labels file. Raises GhptDataError if it is not what it should be or holds code."""
+    """Read and check a labels file. Raises GhptDataError if it is not what it should be or holds
+    code.
+    """
     content = _unpickled(path)
-    names = {key: _names(path, key, content) for key in ("subject_names", "camera_names", "action_names")}
+    names = {
+        key: _names(path, key, content) for key in ("subject_names", "camera_names", "action_names")
+    }
     rig = _structured(path, "cameras", content, tuple(map(len, names.values()))[:2])
     table = _structured(path, "table", content, (None,))
     rigs = {
-        key: check_array(path, f"cameras[{key!r}]", _column(path, "cameras", rig, key), (None, None, *shape), "f")
+        key: check_array(
+            path, f"cameras[{key!r}]", _column(path, "cameras", rig, key), (None, None, *shape), "f"
+        )
         for key, shape in {"K": (3, 3), "R": (3, 3), "t": (3, 1), "dist": (5,)}.items()
     }
-    rows = {key: _column(path, "table", table, key) for key in ("subject_idx", "action_idx", "frame_idx")}
-    for key, count in (("subject_idx", "subject_names"), ("action_idx", "action_names"), ("frame_idx", None)):
+    rows = {
+        key: _column(path, "table", table, key)
+        for key in ("subject_idx", "action_idx", "frame_idx")
+    }
+    for key, count in (
+        ("subject_idx", "subject_names"),
+        ("action_idx", "action_names"),
+        ("frame_idx", None),
+    ):
         check_array(path, f"table[{key!r}]", rows[key], (None,), "iu")
         if count and len(table) and (rows[key].min() < 0 or rows[key].max() >= len(names[count])):
             problem = f"goes from {rows[key].min()} to {rows[key].max()}, with {len(names[count])} {count}"
             raise GhptDataError(path, f"table[{key!r}]", problem, _MEND)
     points = _column(path, "table", table, "keypoints")
     return Labels(
-        path, *names.values(), K=rigs["K"], R=rigs["R"], t=rigs["t"][..., 0], distortion=rigs["dist"],
-        subject=rows["subject_idx"], action=rows["action_idx"], frame=rows["frame_idx"],
+        path,
+        *names.values(),
+        K=rigs["K"],
+        R=rigs["R"],
+        t=rigs["t"][..., 0],
+        distortion=rigs["dist"],
+        subject=rows["subject_idx"],
+        action=rows["action_idx"],
+        frame=rows["frame_idx"],
         key_points=check_array(path, "table['keypoints']", points, (None, 17, 3), "f"),
-    )  # fmt: skip
+    )
 
 
 @dataclass
@@ -97,7 +118,9 @@ class _Dtype:
             columns = [fields[name] for name in names]
             formats = [column[0].build(depth + 1) for column in columns]
             offsets = [column[1] for column in columns]
-            built = np.dtype({"names": list(names), "formats": formats, "offsets": offsets, "itemsize": size})
+            built = np.dtype(
+                {"names": list(names), "formats": formats, "offsets": offsets, "itemsize": size}
+            )
         else:
             built = np.dtype(str(self.code)).newbyteorder(order if order in ("<", ">") else "=")
         if built.hasobject or not 0 < built.itemsize <= _MAX_ITEM:
@@ -135,7 +158,9 @@ _OPCODES = """
     NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG1 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING UNICODE
     SHORT_BINUNICODE BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3
     TUPLE EMPTY_LIST LIST APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS POP"""
-"""Those that build plain data. Not among them: making instances, extension codes, references to outside."""
+"""Those that build plain data. Not among them: making instances, extension codes, references to
+outside.
+"""
 
 
 class _Unpickler(pickle.Unpickler):
@@ -143,7 +168,9 @@ class _Unpickler(pickle.Unpickler):
         stand_in = _STAND_INS.get(f"{module}.{name}")
         if stand_in is None:
             raise pickle.UnpicklingError(f"it holds code: it names {module}.{name}")
-        return lambda *args: stand_in(*args)  # a new one each time: a pickle can set attributes of what it names
+        return lambda *args: stand_in(
+            *args
+        )  # a new one each time: a pickle can set attributes of what it names
 
 
 def _unpickled(path: Path) -> dict[str, Any]:
@@ -160,7 +187,9 @@ def _unpickled(path: Path) -> dict[str, Any]:
                 content = _Unpickler(data, encoding="latin1").load()
                 (content,) = content.state[4]
             except Exception as error:  # damaged pickles raise almost anything
-                raise GhptDataError(path, "", f"is not a labels file ({error!s:.200})", _MEND) from error
+                raise GhptDataError(
+                    path, "", f"is not a labels file ({error!s:.200})", _MEND
+                ) from error
     if not isinstance(content, dict):
         raise GhptDataError(path, "", f"holds a {type(content).__name__}, not a dict", _MEND)
     return content
@@ -172,7 +201,9 @@ def _check_opcodes(data: mmap.mmap) -> None:
     for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
         if opcode.name not in allowed:
             raise pickle.UnpicklingError(f"it holds code: opcode {opcode.name}")
-        if count > _MAX_OPCODES or (opcode.name in ("PUT", "LONG_BINPUT") and int(argument) > _MAX_OPCODES):
+        if count > _MAX_OPCODES or (
+            opcode.name in ("PUT", "LONG_BINPUT") and int(argument) > _MAX_OPCODES
+        ):
             raise pickle.UnpicklingError("it is too complicated")
 
 
@@ -183,7 +214,9 @@ def _names(path: Path, key: str, content: dict[str, Any]) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _structured(path: Path, key: str, content: dict[str, Any], shape: tuple[int | None, ...]) -> np.ndarray:
+def _structured(
+    path: Path, key: str, content: dict[str, Any], shape: tuple[int | None, ...]
+) -> np.ndarray:
     array = content.get(key)
     if not isinstance(array, _Array):
         raise GhptDataError(path, key, "is missing, or not an array", _MEND)

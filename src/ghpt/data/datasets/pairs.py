@@ -1,4 +1,6 @@
-"""Pairs of cameras as a torch data set: M random frames of a rig, seen by two of its cameras (paper, section 3.2)."""
+"""Pairs of cameras as a torch data set: M random frames of a rig, seen by two of its cameras
+(paper, section 3.2).
+"""
 
 from __future__ import annotations
 
@@ -52,17 +54,26 @@ class RigOfSplit:
 
 
 class Pairs(Dataset[PairBatch]):
-    """Every pair of views of every rig with ``draws`` draws of M frames each, or ``samples`` random ones.
+    """Every pair of views of every rig with ``draws`` draws of M frames each, or ``samples`` random
+    ones.
 
-    In order: sample i is a rig, then a draw, then a pair, so that the pairs of one draw, which share their frames,
-    follow one another. With ``samples`` each sample has its own draw and a random rig and pair. A rig with fewer than
-    M frames fills up with frames in which nothing is seen. All is a pure function of the recordings, settings and seed.
+    In order: sample i is a rig, then a draw, then a pair, so that the pairs of one draw, which
+    share their frames, follow one another. With ``samples`` each sample has its own draw and a
+    random rig and pair. A rig with fewer than M frames fills up with frames in which nothing is
+    seen. All is a pure function of the recordings, settings and seed.
     """
 
     def __init__(
-        self, recordings: Sequence[Recording], settings: PairSettings, seed: int, samples: int | None = None
+        self,
+        recordings: Sequence[Recording],
+        settings: PairSettings,
+        seed: int,
+        samples: int | None = None,
     ) -> None:
-        self.recordings, self.settings, self.seed, self.samples = recordings, settings, seed, samples
+        self.recordings = recordings
+        self.settings = settings
+        self.seed = seed
+        self.samples = samples
         self.rigs = _rigs(recordings, settings.points, seed)
         self.pairs = list(combinations(range(len(self.rigs[0].names)), 2))
 
@@ -75,7 +86,9 @@ class Pairs(Dataset[PairBatch]):
         return self.settings.draws
 
     def __len__(self) -> int:
-        return len(self.rigs) * self.draws * len(self.pairs) if self.samples is None else self.samples
+        return (
+            len(self.rigs) * self.draws * len(self.pairs) if self.samples is None else self.samples
+        )
 
     def locate(self, sample: int) -> tuple[int, int, tuple[int, int]]:
         """The rig's index, the number of the draw over all rigs, and the pair of views."""
@@ -92,7 +105,11 @@ class Pairs(Dataset[PairBatch]):
         count = min(self.settings.frames, int(start[-1]))
         chosen = _distinct(self.seed, draw, int(start[-1]), count)
         which = np.searchsorted(start, chosen, side="right") - 1
-        return [(r, chosen[which == i] - start[i]) for i, r in enumerate(recordings) if (which == i).any()]
+        return [
+            (r, chosen[which == i] - start[i])
+            for i, r in enumerate(recordings)
+            if (which == i).any()
+        ]
 
     def __getitem__(self, samples: Sequence[int]) -> PairBatch:
         places = [self.locate(sample) for sample in samples]
@@ -113,7 +130,12 @@ class Pairs(Dataset[PairBatch]):
             rig=rig,
             draw=torch.tensor([place[1] for place in places], dtype=torch.int64),
             pair=torch.tensor([place[2] for place in places], dtype=torch.int64).reshape(-1, 2),
-            cameras=Cameras(*(torch.stack([getattr(r.cameras, n) for r in self.rigs])[rig] for n in ("K", "R", "t"))),
+            cameras=Cameras(
+                *(
+                    torch.stack([getattr(r.cameras, n) for r in self.rigs])[rig]
+                    for n in ("K", "R", "t")
+                )
+            ),
             key_points=gather("key_points"),
             confidence=gather("confidence"),
             seen=gather("seen"),
@@ -123,7 +145,9 @@ class Pairs(Dataset[PairBatch]):
     def _read(self, rig: int, draw: int) -> dict[str, np.ndarray]:
         """Key points, confidence and masks [V, M, J, ...] of a draw."""
         views, joints = self.recordings[0].key_points.shape[1:3]
-        arrays = {field: make(views, self.settings.frames, joints) for field, make in _EMPTY.items()}
+        arrays = {
+            field: make(views, self.settings.frames, joints) for field, make in _EMPTY.items()
+        }
         row = 0
         for recording, positions in self.frames_of(rig, draw):
             for field, array in arrays.items():
@@ -141,7 +165,9 @@ _EMPTY = {
 
 
 def _distinct(seed: int, draw: int, total: int, count: int) -> Int[np.ndarray, " F"]:
-    """``count`` distinct numbers below ``total``, sorted (Floyd's algorithm, so that long recordings cost nothing)."""
+    """``count`` distinct numbers below ``total``, sorted (Floyd's algorithm, so that long
+    recordings cost nothing).
+    """
     draws = randomness.uniform(randomness.key(seed, "frames of a draw", draw), (count,)).numpy()
     chosen: set[int] = set()
     for last, u in zip(range(total - count, total), draws, strict=True):
@@ -161,19 +187,34 @@ def _rigs(recordings: Sequence[Recording], points: int, seed: int) -> list[RigOf
     for number, ((names, _), members) in enumerate(groups.items()):
         subjects = dict.fromkeys(recordings[i].subject for i in members)
         volume = _volume([recordings[i] for i in members])
-        share = randomness.uniform(randomness.key(seed, "points of the volume", number), (points, 3))
-        cameras = Cameras(*(getattr(recordings[members[0]].cameras, n).double() for n in ("K", "R", "t")))
+        share = randomness.uniform(
+            randomness.key(seed, "points of the volume", number), (points, 3)
+        )
+        cameras = Cameras(
+            *(getattr(recordings[members[0]].cameras, n).double() for n in ("K", "R", "t"))
+        )
         low, high = volume
-        rigs.append(RigOfSplit(" ".join(subjects), names, cameras, tuple(members), low + share * (high - low)))
+        rigs.append(
+            RigOfSplit(
+                " ".join(subjects), names, cameras, tuple(members), low + share * (high - low)
+            )
+        )
     return rigs
 
 
 def _volume(recordings: Sequence[Recording]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-    """The lowest and highest corner of the box of the true joints. Raises GhptDataError where there are none."""
+    """The lowest and highest corner of the box of the true joints. Raises GhptDataError where there
+    are none.
+    """
     step = max(1, sum(map(len, recordings)) // _VOLUME_FRAMES)
-    joints = np.concatenate([r.truth[::step][r.truth_seen[::step]] for r in recordings]).astype(np.float64)
+    joints = np.concatenate([r.truth[::step][r.truth_seen[::step]] for r in recordings]).astype(
+        np.float64
+    )
     if not len(joints):
         raise GhptDataError(
-            recordings[0].name, "truth", "has no true pose, so errors cannot be measured", "Use calibrate.py for it."
+            recordings[0].name,
+            "truth",
+            "has no true pose, so errors cannot be measured",
+            "Use calibrate.py for it.",
         )
     return torch.from_numpy(joints.min(axis=0)), torch.from_numpy(joints.max(axis=0))

@@ -1,7 +1,8 @@
 """CMU Panoptic Studio in its own layout, with the user's 2D detections beside it.
 
-A root holds sequences: ``<seq>/calibration_<seq>.json``, ``<seq>/hdPose3d_stage1_coco19/body3DScene_%08d.json``
-and either ``<seq>/keypoints/00_%02d.npz`` for each HD camera, or the authors' ``<seq>/all_2d_preds.npy``.
+A root holds sequences: ``<seq>/calibration_<seq>.json``,
+``<seq>/hdPose3d_stage1_coco19/body3DScene_%08d.json`` and either ``<seq>/keypoints/00_%02d.npz``
+for each HD camera, or the authors' ``<seq>/all_2d_preds.npy``.
 """
 
 from __future__ import annotations
@@ -27,10 +28,26 @@ SPLITS = {"train": (0.0, 0.6), "validation": (0.6, 0.8), "test": (0.8, 1.0)}
 """Split -> its part of each sequence in time (paper, section 4.1)."""
 
 COCO19 = (
-    "neck", "nose", "mid_hip", "left_shoulder", "left_elbow", "left_wrist", "left_hip", "left_knee", "left_ankle",
-    "right_shoulder", "right_elbow", "right_wrist", "right_hip", "right_knee", "right_ankle",
-    "left_eye", "left_ear", "right_eye", "right_ear",
-)  # fmt: skip
+    "neck",
+    "nose",
+    "mid_hip",
+    "left_shoulder",
+    "left_elbow",
+    "left_wrist",
+    "left_hip",
+    "left_knee",
+    "left_ankle",
+    "right_shoulder",
+    "right_elbow",
+    "right_wrist",
+    "right_hip",
+    "right_knee",
+    "right_ankle",
+    "left_eye",
+    "left_ear",
+    "right_eye",
+    "right_ear",
+)
 """Joints of the body3DScene files, in their order."""
 
 _PARTS = {name: (name,) for name in JOINT if name in COCO19} | {
@@ -47,19 +64,26 @@ _GET = "Get the file again from the Panoptic Studio tool box."
 
 
 def panoptic_files(root: Path, numbers: Sequence[int]) -> list[Path]:
-    """The files that the recordings of these HD cameras are made of. Raises GhptDataError if one is missing."""
+    """The files that the recordings of these HD cameras are made of. Raises GhptDataError if one is
+    missing.
+    """
     files = []
     for folder in _sequences(root):
-        files += [_calibration(folder), *_scenes(folder).values(), *detection_files(folder, numbers)]
+        files += [
+            _calibration(folder),
+            *_scenes(folder).values(),
+            *detection_files(folder, numbers),
+        ]
     return files
 
 
 def panoptic_recordings(root: Path, numbers: Sequence[int], split: str) -> Iterator[Recording]:
     """One recording for each sequence: the split's part in time, in the HD cameras ``numbers``.
 
-    Frames are those of the 3D files, so that the split is the same for all cameras; detections are matched by
-    frame number, and a frame without them is not seen. Of several bodies, the truth is the id that is there in most
-    of the split's frames. Raises GhptDataError if a file is missing, damaged or not what it should be.
+    Frames are those of the 3D files, so that the split is the same for all cameras; detections are
+    matched by frame number, and a frame without them is not seen. Of several bodies, the truth is
+    the id that is there in most of the split's frames. Raises GhptDataError if a file is missing,
+    damaged or not what it should be.
     """
     check(split in SPLITS, "split", f"is {split!r}", f"Existing: {', '.join(SPLITS)}.")
     for folder in _sequences(root):
@@ -69,20 +93,32 @@ def panoptic_recordings(root: Path, numbers: Sequence[int], split: str) -> Itera
         truth, truth_seen = _truth([scenes[number] for number in frame])
         names, cameras, distortion = _cameras(folder, numbers)
         shape = (len(frame), len(numbers), len(JOINT))
-        key_points, seen = np.zeros((*shape, 2), np.float32), np.zeros(shape, np.bool_)
+        key_points = np.zeros((*shape, 2), np.float32)
+        seen = np.zeros(shape, np.bool_)
         confidence = np.zeros(shape, np.float32)
         for view, found in enumerate(detections(folder, numbers, list(scenes))):
             _, here, there = np.intersect1d(frame, found["frame"], return_indices=True)
             confidence[here, view] = found["confidence"][there]
             key_points[here, view], seen[here, view] = undistorted(
-                found["key_points"][there], found["seen"][there], cameras.K[view].numpy(), distortion[view]
+                found["key_points"][there],
+                found["seen"][there],
+                cameras.K[view].numpy(),
+                distortion[view],
             )
         yield Recording(
-            name=folder.name, subject=folder.name, action=_action(folder.name), rate_hz=_RATE_HZ,
-            camera_names=names, cameras=cameras, key_points=key_points,
-            confidence=np.where(seen, confidence, 0).astype(np.float32), seen=seen,
-            truth=truth, truth_seen=truth_seen, frame=frame,
-        )  # fmt: skip
+            name=folder.name,
+            subject=folder.name,
+            action=_action(folder.name),
+            rate_hz=_RATE_HZ,
+            camera_names=names,
+            cameras=cameras,
+            key_points=key_points,
+            confidence=np.where(seen, confidence, 0).astype(np.float32),
+            seen=seen,
+            truth=truth,
+            truth_seen=truth_seen,
+            frame=frame,
+        )
 
 
 def joints17(
@@ -100,7 +136,9 @@ def _sequences(root: Path) -> list[Path]:
     sequences = [folder for folder in folders if _calibration(folder).is_file()]
     if not sequences:
         problem = "there is no <seq>/calibration_<seq>.json below"
-        raise GhptDataError(root, "", problem, "data.root must be the folder that holds the sequences' folders.")
+        raise GhptDataError(
+            root, "", problem, "data.root must be the folder that holds the sequences' folders."
+        )
     return sequences
 
 
@@ -111,7 +149,9 @@ def _calibration(folder: Path) -> Path:
 def _scenes(folder: Path) -> dict[int, Path]:
     """Frame number -> 3D file, in order of time."""
     files = (folder / _SCENES).iterdir() if (folder / _SCENES).is_dir() else ()
-    scenes = {int(m[1]): f for f in files if (m := re.fullmatch(r"body3DScene_(\d{1,12})\.json", f.name))}
+    scenes = {
+        int(m[1]): f for f in files if (m := re.fullmatch(r"body3DScene_(\d{1,12})\.json", f.name))
+    }
     if not scenes:
         raise GhptDataError(folder / _SCENES, "", "there is no body3DScene_<frame>.json", _GET)
     return dict(sorted(scenes.items()))
@@ -122,7 +162,9 @@ def _action(name: str) -> str:
     return name.partition("_")[2].rstrip("0123456789") or "unknown"
 
 
-def _cameras(folder: Path, numbers: Sequence[int]) -> tuple[tuple[str, ...], Cameras, Float[np.ndarray, "V 5"]]:
+def _cameras(
+    folder: Path, numbers: Sequence[int]
+) -> tuple[tuple[str, ...], Cameras, Float[np.ndarray, "V 5"]]:
     path = _calibration(folder)
     calibration = read_json(path)
     entries = calibration.get("cameras") if isinstance(calibration, dict) else None
@@ -140,17 +182,23 @@ def _cameras(folder: Path, numbers: Sequence[int]) -> tuple[tuple[str, ...], Cam
         for field, shape in {"K": (3, 3), "R": (3, 3), "t": (3, 1), "distCoef": (5,)}.items()
     }
     t = values["t"][..., 0] * _MM
-    cameras, distortion = check_cameras(path, names, values["K"], values["R"], t, values["distCoef"])
+    cameras, distortion = check_cameras(
+        path, names, values["K"], values["R"], t, values["distCoef"]
+    )
     return names, cameras, distortion
 
 
-def _numbers(path: Path, where: str, entry: dict[str, Any], field: str, shape: tuple[int, ...]) -> np.ndarray:
+def _numbers(
+    path: Path, where: str, entry: dict[str, Any], field: str, shape: tuple[int, ...]
+) -> np.ndarray:
     try:
         array = np.array(entry[field])
     except KeyError as error:
         raise GhptDataError(path, f"{where}, {field}", "is missing", _GET) from error
     except (ValueError, OverflowError) as error:
-        raise GhptDataError(path, f"{where}, {field}", "is not an array of numbers", _GET) from error
+        raise GhptDataError(
+            path, f"{where}, {field}", "is not an array of numbers", _GET
+        ) from error
     return check_array(path, f"{where}, {field}", array, shape, "fiu").astype(np.float64)
 
 
@@ -160,7 +208,11 @@ def _truth(files: Sequence[Path]) -> tuple[Float[np.ndarray, "T 17 3"], Bool[np.
     counts = Counter(body for scene in scenes for body in scene)
     person = min(counts, key=lambda body: (-counts[body], body), default=0)
     nobody = np.full((len(COCO19), 4), -1.0)
-    joints = np.stack([scene.get(person, nobody) for scene in scenes]) if scenes else np.empty((0, *nobody.shape))
+    joints = (
+        np.stack([scene.get(person, nobody) for scene in scenes])
+        if scenes
+        else np.empty((0, *nobody.shape))
+    )
     return joints17(joints[..., :3] * _MM, joints[..., 3] >= 0)
 
 
@@ -174,8 +226,14 @@ def _bodies(path: Path) -> dict[int, Float[np.ndarray, "19 4"]]:
     for body in bodies:
         number = body.get("id")
         if type(number) is not int or number in found:
-            raise GhptDataError(path, "id", f"is {number!r}: not a whole number, or there twice", _GET)
-        found[number] = _numbers(path, f"body {number}", body, "joints19", (4 * len(COCO19),)).reshape(-1, 4)
+            raise GhptDataError(
+                path, "id", f"is {number!r}: not a whole number, or there twice", _GET
+            )
+        found[number] = _numbers(
+            path, f"body {number}", body, "joints19", (4 * len(COCO19),)
+        ).reshape(-1, 4)
         if not (np.abs(found[number]) < 1e6).all():
-            raise GhptDataError(path, f"body {number}, joints19", "is not finite, or beyond 10 km", _GET)
+            raise GhptDataError(
+                path, f"body {number}, joints19", "is not finite, or beyond 10 km", _GET
+            )
     return found

@@ -1,4 +1,6 @@
-"""The user's 2D detections beside a Panoptic sequence: a file per HD camera, or the authors' one array."""
+"""The user's 2D detections beside a Panoptic sequence: a file per HD camera, or the authors' one
+array.
+"""
 
 from __future__ import annotations
 
@@ -27,19 +29,27 @@ def detection_files(folder: Path, numbers: Sequence[int]) -> list[Path]:
     if (folder / "keypoints").is_dir():
         for file in files:
             if not file.is_file():
-                raise GhptDataError(file, "", "there is no such file", "Each camera of the arrangement needs one.")
+                raise GhptDataError(
+                    file, "", "there is no such file", "Each camera of the arrangement needs one."
+                )
         return files
     if (folder / "all_2d_preds.npy").is_file():
         names = ("all_2d_preds.npy", "all_bboxes.npy", "all_frames.npy", "all_cameras.json")
         return [folder / name for name in names if (folder / name).is_file()]
     problem = "there are neither keypoints/00_<camera>.npz nor all_2d_preds.npy"
-    raise GhptDataError(folder, "", problem, "Run a 2D detector on the HD videos and put its key points there.")
+    raise GhptDataError(
+        folder, "", problem, "Run a 2D detector on the HD videos and put its key points there."
+    )
 
 
-def detections(folder: Path, numbers: Sequence[int], frames: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
-    """For each camera: frame [N], key_points [N 17 2] in raw pixels, confidence [N 17], seen [N 17].
+def detections(
+    folder: Path, numbers: Sequence[int], frames: Sequence[int]
+) -> Iterator[dict[str, np.ndarray]]:
+    """For each camera: frame [N], key_points [N 17 2] in raw pixels, confidence [N 17], seen [N
+    17].
 
-    ``frames`` are the sequence's. Raises GhptDataError if a file is missing, damaged or not what it should be.
+    ``frames`` are the sequence's. Raises GhptDataError if a file is missing, damaged or not what it
+    should be.
     """
     files = detection_files(folder, numbers)
     if files[0].name == "all_2d_preds.npy":
@@ -49,33 +59,47 @@ def detections(folder: Path, numbers: Sequence[int], frames: Sequence[int]) -> I
     for file, arrays in found:
         arrays["frame"] = arrays["frame"].astype(np.int64)
         if len(np.unique(arrays["frame"])) != len(arrays["frame"]):
-            raise GhptDataError(file, "frame", "holds a frame number twice", "Keep one detection for each frame.")
+            raise GhptDataError(
+                file, "frame", "holds a frame number twice", "Keep one detection for each frame."
+            )
         if not np.isin(arrays["frame"], frames).any():
-            problem = f"holds none of the frames {min(frames)} to {max(frames)} of the body3DScene files"
+            problem = (
+                f"holds none of the frames {min(frames)} to {max(frames)} of the body3DScene files"
+            )
             raise GhptDataError(file, "frame", problem, "Number the frames as Panoptic does.")
         yield arrays
 
 
 def _own(file: Path) -> dict[str, np.ndarray]:
     joints = len(JOINT)
-    fields = {"frame": ((None,), "iu"), "key_points": ((None, joints, 2), "f"),
-              "confidence": ((None, joints), "f"), "seen": ((None, joints), "b")}  # fmt: skip
+    fields = {
+        "frame": ((None,), "iu"),
+        "key_points": ((None, joints, 2), "f"),
+        "confidence": ((None, joints), "f"),
+        "seen": ((None, joints), "b"),
+    }
     arrays = read_npz(file, fields)
     for field, (shape, kinds) in fields.items():
         check_array(file, field, arrays[field], (len(arrays["frame"]), *shape[1:]), kinds)
     confidence = arrays["confidence"][arrays["seen"]]
     if not ((confidence >= 0) & (confidence <= 1)).all():
-        raise GhptDataError(file, "confidence", "is not between 0 and 1 everywhere", "Scale it, or mask with seen.")
+        raise GhptDataError(
+            file, "confidence", "is not between 0 and 1 everywhere", "Scale it, or mask with seen."
+        )
     return arrays
 
 
-def _authors(folder: Path, numbers: Sequence[int], frames: Sequence[int]) -> Iterator[dict[str, np.ndarray]]:
+def _authors(
+    folder: Path, numbers: Sequence[int], frames: Sequence[int]
+) -> Iterator[dict[str, np.ndarray]]:
     path = folder / "all_2d_preds.npy"
     names = [hd_name(number) for number in range(_HD_CAMERAS)]
     if (folder / "all_cameras.json").is_file():
         names = read_json(folder / "all_cameras.json")
         if not isinstance(names, list):
-            raise GhptDataError(folder / "all_cameras.json", "", "is not a list", 'Write ["00_03", "00_06", ...].')
+            raise GhptDataError(
+                folder / "all_cameras.json", "", "is not a list", 'Write ["00_03", "00_06", ...].'
+            )
     wanted = [hd_name(number) for number in numbers]
     check_names(path, names)
     check_names(path, wanted, names)
@@ -86,7 +110,9 @@ def _authors(folder: Path, numbers: Sequence[int], frames: Sequence[int]) -> Ite
         frame = np.array(frames)
     else:
         problem = f"has {len(predictions)} frames, and there are {len(frames)} body3DScene files"
-        raise GhptDataError(path, "", problem, "Put the frame numbers beside it, as all_frames.npy.")
+        raise GhptDataError(
+            path, "", problem, "Put the frame numbers beside it, as all_frames.npy."
+        )
     boxes = None
     if (folder / "all_bboxes.npy").is_file():
         boxes = read_npy(folder / "all_bboxes.npy", (len(predictions), len(names), 2, 2), "fiu")
@@ -96,5 +122,9 @@ def _authors(folder: Path, numbers: Sequence[int], frames: Sequence[int]) -> Ite
         there = np.ones(pixels.shape[:-1], np.bool_)
         if boxes is not None:
             pixels, there = in_image(pixels, boxes[:, view].astype(np.float64))
-        yield {"frame": frame, "key_points": pixels[:, 0], "seen": there[:, 0],
-               "confidence": np.ones(there.shape[::2], np.float32)}  # fmt: skip
+        yield {
+            "frame": frame,
+            "key_points": pixels[:, 0],
+            "seen": there[:, 0],
+            "confidence": np.ones(there.shape[::2], np.float32),
+        }

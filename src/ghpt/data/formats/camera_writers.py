@@ -1,4 +1,6 @@
-"""Calibrated cameras in the formats that others read: Pose2Sim and aniposelib TOML, OpenCV / EasyMocap yml; metres."""
+"""Calibrated cameras in the formats that others read: Pose2Sim and aniposelib TOML, OpenCV /
+EasyMocap yml; metres.
+"""
 
 from __future__ import annotations
 
@@ -26,8 +28,10 @@ def write_pose2sim(path: str | Path, rig: Rig, metadata: Metadata) -> None:
 
     Its lens model is OpenCV's, so a k3 that is not 0 is written as a fifth coefficient.
     """
-    keys = [name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
-            for name in rig.names]  # fmt: skip
+    keys = [
+        name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
+        for name in rig.names
+    ]
     lenses = [lens if lens[4] != 0 else lens[:4] for lens in rig.distortion.tolist()]
     _write_toml(path, rig, keys, lenses, metadata)
 
@@ -35,42 +39,64 @@ def write_pose2sim(path: str | Path, rig: Rig, metadata: Metadata) -> None:
 def write_aniposelib(path: str | Path, rig: Rig, metadata: Metadata) -> None:
     """A TOML file that aniposelib's ``CameraGroup.load`` reads.
 
-    It takes the tables in the order of their keys as texts, so these have leading zeros: cam_02 before cam_10.
+    It takes the tables in the order of their keys as texts, so these have leading zeros: cam_02
+    before cam_10.
     """
     digits = len(str(len(rig) - 1))
-    _write_toml(path, rig, [f"cam_{i:0{digits}d}" for i in range(len(rig))], rig.distortion.tolist(), metadata)
+    _write_toml(
+        path,
+        rig,
+        [f"cam_{i:0{digits}d}" for i in range(len(rig))],
+        rig.distortion.tolist(),
+        metadata,
+    )
 
 
 def write_opencv(folder: str | Path, rig: Rig) -> None:
-    """``intri.yml`` and ``extri.yml`` as EasyMocap's ``read_camera`` and OpenCV's ``FileStorage`` read them.
+    """``intri.yml`` and ``extri.yml`` as EasyMocap's ``read_camera`` and OpenCV's ``FileStorage``
+    read them.
 
-    FileStorage knows letters, digits, _ and - in a key; another character of a camera's name becomes _. Raises
-    GhptDataError if two names are then the same.
+    FileStorage knows letters, digits, _ and - in a key; another character of a camera's name
+    becomes _. Raises GhptDataError if two names are then the same.
     """
     names = [re.sub(r"[^A-Za-z0-9_-]", "_", name) for name in rig.names]
     if len(set(names)) != len(names):
-        raise GhptDataError(Path(folder) / "intri.yml", "names", f"are the same in yml: {', '.join(rig.names)}",
-                            "Name the cameras by letters, digits, _ and -.")  # fmt: skip
+        raise GhptDataError(
+            Path(folder) / "intri.yml",
+            "names",
+            f"are the same in yml: {', '.join(rig.names)}",
+            "Name the cameras by letters, digits, _ and -.",
+        )
     vectors = matrix_to_vector(rig.cameras.R)
     listed = ["names:", *(f'  - "{name}"' for name in names)]
-    intrinsic, extrinsic = list(listed), list(listed)
+    intrinsic = list(listed)
+    extrinsic = list(listed)
     for i, name in enumerate(names):
-        intrinsic += [*_matrix(f"K_{name}", rig.cameras.K[i]), *_matrix(f"dist_{name}", rig.distortion[i][None])]
+        intrinsic += [
+            *_matrix(f"K_{name}", rig.cameras.K[i]),
+            *_matrix(f"dist_{name}", rig.distortion[i][None]),
+        ]
         width, height = rig.size[i].tolist()
         intrinsic += [f"H_{name}: {height}", f"W_{name}: {width}"] if width > 0 else []
         extrinsic += [
-            *_matrix(f"R_{name}", vectors[i][:, None]), *_matrix(f"Rot_{name}", rig.cameras.R[i]),
+            *_matrix(f"R_{name}", vectors[i][:, None]),
+            *_matrix(f"Rot_{name}", rig.cameras.R[i]),
             *_matrix(f"T_{name}", rig.cameras.t[i][:, None] / _MM_PER_M),
-        ]  # fmt: skip
+        ]
     for file, lines in (("intri.yml", intrinsic), ("extri.yml", extrinsic)):
         with atomic_write(Path(folder) / file, "w", verify=read_yml) as handle:
             handle.write("\n".join(["%YAML:1.0", "---", *lines, ""]))
 
 
 def _write_toml(
-    path: str | Path, rig: Rig, keys: Sequence[str], lenses: Sequence[Sequence[float]], metadata: Metadata
+    path: str | Path,
+    rig: Rig,
+    keys: Sequence[str],
+    lenses: Sequence[Sequence[float]],
+    metadata: Metadata,
 ) -> None:
-    vectors, metres = matrix_to_vector(rig.cameras.R).tolist(), (rig.cameras.t / _MM_PER_M).tolist()
+    vectors = matrix_to_vector(rig.cameras.R).tolist()
+    metres = (rig.cameras.t / _MM_PER_M).tolist()
     lines = []
     for i, (key, name) in enumerate(zip(keys, rig.names, strict=True)):
         lines += [
@@ -86,11 +112,19 @@ def _write_toml(
         ]
     values = {key: json.dumps(value, ensure_ascii=False) for key, value in metadata.items()}
     lines += ["[metadata]", *(f"{key} = {value}" for key, value in values.items()), ""]
-    with atomic_write(path, "w", verify=lambda file: tomllib.loads(file.read_text(encoding="utf-8"))) as handle:
+    with atomic_write(
+        path, "w", verify=lambda file: tomllib.loads(file.read_text(encoding="utf-8"))
+    ) as handle:
         handle.write("\n".join(lines))
 
 
 def _matrix(key: str, values: Float[Tensor, "rows cols"]) -> list[str]:
     rows, cols = values.shape
     numbers = ", ".join(map(repr, values.flatten().tolist()))
-    return [f"{key}: !!opencv-matrix", f"  rows: {rows}", f"  cols: {cols}", "  dt: d", f"  data: [{numbers}]"]
+    return [
+        f"{key}: !!opencv-matrix",
+        f"  rows: {rows}",
+        f"  cols: {cols}",
+        "  dt: d",
+        f"  data: [{numbers}]",
+    ]

@@ -21,18 +21,22 @@ _Found = list[tuple[int, Float[np.ndarray, "K 3"]]]
 
 
 def read_coco(path: Path, skeleton: str | None) -> People:
-    """Everybody in COCO results: a folder with a file for each camera, or one file with the names of the images.
+    """Everybody in COCO results: a folder with a file for each camera, or one file with the names
+    of the images.
 
-    In a folder the file's name is the view's. In one file it is the folder of the image (``cam1/000012.jpg``), or the
-    image's name before its last number (``cam1_000012.jpg``). The frame number is the last number of the image's name,
-    or the ``image_id`` where that is a number without a name. 17 joints are COCO's. Raises GhptDataError.
+    In a folder the file's name is the view's. In one file it is the folder of the image
+    (``cam1/000012.jpg``), or the image's name before its last number (``cam1_000012.jpg``). The
+    frame number is the last number of the image's name, or the ``image_id`` where that is a number
+    without a name. 17 joints are COCO's. Raises GhptDataError.
     """
     files = json_files(path)
     found: list[Detections] = []
     for file in files:
         views, frames = _views(file, named=path.is_dir())
         found += [detections(file, view, frames[view], views[view]) for view in sorted(frames)]
-    coco = {view.values.shape[1] for view in found if len(view.values)} == {len(SKELETONS["coco_17"])}
+    coco = {view.values.shape[1] for view in found if len(view.values)} == {
+        len(SKELETONS["coco_17"])
+    }
     return gather(path, found, SKELETONS["coco_17"] if coco else None, skeleton)
 
 
@@ -81,8 +85,14 @@ def _image(file: Path, image: int | str | None, named: bool) -> tuple[str, int]:
     name = PurePosixPath(image.replace("\\", "/")) if isinstance(image, str) else PurePosixPath()
     digits = list(re.finditer(r"\d+", name.stem))
     if not digits or len(digits[-1][0]) > 15:
-        problem = f"{image!r} has no frame number" if image is not None else "an image has neither number nor name"
-        raise GhptDataError(file, "image_id", problem, "Name the images like cam1/000012.jpg, or number them.")
+        problem = (
+            f"{image!r} has no frame number"
+            if image is not None
+            else "an image has neither number nor name"
+        )
+        raise GhptDataError(
+            file, "image_id", problem, "Name the images like cam1/000012.jpg, or number them."
+        )
     before = name.stem[: digits[-1].start()].rstrip(" _.-")
     view = name.parent.name or before or view_name(file)
     return (view_name(file) if named else view), int(digits[-1][0])

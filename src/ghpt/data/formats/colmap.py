@@ -26,10 +26,16 @@ _LARGEST = 1 << 30
 """Bytes of images.bin or images.txt, which hold every image's points."""
 _MEND = "Export the model again with COLMAP's model_converter."
 _MODELS = {
-    0: ("SIMPLE_PINHOLE", 3), 1: ("PINHOLE", 4), 2: ("SIMPLE_RADIAL", 4), 3: ("RADIAL", 5), 4: ("OPENCV", 8),
+    0: ("SIMPLE_PINHOLE", 3),
+    1: ("PINHOLE", 4),
+    2: ("SIMPLE_RADIAL", 4),
+    3: ("RADIAL", 5),
+    4: ("OPENCV", 8),
     6: ("FULL_OPENCV", 12),
-}  # fmt: skip
-"""Number in binary files -> name, count of parameters, of the models whose lens OpenCV's k1 k2 p1 p2 k3 can be."""
+}
+"""Number in binary files -> name, count of parameters, of the models whose lens OpenCV's k1 k2 p1
+p2 k3 can be.
+"""
 
 
 class Image(NamedTuple):
@@ -60,15 +66,20 @@ def is_colmap(folder: Path) -> bool:
 
 
 def read_colmap(folder: Path) -> list[ColmapCamera]:
-    """The cameras of a folder with cameras and images as .bin or .txt, in the order of the images' names.
+    """The cameras of a folder with cameras and images as .bin or .txt, in the order of the images'
+    names.
 
-    An image's camera is called as the image, without its ending; where images are called alike (``cam1/0001.png``,
-    ``cam2/0001.png``), as their folders. COLMAP's first pixel has its centre at (0.5, 0.5), ours at (0, 0). Raises
-    GhptDataError for a damaged file, a lens that is not k1 k2 p1 p2 k3, and several images of one camera.
+    An image's camera is called as the image, without its ending; where images are called alike
+    (``cam1/0001.png``, ``cam2/0001.png``), as their folders. COLMAP's first pixel has its centre at
+    (0.5, 0.5), ours at (0, 0). Raises GhptDataError for a damaged file, a lens that is not k1 k2 p1
+    p2 k3, and several images of one camera.
     """
     end = "bin" if (folder / "images.bin").is_file() else "txt"
-    camera_file, image_file = folder / f"cameras.{end}", folder / f"images.{end}"
-    read_cameras, read_images = (_camera_bytes, _image_bytes) if end == "bin" else (_camera_lines, _image_lines)
+    camera_file = folder / f"cameras.{end}"
+    image_file = folder / f"images.{end}"
+    read_cameras, read_images = (
+        (_camera_bytes, _image_bytes) if end == "bin" else (_camera_lines, _image_lines)
+    )
     try:
         found = list(islice(read_cameras(_content(camera_file)), MOST_VIEWS + 1))
     except (struct.error, ValueError, OverflowError) as error:
@@ -84,22 +95,34 @@ def read_colmap(folder: Path) -> list[ColmapCamera]:
     rig = []
     for image, (name, other) in zip(images, names, strict=True):
         if image.camera not in cameras:
-            raise GhptDataError(image_file, f"image {image.name}", f"there is no camera {image.camera}", _MEND)
+            raise GhptDataError(
+                image_file, f"image {image.name}", f"there is no camera {image.camera}", _MEND
+            )
         model, size, parameters = cameras[image.camera]
         K, lens = _intrinsics(camera_file, name, model, parameters)
-        rig.append(ColmapCamera(name, other, K, lens, size, _rotation(image_file, image), np.array(image.t)))
+        rig.append(
+            ColmapCamera(
+                name, other, K, lens, size, _rotation(image_file, image), np.array(image.t)
+            )
+        )
     return rig
 
 
 def _content(path: Path) -> bytes:
     with open_input(path) as handle:
         if path.stat().st_size > _LARGEST:
-            raise GhptDataError(path, "", f"has more than {_LARGEST >> 30} GiB", "Give a model of the rig's cameras.")
+            raise GhptDataError(
+                path,
+                "",
+                f"has more than {_LARGEST >> 30} GiB",
+                "Give a model of the rig's cameras.",
+            )
         return handle.read()
 
 
 def _camera_bytes(data: bytes) -> Iterator[tuple[int, int | str, tuple[int, int], list[float]]]:
-    (count,), at = struct.unpack_from("<Q", data), 8
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
     for _ in range(count):
         number, model, width, height = struct.unpack_from("<IiQQ", data, at)
         if model not in _MODELS:
@@ -111,7 +134,8 @@ def _camera_bytes(data: bytes) -> Iterator[tuple[int, int | str, tuple[int, int]
 
 
 def _image_bytes(data: bytes) -> Iterator[Image]:
-    (count,), at = struct.unpack_from("<Q", data), 8
+    (count,) = struct.unpack_from("<Q", data)
+    at = 8
     for _ in range(count):
         _, *pose, camera = struct.unpack_from("<I7dI", data, at)
         end = data.index(0, at + 64)
@@ -126,7 +150,12 @@ def _camera_lines(data: bytes) -> Iterator[tuple[int, int | str, tuple[int, int]
     for line in _lines(data):
         if line:
             number, model, width, height, *parameters = line.split()
-            yield int(number), model, (int(width), int(height)), [float(value) for value in parameters]
+            yield (
+                int(number),
+                model,
+                (int(width), int(height)),
+                [float(value) for value in parameters],
+            )
 
 
 def _image_lines(data: bytes) -> Iterator[Image]:
@@ -134,7 +163,12 @@ def _image_lines(data: bytes) -> Iterator[Image]:
     for line in islice(_lines(data), 0, None, 2):
         if line:
             _, w, x, y, z, t1, t2, t3, camera, name = line.split(maxsplit=9)
-            yield Image(name, (float(w), float(x), float(y), float(z)), (float(t1), float(t2), float(t3)), int(camera))
+            yield Image(
+                name,
+                (float(w), float(x), float(y), float(z)),
+                (float(t1), float(t2), float(t3)),
+                int(camera),
+            )
 
 
 def _lines(data: bytes) -> Iterator[str]:
@@ -147,30 +181,46 @@ def _names(where: Path, paths: list[PurePosixPath]) -> list[tuple[str, str]]:
     for of in (lambda p: p.stem, lambda p: p.parent.name):
         names = [of(path) for path in paths]
         if len({*names}) == len(names) and all(names):
-            return [(name, str(path.parent / path.stem)) for name, path in zip(names, paths, strict=True)]
+            return [
+                (name, str(path.parent / path.stem))
+                for name, path in zip(names, paths, strict=True)
+            ]
     mend = "A rig's cameras stand still: keep one image of each, called as its view."
-    raise GhptDataError(where, "images", f"are {len(paths)} with names that tell no cameras apart", mend)
+    raise GhptDataError(
+        where, "images", f"are {len(paths)} with names that tell no cameras apart", mend
+    )
 
 
-def _intrinsics(where: Path, name: str, model: int | str, parameters: list[float]) -> tuple[np.ndarray, np.ndarray]:
+def _intrinsics(
+    where: Path, name: str, model: int | str, parameters: list[float]
+) -> tuple[np.ndarray, np.ndarray]:
     counts = dict(_MODELS.values())
     if model not in counts or len(parameters) != counts[model]:
         problem = f"is of the model {model} with {len(parameters)} parameters"
         raise GhptDataError(
-            where, f"camera {name}", problem, f"Known: {', '.join(counts)}; undistort the images first."
+            where,
+            f"camera {name}",
+            problem,
+            f"Known: {', '.join(counts)}; undistort the images first.",
         )
     focal = 1 if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else 2
-    fx, fy = parameters[0], parameters[focal - 1]
-    (cx, cy), rest = parameters[focal : focal + 2], parameters[focal + 2 :]
+    fx = parameters[0]
+    fy = parameters[focal - 1]
+    (cx, cy) = parameters[focal : focal + 2]
+    rest = parameters[focal + 2 :]
     lens = np.zeros(8)
     lens[: len(rest)] = rest  # k1 k2 p1 p2 k3 k4 k5 k6, OpenCV's order
     if lens[5:].any():
-        raise GhptDataError(where, f"camera {name}", "has k4, k5 or k6", "Calibrate it with the model OPENCV.")
+        raise GhptDataError(
+            where, f"camera {name}", "has k4, k5 or k6", "Calibrate it with the model OPENCV."
+        )
     return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]), lens[:5]
 
 
 def _rotation(where: Path, image: Image) -> Float[np.ndarray, "3 3"]:
     length = math.hypot(*image.wxyz)
     if not 0.5 < length < 2:
-        raise GhptDataError(where, f"image {image.name}", "has a quaternion that is not of length 1", _MEND)
+        raise GhptDataError(
+            where, f"image {image.name}", "has a quaternion that is not of length 1", _MEND
+        )
     return quaternion_to_matrix(torch.tensor(image.wxyz, dtype=torch.float64) / length).numpy()

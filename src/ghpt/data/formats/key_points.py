@@ -1,4 +1,6 @@
-"""People's own 2D key points, as a detector wrote them: the format is recognised by its content, or named."""
+"""People's own 2D key points, as a detector wrote them: the format is recognised by its content, or
+named.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,12 @@ from ghpt.data.formats.authors_npy import read_authors
 from ghpt.data.formats.coco import read_coco
 from ghpt.data.formats.mediapipe import is_caliscope, opening, read_caliscope
 from ghpt.data.formats.mmpose import read_mmpose
-from ghpt.data.formats.movement_files import EXTENSIONS, read_deeplabcut, read_lightning_pose, read_sleap
+from ghpt.data.formats.movement_files import (
+    EXTENSIONS,
+    read_deeplabcut,
+    read_lightning_pose,
+    read_sleap,
+)
 from ghpt.data.formats.openpose import follow_views, read_openpose
 from ghpt.data.formats.own_npz import read_own, write_key_points
 from ghpt.data.formats.skeletons import SKELETONS, joints_of, parts_of
@@ -30,10 +37,13 @@ _MEND = (
 
 
 def read_people(
-    path: str | Path, skeleton: str | None = None, rate_hz: int | float | None = None, format: str | None = None
+    path: str | Path,
+    skeleton: str | None = None,
+    rate_hz: int | float | None = None,
+    format: str | None = None,
 ) -> People:
-    """Everybody in a folder or file of key points; ``skeleton`` and ``rate_hz`` say what the files do not, or overrule
-    them; ``format`` is one of ``FORMATS``, and recognised by content if None.
+    """Everybody in a folder or file of key points; ``skeleton`` and ``rate_hz`` say what the files
+    do not, or overrule them; ``format`` is one of ``FORMATS``, and recognised by content if None.
 
     Raises GhptDataError for what is damaged, empty or not known, naming file, field and mend.
     """
@@ -42,22 +52,31 @@ def read_people(
     if skeleton is not None:
         joints_of(path, skeleton)
     if format is not None and format not in FORMATS:
-        raise GhptDataError(path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}.")
+        raise GhptDataError(
+            path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
+        )
     found = FORMATS[format or _recognised(path)](path, skeleton)
     people = everyone(found) if isinstance(found, KeyPoints) else found
     parts_of(path, people.joints)
     seen_by = set(people.view[people.seen.any(-1)].tolist())
     for view, name in enumerate(people.views):
         if view not in seen_by:
-            raise GhptDataError(path, f"view {name}", "has no key point", "Detect this view again, or leave it out.")
+            raise GhptDataError(
+                path, f"view {name}", "has no key point", "Detect this view again, or leave it out."
+            )
     return people if rate_hz is None else replace(people, rate_hz=rate)
 
 
 def read_key_points(
-    path: str | Path, skeleton: str | None = None, rate_hz: int | float | None = None, format: str | None = None
+    path: str | Path,
+    skeleton: str | None = None,
+    rate_hz: int | float | None = None,
+    format: str | None = None,
 ) -> KeyPoints:
-    """The one person of ``read_people`` who is tracked best in each view (``ghpt.data.formats.openpose.follow``), without
-    regard to the other views: `ghpt.data.people.views.look_through` chooses better where cameras are calibrated."""
+    """The one person of ``read_people`` who is tracked best in each view
+    (``ghpt.data.formats.openpose.follow``), without regard to the other views:
+    `ghpt.data.people.views.look_through` chooses better where cameras are calibrated.
+    """
     people = read_people(path, skeleton, rate_hz, format)
     return people.pick(follow_views(people))
 
@@ -65,13 +84,30 @@ def read_key_points(
 def _caliscope(path: Path, _: str | None) -> KeyPoints:
     views, frame, points, seen = read_caliscope(path)
     joints = SKELETONS["mediapipe_33"]
-    return KeyPoints(str(path), views, joints, frame, points, seen.astype(np.float64), seen, None, (0,) * len(views))
+    return KeyPoints(
+        str(path),
+        views,
+        joints,
+        frame,
+        points,
+        seen.astype(np.float64),
+        seen,
+        None,
+        (0,) * len(views),
+    )
 
 
 FORMATS: dict[str, Callable[[Path, str | None], KeyPoints | People]] = {
-    "openpose": read_openpose, "coco": read_coco, "mmpose": read_mmpose, "caliscope": _caliscope, "npz": read_own,
-    "authors": read_authors, "deeplabcut": read_deeplabcut, "sleap": read_sleap, "lightningpose": read_lightning_pose,
-}  # fmt: skip
+    "openpose": read_openpose,
+    "coco": read_coco,
+    "mmpose": read_mmpose,
+    "caliscope": _caliscope,
+    "npz": read_own,
+    "authors": read_authors,
+    "deeplabcut": read_deeplabcut,
+    "sleap": read_sleap,
+    "lightningpose": read_lightning_pose,
+}
 
 
 def _recognised(path: Path) -> str:
@@ -83,7 +119,9 @@ def _recognised(path: Path) -> str:
         return form
     if any(path.glob("all_2d_preds*.npy")):
         return "authors"
-    inside = (file for file in sorted(path.iterdir()) if file.suffix.lower() in (".json", *EXTENSIONS))
+    inside = (
+        file for file in sorted(path.iterdir()) if file.suffix.lower() in (".json", *EXTENSIONS)
+    )
     first = next(inside, None)
     return "openpose" if first is None else _of_file(first) or "openpose"
 

@@ -27,7 +27,11 @@ _JOINTS = len(SKELETONS["mediapipe_33"])
 
 def opening(start: bytes) -> str:
     """The text that a file begins with, whatever its encoding's mark says (UTF-8 without one)."""
-    marks = ((codecs.BOM_UTF8, "utf-8"), (codecs.BOM_UTF16_LE, "utf-16-le"), (codecs.BOM_UTF16_BE, "utf-16-be"))
+    marks = (
+        (codecs.BOM_UTF8, "utf-8"),
+        (codecs.BOM_UTF16_LE, "utf-16-le"),
+        (codecs.BOM_UTF16_BE, "utf-16-be"),
+    )
     for mark, encoding in marks:
         if start.startswith(mark):
             return start[len(mark) :].decode(encoding, "replace").lstrip()
@@ -35,18 +39,23 @@ def opening(start: bytes) -> str:
 
 
 def is_caliscope(text: str) -> bool:
-    """Whether a file that starts so is one of caliscope's 2D tables, its columns parted by commas or not."""
+    """Whether a file that starts so is one of caliscope's 2D tables, its columns parted by commas
+    or not.
+    """
     header = text.splitlines()[0] if text else ""
     return set(COLUMNS) <= {name.strip().strip('"') for name in re.split("[,;\t]", header)}
 
 
 def read_caliscope(
     path: Path,
-) -> tuple[tuple[str, ...], Int[np.ndarray, " T"], Float[np.ndarray, "T V K 2"], Bool[np.ndarray, "T V K"]]:
-    """Camera names (``cam_<port>``), frames (``sync_index``), the body's 33 landmarks (pixels) and which are there.
+) -> tuple[
+    tuple[str, ...], Int[np.ndarray, " T"], Float[np.ndarray, "T V K 2"], Bool[np.ndarray, "T V K"]
+]:
+    """Camera names (``cam_<port>``), frames (``sync_index``), the body's 33 landmarks (pixels) and
+    which are there.
 
-    Points beyond the body's (hands, face) are left out. There is no confidence in these files. Raises GhptDataError
-    for a table that is damaged, or that has a point twice.
+    Points beyond the body's (hands, face) are left out. There is no confidence in these files.
+    Raises GhptDataError for a table that is damaged, or that has a point twice.
     """
     table = _table(path)
     body = (table[:, 2] >= 0) & (table[:, 2] < _JOINTS)
@@ -60,9 +69,12 @@ def read_caliscope(
         raise GhptDataError(path, "port", f"names {len(ports)} cameras", _WRITE)
     place = (row * len(ports) + view) * _JOINTS + index[:, 2]
     if len(np.unique(place)) != len(place):
-        raise GhptDataError(path, "point_id", "a point is there twice in a frame of a camera", _WRITE)
+        raise GhptDataError(
+            path, "point_id", "a point is there twice in a frame of a camera", _WRITE
+        )
     shape = (len(frames), len(ports), _JOINTS)
-    points, seen = np.zeros((*shape, 2)), np.zeros(shape, np.bool_)
+    points = np.zeros((*shape, 2))
+    seen = np.zeros(shape, np.bool_)
     points.reshape(-1, 2)[place], seen.reshape(-1)[place] = table[:, 3:5], True
     return tuple(f"cam_{port}" for port in ports), frames, points, seen
 
@@ -75,13 +87,17 @@ def _table(path: Path) -> Float[np.ndarray, "N 5"]:
         encoding = "utf-16" if utf16 else "utf-8-sig"
         raw.seek(-min(2, path.stat().st_size), 2)
         if not raw.read().strip(b"\0").endswith((b"\n", b"\r")):
-            raise GhptDataError(path, "", "ends in the middle of a line: it is truncated", "Copy it again.")
+            raise GhptDataError(
+                path, "", "ends in the middle of a line: it is truncated", "Copy it again."
+            )
         raw.seek(0)
         with io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline="") as handle:
             table = _rows(path, handle)
     whole = table[:, :3][np.isfinite(table[:, :3])]
     if not (np.abs(np.nan_to_num(table)) < 1e12).all() or (whole != np.round(whole)).any():
-        raise GhptDataError(path, "", "holds an index that is not whole, or a number beyond 1e12", _WRITE)
+        raise GhptDataError(
+            path, "", "holds an index that is not whole, or a number beyond 1e12", _WRITE
+        )
     return table
 
 
@@ -104,7 +120,9 @@ def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
         empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a table without rows
-            table = np.loadtxt(_lines(handle), delimiter=",", usecols=columns, converters=empty, ndmin=2)
+            table = np.loadtxt(
+                _lines(handle), delimiter=",", usecols=columns, converters=empty, ndmin=2
+            )
     except (ValueError, StopIteration, csv.Error) as error:
         raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
     return table.reshape(-1, len(COLUMNS))

@@ -20,7 +20,8 @@ _MEND = "It must be a file that MMPose wrote for a video (save_predictions, or p
 def read_mmpose(path: Path, skeleton: str | None) -> People:
     """Everybody in a folder with MMPose's file of each camera; the files' names are the views'.
 
-    Frame numbers are ``frame_id``; the joints' names those of ``meta_info``, if it is there. Raises GhptDataError.
+    Frame numbers are ``frame_id``; the joints' names those of ``meta_info``, if it is there. Raises
+    GhptDataError.
     """
     found: list[Detections] = []
     named: dict[tuple[str, ...], Path] = {}
@@ -34,38 +35,60 @@ def read_mmpose(path: Path, skeleton: str | None) -> People:
         view = _view(file, frames)
         if joints is not None and len(view.values) and view.values.shape[1] != len(joints):
             problem = f"names {len(joints)} joints, and people have {view.values.shape[1]}"
-            raise GhptDataError(file, "meta_info.keypoint_id2name", problem, "Detect this view again.")
+            raise GhptDataError(
+                file, "meta_info.keypoint_id2name", problem, "Detect this view again."
+            )
         named.setdefault(joints or (), file)
         found.append(view)
     if len(named) > 1:
         problem = f"names other joints than {next(iter(named.values())).name}"
-        raise GhptDataError(list(named.values())[1], "meta_info", problem, "Detect all views with one model.")
+        raise GhptDataError(
+            list(named.values())[1], "meta_info", problem, "Detect all views with one model."
+        )
     return gather(path, found, next(iter(named)) or None, skeleton)
 
 
 def _view(file: Path, frames: list[dict[str, Any]]) -> Detections:
-    numbers, found = [], []
+    numbers = []
+    found = []
     for index, frame in enumerate(frames):
-        number, people = frame.get("frame_id"), frame.get("instances")
+        number = frame.get("frame_id")
+        people = frame.get("instances")
         if type(number) is not int or not 0 <= number < 10**15:
-            raise GhptDataError(file, f"instance_info[{index}].frame_id", "is not a frame number", _MEND)
+            raise GhptDataError(
+                file, f"instance_info[{index}].frame_id", "is not a frame number", _MEND
+            )
         if not isinstance(people, list) or not all(isinstance(person, dict) for person in people):
-            raise GhptDataError(file, f"instance_info[{index}].instances", "is not a list of people", _MEND)
+            raise GhptDataError(
+                file, f"instance_info[{index}].instances", "is not a list of people", _MEND
+            )
         check_people(file, f"instance_info[{index}].instances", len(people))
         numbers.append(number)
-        found += [(number, _person(file, f"instance_info[{index}].instances[{i}]", p)) for i, p in enumerate(people)]
+        found += [
+            (number, _person(file, f"instance_info[{index}].instances[{i}]", p))
+            for i, p in enumerate(people)
+        ]
     if len(set(numbers)) != len(numbers):
         raise GhptDataError(file, "frame_id", "is there twice", "Keep one entry for each frame.")
     return detections(file, view_name(file), numbers, found)
 
 
 def _person(file: Path, field: str, person: dict[str, Any]) -> Float[np.ndarray, "K 3"]:
-    points, scores = person.get("keypoints"), person.get("keypoint_scores")
-    if not isinstance(points, list) or not all(isinstance(point, list) and len(point) == 2 for point in points):
+    points = person.get("keypoints")
+    scores = person.get("keypoint_scores")
+    if not isinstance(points, list) or not all(
+        isinstance(point, list) and len(point) == 2 for point in points
+    ):
         raise GhptDataError(file, f"{field}.keypoints", "is not a list of [x, y]", _MEND)
     if not isinstance(scores, list) or len(scores) != len(points):
-        raise GhptDataError(file, f"{field}.keypoint_scores", "is not a list of a score for each joint", _MEND)
-    return triples(file, field, [x for point, score in zip(points, scores, strict=True) for x in (*point, score)])
+        raise GhptDataError(
+            file, f"{field}.keypoint_scores", "is not a list of a score for each joint", _MEND
+        )
+    return triples(
+        file,
+        field,
+        [x for point, score in zip(points, scores, strict=True) for x in (*point, score)],
+    )
 
 
 def _joints(file: Path, meta: Any) -> tuple[str, ...] | None:
@@ -73,6 +96,12 @@ def _joints(file: Path, meta: Any) -> tuple[str, ...] | None:
     if names is None:
         return None
     numbers = [str(index) for index in range(len(names))] if isinstance(names, dict) else []
-    if not numbers or set(names) != set(numbers) or not all(type(name) is str for name in names.values()):
-        raise GhptDataError(file, "meta_info.keypoint_id2name", "does not name the joints from 0 on", _MEND)
+    if (
+        not numbers
+        or set(names) != set(numbers)
+        or not all(type(name) is str for name in names.values())
+    ):
+        raise GhptDataError(
+            file, "meta_info.keypoint_id2name", "does not name the joints from 0 on", _MEND
+        )
     return canonical([names[number] for number in numbers])

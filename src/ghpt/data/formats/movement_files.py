@@ -15,13 +15,19 @@ from ghpt.errors import GhptDataError
 
 EXTENSIONS = (".csv", ".h5", ".slp")
 _INSTALL = "Install it: pip install movement"
-_LOADERS = {"DeepLabCut": "from_dlc_file", "LightningPose": "from_lp_file", "SLEAP": "from_sleap_file"}
+_LOADERS = {
+    "DeepLabCut": "from_dlc_file",
+    "LightningPose": "from_lp_file",
+    "SLEAP": "from_sleap_file",
+}
 _LARGEST = 2 << 30
 """Bytes."""
 
 
 def read_deeplabcut(path: Path, skeleton: str | None) -> People:
-    """Everybody in a folder with DeepLabCut's CSV of each camera. Its .h5 files are refused: they hold pickles."""
+    """Everybody in a folder with DeepLabCut's CSV of each camera. Its .h5 files are refused: they
+    hold pickles.
+    """
     return _read(path, skeleton, "DeepLabCut", (".csv",))
 
 
@@ -36,21 +42,32 @@ def read_sleap(path: Path, skeleton: str | None) -> People:
 
 
 def _read(path: Path, skeleton: str | None, software: str, endings: tuple[str, ...]) -> People:
-    files = [f for f in sorted(path.iterdir()) if f.suffix.lower() in endings] if path.is_dir() else [path]
+    files = (
+        [f for f in sorted(path.iterdir()) if f.suffix.lower() in endings]
+        if path.is_dir()
+        else [path]
+    )
     if not files or any(file.suffix.lower() not in endings for file in files):
         problem = f"holds no {' or '.join(endings)} of {software}"
         raise GhptDataError(path, "", problem, f"Export {endings[0]} files, one for each camera.")
     try:
         from movement.io import load_poses
     except ImportError as error:
-        raise GhptDataError(path, "", f"{software}'s files need the package movement", _INSTALL) from error
-    found, named = [], {}
+        raise GhptDataError(
+            path, "", f"{software}'s files need the package movement", _INSTALL
+        ) from error
+    found = []
+    named = {}
     for file in files:
         if file.stat().st_size > _LARGEST:
-            raise GhptDataError(file, "", f"has more than {_LARGEST >> 30} GiB", "Split the recording.")
+            raise GhptDataError(
+                file, "", f"has more than {_LARGEST >> 30} GiB", "Split the recording."
+            )
         try:
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of a missing frame rate, which does not matter here
+                warnings.simplefilter(
+                    "ignore"
+                )  # of a missing frame rate, which does not matter here
                 data = getattr(load_poses, _LOADERS[software])(file)
             joints, view = _view(file, data)
         except GhptDataError:
@@ -61,13 +78,19 @@ def _read(path: Path, skeleton: str | None, software: str, endings: tuple[str, .
         named.setdefault(joints, file)
         found.append(view)
     if len(named) > 1:
-        raise GhptDataError(list(named.values())[1], "keypoints", "are named otherwise than in the files before",
-                            "Track all views with one model.")  # fmt: skip
+        raise GhptDataError(
+            list(named.values())[1],
+            "keypoints",
+            "are named otherwise than in the files before",
+            "Track all views with one model.",
+        )
     return gather(path, found, next(iter(named)), skeleton)
 
 
 def _view(file: Path, data: Any) -> tuple[tuple[str, ...], Detections]:
-    """The joints' names and the detections of movement's data set: dimensions time, space, keypoints, individuals."""
+    """The joints' names and the detections of movement's data set: dimensions time, space,
+    keypoints, individuals.
+    """
     order = ("time", "individuals", "keypoints")
     position = np.asarray(data["position"].transpose(*order, "space"), dtype=np.float64)[..., :2]
     confidence = np.asarray(data["confidence"].transpose(*order), dtype=np.float64)
@@ -78,4 +101,6 @@ def _view(file: Path, data: Any) -> tuple[tuple[str, ...], Detections]:
     frame, person = np.nonzero(seen.any(-1))
     joints = canonical([str(name) for name in data["keypoints"].values])
     name = re.split(r"DLC_|[_.-]?(?:predictions|analysis)", file.stem)[0] or file.stem
-    return joints, Detections(name, np.arange(len(seen)), frame, values[frame, person], np.full(len(frame), -1))
+    return joints, Detections(
+        name, np.arange(len(seen)), frame, values[frame, person], np.full(len(frame), -1)
+    )

@@ -6,16 +6,17 @@ import math
 from collections.abc import Iterable
 
 Name = str | int | float | bool | None
-"""What a name becomes on its way through the command line: ``54138969``, ``1e5``, ``true`` and ``null``
-become an integer, a number, a truth and nothing."""
+"""What a name becomes on its way through the command line: ``54138969``, ``1e5``, ``true`` and
+``null`` become an integer, a number, a truth and nothing.
+"""
 
 
 def chosen_name(value: Name, existing: Iterable[str]) -> str:
     """The name that ``value`` was typed for.
 
-    A text, and whatever reads like an existing name, is that name. Another value stands for the one existing
-    name that is read as this value: 100000.0 for ``1e5``, and 7 for ``07``. Where there is none or more than
-    one, the value comes back as text, which the caller then finds or does not.
+    A text, and whatever reads like an existing name, is that name. Another value stands for the one
+    existing name that is read as this value: 100000.0 for ``1e5``, and 7 for ``07``. Where there is
+    none or more than one, the value comes back as text, which the caller then finds or does not.
     """
     names = list(dict.fromkeys(existing))
     text = str(value)

@@ -1,6 +1,7 @@
 """The yml files of OpenCV's FileStorage, as far as they hold names, numbers and matrices.
 
-Read without FileStorage: it reads names without quotes as numbers, and aborts the process on some damaged files.
+Read without FileStorage: it reads names without quotes as numbers, and aborts the process on some
+damaged files.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from ghpt.data.formats.validate import open_input
 from ghpt.errors import GhptDataError
 
 Node = str | float | list[str] | Float[np.ndarray, "..."]
-_LARGEST, _DEEPEST = 1 << 18, 100
+_LARGEST = 1 << 18
+_DEEPEST = 100
 """Bytes; lists in lists, by brackets or by indentation."""
 _INDENTED = re.compile(rb"^[ ?:-]{%d}" % (_DEEPEST + 1), re.MULTILINE)
 _Base: type = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
@@ -33,28 +35,40 @@ class _Loader(_Base):
         keys = [key.value for key, _ in node.value if isinstance(key.value, str)]
         if len(set(keys)) != len(keys):
             name = next(key for key in keys if keys.count(key) > 1)
-            raise yaml.constructor.ConstructorError(None, None, f"{name} is there twice", node.start_mark)
+            raise yaml.constructor.ConstructorError(
+                None, None, f"{name} is there twice", node.start_mark
+            )
         return super().construct_mapping(node, deep)
 
 
 def read_yml(path: Path) -> dict[str, Node | None]:
-    """Key -> matrix, number, text or list of texts. Raises GhptDataError for a file that is too large or damaged."""
+    """Key -> matrix, number, text or list of texts. Raises GhptDataError for a file that is too
+    large or damaged.
+    """
     with open_input(path) as handle:
         data = handle.read(_LARGEST + 1)
     if len(data) > _LARGEST:
         raise GhptDataError(path, "", f"has more than {_LARGEST >> 10} KiB", _MEND)
     if not data.endswith((b"\n", b"\r")):
-        raise GhptDataError(path, "", "ends in the middle of a line: it is truncated", "Copy it again.")
+        raise GhptDataError(
+            path, "", "ends in the middle of a line: it is truncated", "Copy it again."
+        )
     characters = np.frombuffer(data, np.uint8)
     deeper, higher = (np.isin(characters, list(signs)).astype(np.int32) for signs in (b"[{", b"]}"))
     if np.cumsum(deeper - higher).max(initial=0) > _DEEPEST or _INDENTED.search(data):
         raise GhptDataError(path, "", f"has more than {_DEEPEST} lists in lists", _MEND)
     # %YAML:1.0 is no directive of YAML's
-    body = b"\n".join(line for line in data.removeprefix(codecs.BOM_UTF8).splitlines() if not line.startswith(b"%"))
+    body = b"\n".join(
+        line
+        for line in data.removeprefix(codecs.BOM_UTF8).splitlines()
+        if not line.startswith(b"%")
+    )
     try:
         content = yaml.load(body.decode(), Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise GhptDataError(path, "", f"is not valid yml ({' '.join(str(error).split())})", _MEND) from error
+        raise GhptDataError(
+            path, "", f"is not valid yml ({' '.join(str(error).split())})", _MEND
+        ) from error
     if not isinstance(content, dict):
         raise GhptDataError(path, "", "holds no keys", _MEND)
     return {str(key): _node(path, str(key), value) for key, value in content.items()}
@@ -64,7 +78,8 @@ def _node(path: Path, key: str, value: Any) -> Node | None:
     if isinstance(value, dict) and {"rows", "cols", "data"} <= set(value):
         return _matrix(path, key, value)
     if isinstance(value, list):
-        # lists within lists may stand for more than memory holds: a few lines of aliases double at each line
+        # lists within lists may stand for more than memory holds: a few lines of aliases double at
+        # each line
         return [item for item in value if isinstance(item, str)]
     if isinstance(value, str):
         try:

@@ -10,7 +10,13 @@ from pathlib import Path
 import numpy as np
 
 from ghpt.data.formats.skeletons import recognise
-from ghpt.data.formats.validate import check_view_count, frame_rate, npy_header, open_input, read_npz
+from ghpt.data.formats.validate import (
+    check_view_count,
+    frame_rate,
+    npy_header,
+    open_input,
+    read_npz,
+)
 from ghpt.data.people.people import KeyPoints, joints_for
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
@@ -23,14 +29,18 @@ _LONGEST_NAMES = 1 << 20
 def write_key_points(path: str | Path, points: KeyPoints) -> None:
     """Write the npz file that ``read_key_points`` reads."""
     arrays = {
-        "key_points": points.key_points, "views": np.array(points.views, dtype=np.str_),
-        "joints": np.array(points.joints, dtype=np.str_), "frame": points.frame, "confidence": points.confidence,
+        "key_points": points.key_points,
+        "views": np.array(points.views, dtype=np.str_),
+        "joints": np.array(points.joints, dtype=np.str_),
+        "frame": points.frame,
+        "confidence": points.confidence,
         "seen": points.seen,
-    }  # fmt: skip
+    }
     if points.rate_hz is not None:
         arrays["rate_hz"] = np.array(points.rate_hz)
     with atomic_write(path) as handle:
-        # zip's check sums guard the values but not the list of names, where damage may hide what comes after it
+        # zip's check sums guard the values but not the list of names, where damage may hide what
+        # comes after it
         np.savez_compressed(handle, members=np.array(sorted(arrays)), **arrays)
 
 
@@ -39,16 +49,25 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
     there = _members(path)
     for field in ("key_points", "views"):
         if field not in there:
-            raise GhptDataError(path, field, "is missing", "See docs/calibration.md for what the file holds.")
+            raise GhptDataError(
+                path, field, "is missing", "See docs/calibration.md for what the file holds."
+            )
     if "members" in there and there - {"members"} != {*_texts(path, "members")}:
-        raise GhptDataError(path, "members", "are others than when it was written", "Write it again.")
-    values = read_npz(path, {"key_points": ((None, None, None, 2), "f")})["key_points"].astype(np.float64)
+        raise GhptDataError(
+            path, "members", "are others than when it was written", "Write it again."
+        )
+    values = read_npz(path, {"key_points": ((None, None, None, 2), "f")})["key_points"].astype(
+        np.float64
+    )
     frames, count_views, count, _ = values.shape
     check_view_count(path, count_views)
     shape = (frames, count_views, count)
     forms = {
-        "confidence": (shape, "f"), "seen": (shape, "b"), "frame": ((frames,), "iu"), "rate_hz": ((), "fiu"),
-    }  # fmt: skip
+        "confidence": (shape, "f"),
+        "seen": (shape, "b"),
+        "frame": ((frames,), "iu"),
+        "rate_hz": ((), "fiu"),
+    }
     more = read_npz(path, {field: form for field, form in forms.items() if field in there})
     views = _texts(path, "views")
     if skeleton is None and "skeleton" in there:
@@ -58,7 +77,9 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
     seen = finite & more.get("seen", finite)
     values = np.where(seen[..., None], values, 0)
     joints = joints or joints_for(
-        path, skeleton or recognise(path, values.reshape(-1, count, 2), seen.reshape(-1, count)), count
+        path,
+        skeleton or recognise(path, values.reshape(-1, count, 2), seen.reshape(-1, count)),
+        count,
     )
     for field, names, expected in (("views", views, count_views), ("joints", joints, count)):
         if len(names) != expected or len(set(names)) != len(names):
@@ -67,10 +88,21 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
     confidence = np.nan_to_num(more.get("confidence", np.ones(shape)).astype(np.float64)).clip(0, 1)
     frame = more.get("frame", np.arange(frames)).astype(np.int64)
     if not frames or (np.diff(frame) <= 0).any():
-        raise GhptDataError(path, "frame", "is empty, or does not rise", "Number the frames in order.")
+        raise GhptDataError(
+            path, "frame", "is empty, or does not rise", "Number the frames in order."
+        )
     rate = frame_rate(path, float(more["rate_hz"])) if "rate_hz" in more else None
-    return KeyPoints(str(path), views, joints, frame, values, np.where(seen, confidence, 0), seen, rate,
-                     (0,) * count_views)  # fmt: skip
+    return KeyPoints(
+        str(path),
+        views,
+        joints,
+        frame,
+        values,
+        np.where(seen, confidence, 0),
+        seen,
+        rate,
+        (0,) * count_views,
+    )
 
 
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError)
@@ -88,7 +120,9 @@ def _members(path: Path) -> set[str]:
         with zipfile.ZipFile(path) as archive:
             return {name.removesuffix(".npy") for name in archive.namelist()}
     except _DAMAGED as error:
-        raise GhptDataError(path, "", f"is not a whole npz file ({error})", "Write it again.") from error
+        raise GhptDataError(
+            path, "", f"is not a whole npz file ({error})", "Write it again."
+        ) from error
 
 
 def _texts(path: Path, field: str) -> tuple[str, ...]:

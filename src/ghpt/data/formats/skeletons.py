@@ -21,8 +21,15 @@ _LIMBS = _sides("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
 _FEET = ("big_toe", "small_toe", "heel")
 _COCO_17 = ("nose", *_sides("eye", "ear"), *_LIMBS)
 _OPENPOSE_BODY = (
-    "nose", "neck", "right_shoulder", "right_elbow", "right_wrist", "left_shoulder", "left_elbow", "left_wrist",
-)  # fmt: skip
+    "nose",
+    "neck",
+    "right_shoulder",
+    "right_elbow",
+    "right_wrist",
+    "left_shoulder",
+    "left_elbow",
+    "left_wrist",
+)
 _OPENPOSE_LEGS = ("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle")
 _OPENPOSE_HEAD = ("right_eye", "left_eye", "right_ear", "left_ear")
 _LEFT_FOOT_FIRST = tuple(f"{side}_{part}" for side in ("left", "right") for part in _FEET)
@@ -36,12 +43,34 @@ SKELETONS: dict[str, tuple[str, ...]] = {
     "body_25b": (*_COCO_17, "upper_neck", "head_top", *_LEFT_FOOT_FIRST),
     "halpe_26": (*_COCO_17, "head_top", "neck", "mid_hip", *_sides(*_FEET)),
     "mediapipe_33": (
-        "nose", "left_eye_inner", "left_eye", "left_eye_outer", "right_eye_inner", "right_eye", "right_eye_outer",
-        "left_ear", "right_ear", "mouth_left", "mouth_right", *_sides("shoulder", "elbow", "wrist", "pinky", "index",
-        "thumb", "hip", "knee", "ankle", "heel", "big_toe"),
+        "nose",
+        "left_eye_inner",
+        "left_eye",
+        "left_eye_outer",
+        "right_eye_inner",
+        "right_eye",
+        "right_eye_outer",
+        "left_ear",
+        "right_ear",
+        "mouth_left",
+        "mouth_right",
+        *_sides(
+            "shoulder",
+            "elbow",
+            "wrist",
+            "pinky",
+            "index",
+            "thumb",
+            "hip",
+            "knee",
+            "ankle",
+            "heel",
+            "big_toe",
+        ),
     ),
-}  # fmt: skip
-"""Joints in the detector's order, in the words of ``ghpt.skeleton``. ``coco_19`` is CMU Panoptic's."""
+}
+"""Joints in the detector's order, in the words of ``ghpt.skeleton``. ``coco_19`` is CMU Panoptic's.
+"""
 
 _SOURCES: dict[str, tuple[tuple[str, ...], ...]] = {joint: ((joint,),) for joint in JOINTS} | {
     "pelvis": (("pelvis",), ("mid_hip",), ("left_hip", "right_hip")),
@@ -51,12 +80,23 @@ _SOURCES: dict[str, tuple[tuple[str, ...], ...]] = {joint: ((joint,),) for joint
 """The means that may stand for a joint; the first whose parts the skeleton has is taken."""
 
 _BONES = (
-    ("nose", "left_eye"), ("nose", "right_eye"),
-    *((f"{side}_{a}", f"{side}_{b}") for side in ("left", "right") for a, b in (
-        ("shoulder", "elbow"), ("elbow", "wrist"), ("shoulder", "hip"), ("hip", "knee"), ("knee", "ankle"),
-        ("eye", "ear"), ("ankle", "heel"), ("heel", "big_toe"),
-    )),
-)  # fmt: skip
+    ("nose", "left_eye"),
+    ("nose", "right_eye"),
+    *(
+        (f"{side}_{a}", f"{side}_{b}")
+        for side in ("left", "right")
+        for a, b in (
+            ("shoulder", "elbow"),
+            ("elbow", "wrist"),
+            ("shoulder", "hip"),
+            ("hip", "knee"),
+            ("knee", "ankle"),
+            ("eye", "ear"),
+            ("ankle", "heel"),
+            ("heel", "big_toe"),
+        )
+    ),
+)
 _CLEARLY = 0.8
 """A skeleton is told from another when its bones have less than this part of the other's length."""
 
@@ -71,9 +111,11 @@ def joints_of(where: object, skeleton: str) -> tuple[str, ...]:
 
 
 def parts_of(where: object, joints: Sequence[str]) -> list[tuple[str, ...]]:
-    """For each of the 17 joints the detector's joints whose mean it is; () where the detector has none.
+    """For each of the 17 joints the detector's joints whose mean it is; () where the detector has
+    none.
 
-    Raises GhptDataError if a detector's joint is there twice or fewer than 8 of the 17 joints can be had.
+    Raises GhptDataError if a detector's joint is there twice or fewer than 8 of the 17 joints can
+    be had.
     """
     if len(set(joints)) != len(joints):
         twice = next(name for name in joints if list(joints).count(name) > 1)
@@ -99,12 +141,14 @@ def joints17(
 ) -> tuple[Float[np.ndarray, "T V J 2"], Float[np.ndarray, "T V J"], Bool[np.ndarray, "T V J"]]:
     """Any skeleton's undistorted key points as the 17 joints, float32.
 
-    A joint that is a mean of others is seen where all of them are and has the least of their confidences; a joint
-    that the detector does not have is never seen.
+    A joint that is a mean of others is seen where all of them are and has the least of their
+    confidences; a joint that the detector does not have is never seen.
     """
     index = {name: i for i, name in enumerate(joints)}
     shape = (*key_points.shape[:2], len(JOINTS))
-    points, sure, there = np.zeros((*shape, 2), np.float32), np.zeros(shape, np.float32), np.zeros(shape, np.bool_)
+    points = np.zeros((*shape, 2), np.float32)
+    sure = np.zeros(shape, np.float32)
+    there = np.zeros(shape, np.bool_)
     parts = parts_of(where, joints)
     for place, names in enumerate(parts):
         if not names or not set(names) <= set(index):
@@ -121,8 +165,11 @@ def joints17(
     return np.where(there[..., None], points, 0), np.where(there, sure, 0), there
 
 
-def recognise(where: object, key_points: Float[np.ndarray, "N K 2"], seen: Bool[np.ndarray, "N K"]) -> str:
-    """The name of the skeleton of N people: of those with K joints the one whose bones are shortest in the images.
+def recognise(
+    where: object, key_points: Float[np.ndarray, "N K 2"], seen: Bool[np.ndarray, "N K"]
+) -> str:
+    """The name of the skeleton of N people: of those with K joints the one whose bones are shortest
+    in the images.
 
     Raises GhptDataError if none has K joints, or if two of them are as good.
     """
@@ -134,7 +181,8 @@ def recognise(where: object, key_points: Float[np.ndarray, "N K 2"], seen: Bool[
     if len(choices) == 1:
         return choices[0]
     lengths = sorted((_bone_length(SKELETONS[name], key_points, seen), name) for name in choices)
-    (shortest, name), (second, other) = lengths[0], lengths[1]
+    (shortest, name) = lengths[0]
+    (second, other) = lengths[1]
     if not shortest < _CLEARLY * second:
         problem = f"it may be {name} or {other}: both have {key_points.shape[1]} joints"
         raise GhptDataError(where, "skeleton", problem, f"Name it: skeleton={name}.")
@@ -145,22 +193,37 @@ def _bone_length(joints: tuple[str, ...], key_points: np.ndarray, seen: np.ndarr
     """Mean over the bones of their median length, pixels; inf if none is ever seen."""
     bones = [[joints.index(a), joints.index(b)] for a, b in _BONES if a in joints and b in joints]
     a, b = np.array(bones).T
-    length = np.where(seen[:, a] & seen[:, b], np.linalg.norm(key_points[:, a] - key_points[:, b], axis=-1), np.nan)
+    length = np.where(
+        seen[:, a] & seen[:, b],
+        np.linalg.norm(key_points[:, a] - key_points[:, b], axis=-1),
+        np.nan,
+    )
     measured = ~np.isnan(length).all(0)
     return float(np.nanmedian(length[:, measured], axis=0).mean()) if measured.any() else np.inf
 
 
 _OTHER_WORDS = {
-    "root": "pelvis", "hip": "mid_hip", "hip_center": "mid_hip", "neck_base": "neck", "head": "head_top",
-    "top_head": "head_top", "right_foot": "right_ankle", "left_foot": "left_ankle",
-}  # fmt: skip
+    "root": "pelvis",
+    "hip": "mid_hip",
+    "hip_center": "mid_hip",
+    "neck_base": "neck",
+    "head": "head_top",
+    "top_head": "head_top",
+    "right_foot": "right_ankle",
+    "left_foot": "left_ankle",
+}
 
 
 def canonical(names: Sequence[str]) -> tuple[str, ...]:
-    """A file's own names of joints in the words of ``SKELETONS``: ``Left Elbow``, ``LElbow`` and ``leftElbow`` are
-    ``left_elbow``; what is not known stays as it is. MMPose's ``h36m`` calls the nose the base of the neck."""
+    """A file's own names of joints in the words of ``SKELETONS``: ``Left Elbow``, ``LElbow`` and
+    ``leftElbow`` are ``left_elbow``; what is not known stays as it is. MMPose's ``h36m`` calls the
+    nose the base of the neck.
+    """
     found = tuple(_canonical(name) for name in names)
-    return tuple("nose" if name == "neck" and "thorax" in found and "nose" not in found else name for name in found)
+    return tuple(
+        "nose" if name == "neck" and "thorax" in found and "nose" not in found else name
+        for name in found
+    )
 
 
 def _canonical(name: str) -> str:

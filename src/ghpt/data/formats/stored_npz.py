@@ -25,9 +25,15 @@ class Member(NamedTuple):
 
 
 def add_member(
-    archive: zipfile.ZipFile, name: str, dtype: np.dtype, shape: tuple[int, ...], content: IO[bytes] | bytes
+    archive: zipfile.ZipFile,
+    name: str,
+    dtype: np.dtype,
+    shape: tuple[int, ...],
+    content: IO[bytes] | bytes,
 ) -> None:
-    """Write an array, given as its bytes or as a file of them; the same content gives the same bytes."""
+    """Write an array, given as its bytes or as a file of them; the same content gives the same
+    bytes.
+    """
     info = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
     info.create_system = 3
     header = {"descr": np.lib.format.dtype_to_descr(dtype), "fortran_order": False, "shape": shape}
@@ -40,11 +46,15 @@ def add_member(
 
 
 def members_of(path: Path) -> dict[str, Member]:
-    """Where each array lies in the file. Raises ValueError or BadZipFile for anything but plain stored arrays."""
+    """Where each array lies in the file. Raises ValueError or BadZipFile for anything but plain
+    stored arrays.
+    """
     size = path.stat().st_size
     with open(path, "rb") as handle, zipfile.ZipFile(handle) as archive:
         entries = archive.infolist()
-        if any(e.compress_type != zipfile.ZIP_STORED or e.file_size != e.compress_size for e in entries):
+        if any(
+            e.compress_type != zipfile.ZIP_STORED or e.file_size != e.compress_size for e in entries
+        ):
             raise ValueError("a member is compressed")
         if sum(e.file_size for e in entries) > size:
             raise ValueError("members overlap")
@@ -64,7 +74,8 @@ def _member_at(handle: IO[bytes], entry: zipfile.ZipInfo) -> Member:
     if parsed is None:
         raise ValueError(f"{entry.filename} is no array of numbers or text")
     shape = tuple(int(length) for length in parsed["shape"].replace(b",", b" ").split())
-    dtype, offset = np.dtype(parsed["dtype"].decode()), start + len(prefix) + len(header)
+    dtype = np.dtype(parsed["dtype"].decode())
+    offset = start + len(prefix) + len(header)
     if math.prod(shape) * dtype.itemsize != start + entry.file_size - offset:
         raise ValueError(f"{entry.filename} does not hold what its header says")
     return Member(offset, dtype, shape)
@@ -83,4 +94,6 @@ def read_rows(path: Path, member: Member, start: int, stop: int) -> np.ndarray:
     """The rows of a member's first dimension from ``start`` up to ``stop``, and no others."""
     each = math.prod(member.shape[1:])
     offset = member.offset + start * each * member.dtype.itemsize
-    return np.fromfile(path, member.dtype, (stop - start) * each, offset=offset).reshape(-1, *member.shape[1:])
+    return np.fromfile(path, member.dtype, (stop - start) * each, offset=offset).reshape(
+        -1, *member.shape[1:]
+    )

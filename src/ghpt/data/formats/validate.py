@@ -1,6 +1,8 @@
-"""Checks of users' cameras, arrays and files; each error names the file, the field, the problem and the mend.
+"""Checks of users' cameras, arrays and files; each error names the file, the field, the problem and
+the mend.
 
-No reader here allocates what a file only claims to hold: sizes are compared with the file's own first.
+No reader here allocates what a file only claims to hold: sizes are compared with the file's own
+first.
 """
 
 from __future__ import annotations
@@ -30,8 +32,12 @@ _MAX_HEADER = 10_000
 _MAX_JSON = 64 << 20
 SMALL_JSON = 4 << 20
 """Bytes of a JSON file that holds a rig's cameras, or one frame."""
-_MOST_OBJECTS, _MOST_LISTS, _MOST_VALUES = 400_000, 1_500_000, 12_000_000
-"""In a JSON file of ``_MAX_JSON`` bytes: each costs up to a hundred times as many bytes of memory as of the file."""
+_MOST_OBJECTS = 400_000
+_MOST_LISTS = 1_500_000
+_MOST_VALUES = 12_000_000
+"""In a JSON file of ``_MAX_JSON`` bytes: each costs up to a hundred times as many bytes of memory
+as of the file.
+"""
 _RATES = (1e-3, 1e5)
 """Frames per second, from a time lapse to the fastest camera."""
 MOST_VIEWS = 1000
@@ -43,26 +49,34 @@ _MAX_MEMBER = 1 << 28
 def check_cameras(
     where: object, names: Sequence[str], K: Any, R: Any, t: Any, distortion: Any
 ) -> tuple[Cameras, np.ndarray]:
-    """V users' cameras (K [V 3 3] pixels, R [V 3 3] and t [V 3] world to camera in mm) and their distortion [V 5].
+    """V users' cameras (K [V 3 3] pixels, R [V 3 3] and t [V 3] world to camera in mm) and their
+    distortion [V 5].
 
-    R that is off by rounding (1e-9 to 1e-3) becomes the nearest rotation. Raises GhptDataError for fewer than two
-    views, a camera listed twice, and values that are not finite or no pinhole camera.
+    R that is off by rounding (1e-9 to 1e-3) becomes the nearest rotation. Raises GhptDataError for
+    fewer than two views, a camera listed twice, and values that are not finite or no pinhole
+    camera.
     """
     check_names(where, names)
     views = len(names)
     expected = {"K": (views, 3, 3), "R": (views, 3, 3), "t": (views, 3), "distortion": (views, 5)}
     arrays = {
-        field: check_array(where, field, np.asarray(value), expected[field], "fiu").astype(np.float64)
+        field: check_array(where, field, np.asarray(value), expected[field], "fiu").astype(
+            np.float64
+        )
         for field, value in zip(expected, (K, R, t, distortion), strict=True)
     }
     for index, name in enumerate(names):
         for field, array in arrays.items():
             if not np.isfinite(array[index]).all():
                 problem = "holds a value that is not finite"
-                raise GhptDataError(where, f"camera {name}, {field}", problem, "Calibrate this camera again.")
+                raise GhptDataError(
+                    where, f"camera {name}, {field}", problem, "Calibrate this camera again."
+                )
         _check_intrinsics(where, name, arrays["K"][index])
         arrays["R"][index] = _rotation(where, name, arrays["R"][index])
-    return Cameras(*(torch.from_numpy(arrays[field]) for field in ("K", "R", "t"))), arrays["distortion"]
+    return Cameras(*(torch.from_numpy(arrays[field]) for field in ("K", "R", "t"))), arrays[
+        "distortion"
+    ]
 
 
 def _check_intrinsics(where: object, name: str, K: np.ndarray) -> None:
@@ -75,7 +89,8 @@ def _check_intrinsics(where: object, name: str, K: np.ndarray) -> None:
 
 
 def _rotation(where: object, name: str, R: np.ndarray) -> np.ndarray:
-    error, det = np.abs(R @ R.T - np.eye(3)).max(), np.linalg.det(R)
+    error = np.abs(R @ R.T - np.eye(3)).max()
+    det = np.linalg.det(R)
     if error > 1e-3 or det < 0:
         problem = f"R is not a rotation (|R R^T - I| = {error:.3g}, det = {det:.3g})"
         mend = "R must be the 3x3 world-to-camera rotation: without scale, not mirrored, not a Rodrigues vector."
@@ -86,8 +101,12 @@ def _rotation(where: object, name: str, R: np.ndarray) -> np.ndarray:
     return U @ Vh
 
 
-def check_names(where: object, names: Sequence[object], available: Sequence[object] | None = None) -> None:
-    """Raise GhptDataError for fewer than two cameras, a camera listed twice, or one that is not ``available``."""
+def check_names(
+    where: object, names: Sequence[object], available: Sequence[object] | None = None
+) -> None:
+    """Raise GhptDataError for fewer than two cameras, a camera listed twice, or one that is not
+    ``available``.
+    """
     counts = Counter(map(repr, names))
     for name in names:
         if counts[repr(name)] > 1:
@@ -95,21 +114,26 @@ def check_names(where: object, names: Sequence[object], available: Sequence[obje
             raise GhptDataError(where, "cameras", problem, "List each camera once.")
         if available is not None and name not in available:
             there = ", ".join(map(str, available))
-            raise GhptDataError(where, "cameras", f"there is no camera {name}", f"There are: {there}.")
+            raise GhptDataError(
+                where, "cameras", f"there is no camera {name}", f"There are: {there}."
+            )
     if len(names) < 2:
         problem = f"{len(names)} camera(s) listed; triangulation needs at least two"
         raise GhptDataError(where, "cameras", problem, "List more cameras.")
 
 
 def check_view_count(where: object, count: int) -> None:
-    """Raise GhptDataError for more than ``MOST_VIEWS`` cameras or views, before anything is made of them."""
+    """Raise GhptDataError for more than ``MOST_VIEWS`` cameras or views, before anything is made of
+    them.
+    """
     if count > MOST_VIEWS:
         problem = f"holds more than {MOST_VIEWS} cameras or views"
         raise GhptDataError(where, "", problem, "Check that this is the right file.")
 
 
 def frame_rate(where: object, value: float | int) -> float | None:
-    """A frame rate in frames per second; None for NaN, which our own files write where it is unknown.
+    """A frame rate in frames per second; None for NaN, which our own files write where it is
+    unknown.
 
     Raises GhptDataError for a rate that no camera has: 0, negative, infinite, or beyond ``_RATES``.
     """
@@ -140,7 +164,8 @@ def read_name(where: object, field: str, value: object) -> str:
 def numbers_in(value: object) -> np.ndarray | None:
     """A number, a list of numbers or lists of lists of them as float64, in the list's own shape.
 
-    None for anything else: ``true`` and ``"900"`` are no numbers, and lists of unequal lengths no array.
+    None for anything else: ``true`` and ``"900"`` are no numbers, and lists of unequal lengths no
+    array.
     """
     if isinstance(value, np.ndarray):
         return value.astype(np.float64) if value.dtype.kind in "fiu" else None
@@ -159,14 +184,20 @@ def _all_numbers(value: object, depth: int = 3) -> bool:
     return type(value) in (int, float)
 
 
-def check_array(where: object, field: str, array: np.ndarray, shape: Shape, kinds: str) -> np.ndarray:
-    """``array`` itself, if it has this shape and its dtype is of these numpy kinds; else GhptDataError."""
+def check_array(
+    where: object, field: str, array: np.ndarray, shape: Shape, kinds: str
+) -> np.ndarray:
+    """``array`` itself, if it has this shape and its dtype is of these numpy kinds; else
+    GhptDataError.
+    """
     _check_form(where, field, array.shape, array.dtype, shape, kinds)
     return array
 
 
 def read_npy(path: Path, shape: Shape, kinds: str) -> np.ndarray:
-    """A read-only memory map of an npy file that holds exactly an array of this form; else GhptDataError."""
+    """A read-only memory map of an npy file that holds exactly an array of this form; else
+    GhptDataError.
+    """
     with open_input(path) as handle:
         found, order, dtype = npy_header(path, "", handle, path.stat().st_size)
         offset = handle.tell()
@@ -189,18 +220,31 @@ def read_npz(path: Path, fields: dict[str, tuple[Shape, str]]) -> dict[str, np.n
                     flat = np.frombuffer(member.read(), dtype)
                     arrays[field] = flat.reshape(found, order=order)
     except KeyError as error:
-        raise GhptDataError(path, "", f"lacks an array: {error}", f"It must hold {', '.join(fields)}.") from error
-    # zipfile raises NotImplementedError for a compression that it does not know, RuntimeError for encryption
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
-        raise GhptDataError(path, "", f"is not a whole npz file ({error})", "Write it again.") from error
+        raise GhptDataError(
+            path, "", f"lacks an array: {error}", f"It must hold {', '.join(fields)}."
+        ) from error
+    # zipfile raises NotImplementedError for a compression that it does not know, RuntimeError for
+    # encryption
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        OSError,
+        NotImplementedError,
+        RuntimeError,
+    ) as error:
+        raise GhptDataError(
+            path, "", f"is not a whole npz file ({error})", "Write it again."
+        ) from error
     return arrays
 
 
 def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
     """The content of a JSON file of at most ``largest`` bytes.
 
-    Raises GhptDataError for a file that is larger or holds more values than any of its kind, and for one
-    with NaN, Infinity, or a key that is there twice: of two cameras with one name, one would be lost.
+    Raises GhptDataError for a file that is larger or holds more values than any of its kind, and
+    for one with NaN, Infinity, or a key that is there twice: of two cameras with one name, one
+    would be lost.
     """
     with open_input(path) as handle:
         data = handle.read(largest + 1)
@@ -226,7 +270,9 @@ def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
     try:
         return json.loads(data, parse_constant=refuse, object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
-        raise GhptDataError(path, "", f"is not valid JSON ({error})", "Get the file again.") from error
+        raise GhptDataError(
+            path, "", f"is not valid JSON ({error})", "Get the file again."
+        ) from error
 
 
 def open_input(path: Path) -> io.BufferedReader:
@@ -234,20 +280,36 @@ def open_input(path: Path) -> io.BufferedReader:
     try:
         return open(path, "rb")
     except FileNotFoundError as error:
-        raise GhptDataError(path, "", "there is no such file", "Check the path and the data's layout.") from error
+        raise GhptDataError(
+            path, "", "there is no such file", "Check the path and the data's layout."
+        ) from error
     except OSError as error:
-        raise GhptDataError(path, "", f"cannot be read ({error.strerror})", "Check its permissions.") from error
+        raise GhptDataError(
+            path, "", f"cannot be read ({error.strerror})", "Check its permissions."
+        ) from error
 
 
-def _check_form(where: object, field: str, found: tuple[int, ...], dtype: np.dtype, shape: Shape, kinds: str) -> None:
-    if len(found) != len(shape) or any(b not in (None, a) for a, b in zip(found, shape, strict=True)):
+def _check_form(
+    where: object, field: str, found: tuple[int, ...], dtype: np.dtype, shape: Shape, kinds: str
+) -> None:
+    if len(found) != len(shape) or any(
+        b not in (None, a) for a, b in zip(found, shape, strict=True)
+    ):
         expected = " x ".join("any" if size is None else str(size) for size in shape)
         problem = f"has shape {' x '.join(map(str, found))} instead of {expected}"
         raise GhptDataError(where, field, problem, "Check how it was written.")
     if dtype.kind not in kinds:
-        names = {"f": "floating-point numbers", "i": "integers", "u": "integers", "b": "booleans", "V": "records"}
+        names = {
+            "f": "floating-point numbers",
+            "i": "integers",
+            "u": "integers",
+            "b": "booleans",
+            "V": "records",
+        }
         expected = " or ".join(dict.fromkeys(names[kind] for kind in kinds))
-        raise GhptDataError(where, field, f"holds {dtype}, not {expected}", "Check how it was written.")
+        raise GhptDataError(
+            where, field, f"holds {dtype}, not {expected}", "Check how it was written."
+        )
 
 
 def npy_header(
@@ -255,7 +317,8 @@ def npy_header(
 ) -> tuple[tuple[int, ...], str, np.dtype]:
     """Shape, order and dtype of the npy array in ``handle``, which then stands at its data.
 
-    Raises GhptDataError unless what follows is as long as the header claims (``size`` counts from the start).
+    Raises GhptDataError unless what follows is as long as the header claims (``size`` counts from
+    the start).
     """
     mend = "Write it with numpy.save, or copy it again."
     start = handle.read(12)
@@ -265,7 +328,9 @@ def npy_header(
     if int.from_bytes(start[8 : 10 if major == 1 else 12], "little") > _MAX_HEADER:
         raise GhptDataError(where, field, f"has a header of more than {_MAX_HEADER} bytes", mend)
     handle.seek(8)
-    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    read = (
+        np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
+    )
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
@@ -275,7 +340,9 @@ def npy_header(
     left = size - handle.tell()
     if dtype.hasobject and not pickled:
         raise GhptDataError(where, field, "holds Python objects, which can run code", mend)
-    if any(n < 0 for n in shape) or (not dtype.hasobject and math.prod(shape) * dtype.itemsize != left):
+    if any(n < 0 for n in shape) or (
+        not dtype.hasobject and math.prod(shape) * dtype.itemsize != left
+    ):
         claimed = math.prod(shape) * dtype.itemsize
         problem = f"claims {claimed} bytes of {dtype} and holds {left}: it is truncated or damaged"
         raise GhptDataError(where, field, problem, mend)

@@ -1,4 +1,6 @@
-"""Who is who in the views of calibrated cameras: the detections of a frame that agree on one body in space."""
+"""Who is who in the views of calibrated cameras: the detections of a frame that agree on one body
+in space.
+"""
 
 from __future__ import annotations
 
@@ -15,12 +17,15 @@ from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.triangulation import triangulate
 
 _FAR = 0.12
-"""Distance of a joint, as a part of the size of the person in the image, at which it says nothing for a body."""
+"""Distance of a joint, as a part of the size of the person in the image, at which it says nothing
+for a body.
+"""
 _AGREE = 0.4
 """A detection agrees with a body that it supports by more, of at most 1."""
 _LEAST_JOINTS = 4
 """Joints that a detection and a body must share to be compared."""
-_MOST_PEOPLE, _MOST_PAIRS = 8, 32
+_MOST_PEOPLE = 8
+_MOST_PAIRS = 32
 """Of more people in a view the best are taken; of more pairs of views, so many spread evenly."""
 _VALUES = 1 << 22
 """Distances that are in memory at once."""
@@ -47,24 +52,32 @@ def associate(
     seen: Bool[np.ndarray, "N J"],
     confidence: Float[np.ndarray, "N J"],
 ) -> list[Int[np.ndarray, "T V"]]:
-    """For each person, the best first, the index of their detection in each frame and view; -1 where there is none.
+    """For each person, the best first, the index of their detection in each frame and view; -1
+    where there is none.
 
-    Within a frame, every two detections in two views are triangulated (undistorted pixels), and the body that they make
-    projected into all views, where those detections support it that are near. The best supported body takes its
-    detections, then the best of the rest, as long as two views agree; at last each detection goes to the body, from all
-    of its views, that it supports most. From frame to
-    frame, bodies are the same person's where their joints stay near; what is left are tracks, and those that are never
-    there at once are joined, the longest first: a person who was seen beside another is not that one. The best person
-    has the greatest sum, over frames and views, of size times mean confidence, over that of the best in the view.
+    Within a frame, every two detections in two views are triangulated (undistorted pixels), and the
+    body that they make projected into all views, where those detections support it that are near.
+    The best supported body takes its detections, then the best of the rest, as long as two views
+    agree; at last each detection goes to the body, from all of its views, that it supports most.
+    From frame to frame, bodies are the same person's where their joints stay near; what is left are
+    tracks, and those that are never there at once are joined, the longest first: a person who was
+    seen beside another is not that one. The best person has the greatest sum, over frames and
+    views, of size times mean confidence, over that of the best in the view.
     """
     if not len(row):
         return []
-    size, sure = extent(key_points, seen), np.where(seen, confidence, 0).mean(-1)
+    size = extent(key_points, seen)
+    sure = np.where(seen, confidence, 0).mean(-1)
     quality = size * sure
-    best = np.array([quality[view == v].max(initial=0) for v in range(int(view.max(initial=0)) + 1)])
+    best = np.array(
+        [quality[view == v].max(initial=0) for v in range(int(view.max(initial=0)) + 1)]
+    )
     quality = quality / np.maximum(best, 1e-9)[view]
     table = _table(frames, len(cameras.K), row, view, quality)
-    members, bodies, known, frame = [], [], [], []
+    members = []
+    bodies = []
+    known = []
+    frame = []
     step = _chunk(table)
     for start in range(0, frames, step):
         part = table[start : start + step]
@@ -75,14 +88,19 @@ def associate(
         bodies.append(points)
         known.append(there)
         frame.append(of + start)
-    chosen, frame = np.concatenate(members), np.concatenate(frame)
+    chosen = np.concatenate(members)
+    frame = np.concatenate(frame)
     track = tracks(frame, np.concatenate(bodies), np.concatenate(known))
     worth = np.where(chosen >= 0, quality[chosen], 0).sum(1)
     return joined(frames, frame, track, worth, chosen)
 
 
 def _table(
-    frames: int, views: int, row: Int[np.ndarray, " N"], view: Int[np.ndarray, " N"], quality: Float[np.ndarray, " N"]
+    frames: int,
+    views: int,
+    row: Int[np.ndarray, " N"],
+    view: Int[np.ndarray, " N"],
+    quality: Float[np.ndarray, " N"],
 ) -> Int[np.ndarray, "T V P"]:
     """The indices of the detections of each frame and view, the best first."""
     order = np.lexsort((-quality, view, row))
@@ -109,7 +127,9 @@ def _chunk(table: Int[np.ndarray, "T V P"]) -> int:
     return max(1, _VALUES // (bodies * views * people * 17))
 
 
-def _views(table: Int[np.ndarray, "T V P"], key_points: np.ndarray, seen: np.ndarray, size: np.ndarray) -> _Views:
+def _views(
+    table: Int[np.ndarray, "T V P"], key_points: np.ndarray, seen: np.ndarray, size: np.ndarray
+) -> _Views:
     there = table >= 0
     return _Views(
         torch.from_numpy(table),
@@ -119,11 +139,14 @@ def _views(table: Int[np.ndarray, "T V P"], key_points: np.ndarray, seen: np.nda
     )
 
 
-def _groups(cameras: Cameras, views: _Views) -> tuple[Int[np.ndarray, "G V"], Int[np.ndarray, " G"]]:
+def _groups(
+    cameras: Cameras, views: _Views
+) -> tuple[Int[np.ndarray, "G V"], Int[np.ndarray, " G"]]:
     """The detections of each body, and its frame."""
     support = _support_of_pairs(cameras, views)
     taken = views.index < 0
-    members, frames = [], []
+    members = []
+    frames = []
     for _ in range(views.index.shape[2]):
         most, who = torch.where(taken[:, None], 0.0, support).max(-1)
         agrees = most > _AGREE
@@ -142,12 +165,18 @@ def _groups(cameras: Cameras, views: _Views) -> tuple[Int[np.ndarray, "G V"], In
 def _settled(
     cameras: Cameras, views: _Views, members: Int[Tensor, "G V"], frame: Int[Tensor, " G"]
 ) -> tuple[Int[np.ndarray, "G V"], Int[np.ndarray, " G"]]:
-    """Each detection with the body that it supports most, if that has none that supports it more in this view."""
+    """Each detection with the body that it supports most, if that has none that supports it more in
+    this view.
+    """
     of = (frame[:, None], torch.arange(members.shape[1]), members)
-    found = triangulate(cameras, views.points[of], (views.seen[of] & (members >= 0)[..., None]).double())
+    found = triangulate(
+        cameras, views.points[of], (views.seen[of] & (members >= 0)[..., None]).double()
+    )
     support = _support(cameras, found.points, found.ok, views, frame)
     support = torch.where(views.index[frame] < 0, 0.0, support)
-    most = torch.zeros_like(views.size).scatter_reduce_(0, frame[:, None, None].expand_as(support), support, "amax")
+    most = torch.zeros_like(views.size).scatter_reduce_(
+        0, frame[:, None, None].expand_as(support), support, "amax"
+    )
     own, who = torch.where(support >= most[frame], support, 0.0).max(-1)
     settled = torch.where(own > _AGREE, views.index[frame].gather(2, who[..., None])[..., 0], -1)
     kept = (settled >= 0).sum(-1) >= 2
@@ -158,11 +187,15 @@ def _support_of_pairs(cameras: Cameras, views: _Views) -> Float[Tensor, "T S V P
     """How much each detection supports each body that two detections make."""
     _, count, people = views.index.shape
     pairs = _pairs(count)
-    first, second = (x.reshape(-1) for x in torch.meshgrid(torch.arange(people), torch.arange(people), indexing="ij"))
+    first, second = (
+        x.reshape(-1)
+        for x in torch.meshgrid(torch.arange(people), torch.arange(people), indexing="ij")
+    )
     who = torch.stack([first, second], -1)
     of_view = pairs[:, None].expand(-1, len(who), -1).reshape(-1, 2)
     of_person = who[None].expand(len(pairs), -1, -1).reshape(-1, 2)
-    pixels, seen = views.points[:, of_view, of_person], views.seen[:, of_view, of_person]
+    pixels = views.points[:, of_view, of_person]
+    seen = views.seen[:, of_view, of_person]
     two = triangulate(cameras.index(of_view), pixels, seen.double())
     frame = torch.arange(len(views.index))[:, None].expand(two.points.shape[:2]).reshape(-1)
     support = _support(cameras, two.points.flatten(0, 1), two.ok.flatten(0, 1), views, frame)
@@ -176,13 +209,17 @@ def _support(
     views: _Views,
     frame: Int[Tensor, " G"],
 ) -> Float[Tensor, "G V P"]:
-    """Mean over the joints that both have of 1 - distance / (_FAR x size), at least 0; 0 where they share too few."""
+    """Mean over the joints that both have of 1 - distance / (_FAR x size), at least 0; 0 where they
+    share too few.
+    """
     shown, depth = project(cameras, bodies)
     both = (known[:, None] & (depth > 0))[:, :, None] & views.seen[frame]
     apart = torch.linalg.vector_norm(shown[:, :, None] - views.points[frame], dim=-1)
     near = (1 - apart / (_FAR * views.size[frame])[..., None]).clamp(min=0)
     count = both.sum(-1)
-    return torch.where(count >= _LEAST_JOINTS, torch.where(both, near, 0.0).sum(-1) / count.clamp(min=1), 0.0)
+    return torch.where(
+        count >= _LEAST_JOINTS, torch.where(both, near, 0.0).sum(-1) / count.clamp(min=1), 0.0
+    )
 
 
 def _bodies(
@@ -190,6 +227,8 @@ def _bodies(
 ) -> tuple[Float[np.ndarray, "G J 3"], Bool[np.ndarray, "G J"]]:
     used = seen[members] & (members >= 0)[..., None]
     found = triangulate(
-        cameras, torch.from_numpy(key_points[members].astype(np.float64)), torch.from_numpy(used).double()
+        cameras,
+        torch.from_numpy(key_points[members].astype(np.float64)),
+        torch.from_numpy(used).double(),
     )
     return found.points.numpy(), found.ok.numpy()

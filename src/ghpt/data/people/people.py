@@ -21,7 +21,9 @@ _FARTHEST = 1e6
 
 @dataclass(frozen=True)
 class KeyPoints:
-    """T frames of V views of one person, in the pixels of the images as they were (lens distortion and all)."""
+    """T frames of V views of one person, in the pixels of the images as they were (lens distortion
+    and all).
+    """
 
     path: str
     views: tuple[str, ...]
@@ -74,7 +76,9 @@ class People:
             part[there] = values[chosen[there]]
             parts.append(part)
         several = tuple((self.counts() > 1).sum(0).tolist())
-        return KeyPoints(self.path, self.views, self.joints, self.frame, *parts, self.rate_hz, several)
+        return KeyPoints(
+            self.path, self.views, self.joints, self.frame, *parts, self.rate_hz, several
+        )
 
     def of(self, indices: Int[np.ndarray, " M"]) -> Int[np.ndarray, "T V"]:
         """The first of these detections in each frame and view, -1 where there is none."""
@@ -105,27 +109,47 @@ def everyone(points: KeyPoints) -> People:
     """One person's key points as the only detections."""
     view, row = np.nonzero(points.seen.any(-1).T)
     values = (x[row, view] for x in (points.key_points, points.confidence, points.seen))
-    return People(points.path, points.views, points.joints, points.frame, row, view, np.full(len(row), -1), *values,
-                  points.rate_hz)  # fmt: skip
+    return People(
+        points.path,
+        points.views,
+        points.joints,
+        points.frame,
+        row,
+        view,
+        np.full(len(row), -1),
+        *values,
+        points.rate_hz,
+    )
 
 
-def gather(path: Path, found: Sequence[Detections], joints: tuple[str, ...] | None, skeleton: str | None) -> People:
-    """The views' detections as one; ``joints`` if the files name them, which ``skeleton`` overrules.
+def gather(
+    path: Path, found: Sequence[Detections], joints: tuple[str, ...] | None, skeleton: str | None
+) -> People:
+    """The views' detections as one; ``joints`` if the files name them, which ``skeleton``
+    overrules.
 
     Raises GhptDataError where the views do not fit together, or the skeleton is not known.
     """
     counts = {view.values.shape[1] for view in found if len(view.values)}
     if len(counts) != 1:
-        problem = f"the views have people of {' and '.join(map(str, sorted(counts)))} joints" if counts else "is empty"
+        problem = (
+            f"the views have people of {' and '.join(map(str, sorted(counts)))} joints"
+            if counts
+            else "is empty"
+        )
         raise GhptDataError(path, "people", problem, "Detect all views with one model.")
     count = counts.pop()
     frame = np.unique(np.concatenate([view.frames for view in found]))
     if len(frame) * len(found) * count > _MOST_VALUES:
-        raise GhptDataError(path, "", f"holds {len(frame) * len(found) * count} joints", "Split the recording.")
+        raise GhptDataError(
+            path, "", f"holds {len(frame) * len(found) * count} joints", "Split the recording."
+        )
     common = set.intersection(*(set(view.frames.tolist()) for view in found))
     if len(found) > 1 and not common:
-        ranges = ", ".join(f"{v.view} {v.frames[0]} to {v.frames[-1]}" if len(v.frames) else f"{v.view} none"
-                           for v in found)  # fmt: skip
+        ranges = ", ".join(
+            f"{v.view} {v.frames[0]} to {v.frames[-1]}" if len(v.frames) else f"{v.view} none"
+            for v in found
+        )
         mend = "Number the frames of synchronised cameras alike."
         raise GhptDataError(path, "frame numbers", f"no frame is in all views ({ranges})", mend)
     full = [view for view in found if len(view.values)]
@@ -134,22 +158,33 @@ def gather(path: Path, found: Sequence[Detections], joints: tuple[str, ...] | No
     if skeleton is not None or joints is None:
         joints = joints_for(path, skeleton or recognise(path, values[..., :2], seen), count)
     return People(
-        path=str(path), views=tuple(view.view for view in found), joints=joints, frame=frame,
+        path=str(path),
+        views=tuple(view.view for view in found),
+        joints=joints,
+        frame=frame,
         row=np.concatenate([np.searchsorted(frame, view.frame) for view in full]),
         view=np.repeat(np.arange(len(found)), [len(view.values) for view in found]),
-        identity=np.concatenate([view.identity for view in full]), key_points=values[..., :2],
-        confidence=values[..., 2].clip(0, 1), seen=seen, rate_hz=None,
-    )  # fmt: skip
+        identity=np.concatenate([view.identity for view in full]),
+        key_points=values[..., :2],
+        confidence=values[..., 2].clip(0, 1),
+        seen=seen,
+        rate_hz=None,
+    )
 
 
 def detections(
-    path: Path, view: str, frames: Sequence[int], found: Sequence[tuple[int, Float[np.ndarray, "K 3"]]]
+    path: Path,
+    view: str,
+    frames: Sequence[int],
+    found: Sequence[tuple[int, Float[np.ndarray, "K 3"]]],
 ) -> Detections:
-    """One view's people without identities: (frame number, joints) in any order, of the frames in ``frames``.
+    """One view's people without identities: (frame number, joints) in any order, of the frames in
+    ``frames``.
 
     Raises GhptDataError for people of different numbers of joints, or too many of them.
     """
-    count, odd = found[0][1].shape[0] if found else 0, next((f for f in found if f[1].shape != found[0][1].shape), None)
+    count = found[0][1].shape[0] if found else 0
+    odd = next((f for f in found if f[1].shape != found[0][1].shape), None)
     if odd is not None:
         problem = f"frame {odd[0]} has a person of {odd[1].shape[0]} joints, frame {found[0][0]} of {count}"
         raise GhptDataError(path, "keypoints", problem, "Detect all frames with one model.")
@@ -157,7 +192,13 @@ def detections(
     order = np.argsort(numbers, kind="stable")
     check_people(path, "keypoints", int(np.unique(numbers, return_counts=True)[1].max(initial=0)))
     values = np.stack([joints for _, joints in found])[order] if found else np.zeros((0, 0, 3))
-    return Detections(view, np.unique(np.array(frames, np.int64)), numbers[order], values, np.full(len(numbers), -1))
+    return Detections(
+        view,
+        np.unique(np.array(frames, np.int64)),
+        numbers[order],
+        values,
+        np.full(len(numbers), -1),
+    )
 
 
 def check_people(path: Path, field: str, count: int) -> None:
@@ -167,9 +208,17 @@ def check_people(path: Path, field: str, count: int) -> None:
         raise GhptDataError(path, field, problem, f"At most {MOST_PEOPLE} are read.")
 
 
-def triples(path: Path, field: str, flat: object, per_joint: int = 3) -> Float[np.ndarray, "K per_joint"]:
-    """A list of ``per_joint`` numbers for each joint, below 1e6. Raises GhptDataError for anything else."""
-    if not isinstance(flat, list) or len(flat) % per_joint or not {int, float}.issuperset(map(type, flat)):
+def triples(
+    path: Path, field: str, flat: object, per_joint: int = 3
+) -> Float[np.ndarray, "K per_joint"]:
+    """A list of ``per_joint`` numbers for each joint, below 1e6. Raises GhptDataError for anything
+    else.
+    """
+    if (
+        not isinstance(flat, list)
+        or len(flat) % per_joint
+        or not {int, float}.issuperset(map(type, flat))
+    ):
         words = "x, y, confidence" if per_joint == 3 else "x, y"
         raise GhptDataError(path, field, f"is not a list of {words}", "Detect this frame again.")
     try:
@@ -182,7 +231,9 @@ def triples(path: Path, field: str, flat: object, per_joint: int = 3) -> Float[n
 
 
 def joints_for(where: Path, skeleton: str, count: int) -> tuple[str, ...]:
-    """The names of ``count`` joints. Raises GhptDataError if the skeleton has another number of them."""
+    """The names of ``count`` joints. Raises GhptDataError if the skeleton has another number of
+    them.
+    """
     joints = joints_of(where, skeleton)
     if len(joints) != count:
         problem = f"{skeleton} has {len(joints)} joints and the key points have {count}"

@@ -1,4 +1,6 @@
-"""The bodies of successive frames as people: tracks of what stays near, joined where they can be one."""
+"""The bodies of successive frames as people: tracks of what stays near, joined where they can be
+one.
+"""
 
 from __future__ import annotations
 
@@ -7,27 +9,36 @@ from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 _NEAR = 0.35
-"""A body is another frame's if the median distance of their joints is below this part of its height."""
+"""A body is another frame's if the median distance of their joints is below this part of its
+height.
+"""
 _MOST_TRACKS = 64
 """That are followed at once: those seen last."""
 _LEAST_JOINTS = 4
 """Joints that two bodies must share to be compared."""
 
 
-def extent(points: Float[np.ndarray, "N J D"], seen: Bool[np.ndarray, "N J"]) -> Float[np.ndarray, " N"]:
+def extent(
+    points: Float[np.ndarray, "N J D"], seen: Bool[np.ndarray, "N J"]
+) -> Float[np.ndarray, " N"]:
     """Diagonal of the box around what is seen; 0 for nothing."""
     low = np.where(seen[..., None], points, np.inf).min(1)
     high = np.where(seen[..., None], points, -np.inf).max(1)
-    return np.linalg.norm(np.where(np.isfinite(low), high - np.where(np.isfinite(low), low, 0), 0), axis=-1)
+    return np.linalg.norm(
+        np.where(np.isfinite(low), high - np.where(np.isfinite(low), low, 0), 0), axis=-1
+    )
 
 
 def tracks(
     frame: Int[np.ndarray, " G"], bodies: Float[np.ndarray, "G J 3"], known: Bool[np.ndarray, "G J"]
 ) -> Int[np.ndarray, " G"]:
-    """The number of each body's track: in each frame bodies go to the tracks whose last body is nearest."""
+    """The number of each body's track: in each frame bodies go to the tracks whose last body is
+    nearest.
+    """
     track = np.full(len(frame), -1)
     order = np.argsort(frame, kind="stable")
-    last, count = np.zeros(0, np.int64), 0
+    last = np.zeros(0, np.int64)
+    count = 0
     for now in np.split(order, np.flatnonzero(np.diff(frame[order])) + 1) if len(order) else ():
         cost = _apart(bodies, known, last, now)
         rows, columns = linear_sum_assignment(np.minimum(cost, 10 * _NEAR))
@@ -48,7 +59,9 @@ def _apart(
     count = both.sum(-1)
     ordered = np.sort(np.where(both, distance, np.inf), axis=-1)
     middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[..., None] // 2, -1)[..., 0]
-    return np.where(count >= _LEAST_JOINTS, middle, np.inf) / np.maximum(extent(bodies[now], known[now]), 1e-9)
+    return np.where(count >= _LEAST_JOINTS, middle, np.inf) / np.maximum(
+        extent(bodies[now], known[now]), 1e-9
+    )
 
 
 def joined(

@@ -1,4 +1,6 @@
-"""The views of a recording before their cameras: matched by name, out of the lens, as the 17 joints."""
+"""The views of a recording before their cameras: matched by name, out of the lens, as the 17
+joints.
+"""
 
 from __future__ import annotations
 
@@ -25,14 +27,19 @@ from ghpt.skeleton import JOINTS
 _log = logging.getLogger(__name__)
 _MEND = "Rename them, say which is which (match={view: camera}), or name the views to use (views=[...])."
 _MOST_OUTSIDE = 0.25
-_NORMALISED, _NEARLY_ALL = 1.5, 0.99
-"""Nearly all coordinates of a view within this are no pixels: of the image's size, with a joint or two beyond it."""
+_NORMALISED = 1.5
+_NEARLY_ALL = 0.99
+"""Nearly all coordinates of a view within this are no pixels: of the image's size, with a joint or
+two beyond it.
+"""
 _WORDS = r"[ _.-](json|openpose|pose|keypoints|kpts|body|2d)\b"
 
 
 @dataclass(frozen=True)
 class Views:
-    """T frames of one person in V views whose cameras may lack extrinsics: all that a calibration starts from."""
+    """T frames of one person in V views whose cameras may lack extrinsics: all that a calibration
+    starts from.
+    """
 
     cameras: CameraFile
     """In the order of the views; ``cameras.names`` are the views' names from here on."""
@@ -55,11 +62,19 @@ class Views:
     def recording(self, name: str, cameras: Cameras) -> Recording:
         """The recording as any calibration of its cameras sees it; without a truth."""
         return Recording(
-            name=name, subject=name, action="unknown", rate_hz=self.rate_hz or float("nan"),
-            camera_names=self.cameras.names, cameras=cameras, key_points=self.key_points,
-            confidence=self.confidence, seen=self.seen, truth=np.zeros((len(self), len(JOINTS), 3), np.float32),
-            truth_seen=np.zeros((len(self), len(JOINTS)), bool), frame=self.frame,
-        )  # fmt: skip
+            name=name,
+            subject=name,
+            action="unknown",
+            rate_hz=self.rate_hz or float("nan"),
+            camera_names=self.cameras.names,
+            cameras=cameras,
+            key_points=self.key_points,
+            confidence=self.confidence,
+            seen=self.seen,
+            truth=np.zeros((len(self), len(JOINTS), 3), np.float32),
+            truth_seen=np.zeros((len(self), len(JOINTS)), bool),
+            frame=self.frame,
+        )
 
 
 def look_through(
@@ -69,19 +84,24 @@ def look_through(
     views: Sequence[Name] | None = None,
     person: int = 0,
 ) -> Views:
-    """Key points with their cameras: lens distortion undone, then the detector's joints mapped to the 17.
+    """Key points with their cameras: lens distortion undone, then the detector's joints mapped to
+    the 17.
 
-    ``views`` names those to use (by the view's or the camera's name); without it every view must have its camera and
-    every camera its view. ``match`` gives the camera of a view where names do not tell. Of several people that one is
-    taken who `who` says. Raises GhptDataError.
+    ``views`` names those to use (by the view's or the camera's name); without it every view must
+    have its camera and every camera its view. ``match`` gives the camera of a view where names do
+    not tell. Of several people that one is taken who `who` says. Raises GhptDataError.
     """
     points, at, ordered = as_one_person(points, cameras, match, views, person)
-    pixels, seen = np.zeros(points.key_points[:, at].shape, np.float32), points.seen[:, at].copy()
+    pixels = np.zeros(points.key_points[:, at].shape, np.float32)
+    seen = points.seen[:, at].copy()
     check_pixels(points.path, points.key_points[:, at], seen, ordered)
     _check_sizes(points.path, points.key_points[:, at], seen, ordered)
     for view in range(len(at)):
-        K, lens = ordered.K[view].numpy(), ordered.distortion[view].numpy()
-        pixels[:, view], seen[:, view] = undistorted(points.key_points[:, at[view]], seen[:, view], K, lens)
+        K = ordered.K[view].numpy()
+        lens = ordered.distortion[view].numpy()
+        pixels[:, view], seen[:, view] = undistorted(
+            points.key_points[:, at[view]], seen[:, view], K, lens
+        )
     values = joints17(points.path, points.joints, pixels, points.confidence[:, at], seen)
     return Views(ordered, *values, frame=points.frame, rate_hz=points.rate_hz)
 
@@ -93,22 +113,29 @@ def as_one_person(
     views: Sequence[str] | None,
     person: int,
 ) -> tuple[KeyPoints, list[int], CameraFile]:
-    """One person's key points, which of their views have a camera, and these cameras in the order of the views."""
+    """One person's key points, which of their views have a camera, and these cameras in the order
+    of the views.
+    """
     pairs = matched(points.path, points.views, cameras, match or {}, views)
-    at, ordered = [view for view, _ in pairs], cameras.select([camera for _, camera in pairs])
+    at = [view for view, _ in pairs]
+    ordered = cameras.select([camera for _, camera in pairs])
     if isinstance(points, People):
         points = points.pick(who(points, ordered, at, person))
     return points, at, ordered
 
 
-def who(people: People, cameras: CameraFile, at: Sequence[int], person: int = 0) -> Int[np.ndarray, "T V"]:
+def who(
+    people: People, cameras: CameraFile, at: Sequence[int], person: int = 0
+) -> Int[np.ndarray, "T V"]:
     """The index of one person's detection in each frame and view, -1 where there is none.
 
-    ``cameras`` are those of the views ``at``. Where all detections have an identity, the person is who has the most of
-    them (``person`` = 0), or the next. Otherwise, where nobody is ever beside another, everybody is one person; else,
-    where the cameras have extrinsics, people are told apart across the views (`ghpt.data.people.association.associate`); and
-    where they have none, or no two views agree in half of the frames, each view follows its own person
-    (`ghpt.data.formats.openpose.follow`), with a warning. Raises GhptDataError if there is no such person.
+    ``cameras`` are those of the views ``at``. Where all detections have an identity, the person is
+    who has the most of them (``person`` = 0), or the next. Otherwise, where nobody is ever beside
+    another, everybody is one person; else, where the cameras have extrinsics, people are told apart
+    across the views (`ghpt.data.people.association.associate`); and where they have none, or no two
+    views agree in half of the frames, each view follows its own person
+    (`ghpt.data.formats.openpose.follow`), with a warning. Raises GhptDataError if there is no such
+    person.
     """
     of = np.isin(people.view, list(at))
     if len(people.identity) and (people.identity >= 0).all():
@@ -132,26 +159,41 @@ def who(people: People, cameras: CameraFile, at: Sequence[int], person: int = 0)
 def _person(people: People, found: Sequence[np.ndarray], person: int) -> Int[np.ndarray, "T V"]:
     if not 0 <= person < len(found):
         mend = f"Give a number below {len(found)}; 0 is who is seen most."
-        raise GhptDataError(people.path, "person", f"there is no person {person}: {len(found)} can be told apart", mend)
+        raise GhptDataError(
+            people.path,
+            "person",
+            f"there is no person {person}: {len(found)} can be told apart",
+            mend,
+        )
     return found[person]
 
 
 def _across(people: People, cameras: CameraFile, at: Sequence[int]) -> list[Int[np.ndarray, "T V"]]:
     """Everybody who can be told apart across the views ``at``."""
-    chosen, pixels, seen = [], [], []
+    chosen = []
+    pixels = []
+    seen = []
     for place, view in enumerate(at):
         of = np.flatnonzero(people.view == view)
-        K, lens = cameras.K[place].numpy(), cameras.distortion[place].numpy()
+        K = cameras.K[place].numpy()
+        lens = cameras.distortion[place].numpy()
         points, there = undistorted(people.key_points[of], people.seen[of], K, lens)
         chosen.append(of)
         pixels.append(points)
         seen.append(there)
     index = np.concatenate(chosen)
-    values = joints17(people.path, people.joints, np.concatenate(pixels)[:, None], people.confidence[index][:, None],
-                      np.concatenate(seen)[:, None])  # fmt: skip
+    values = joints17(
+        people.path,
+        people.joints,
+        np.concatenate(pixels)[:, None],
+        people.confidence[index][:, None],
+        np.concatenate(seen)[:, None],
+    )
     points, sure, there = (value[:, 0] for value in values)
     place = np.repeat(np.arange(len(at)), [len(of) for of in chosen])
-    found = associate(cameras.cameras, len(people.frame), people.row[index], place, points, there, sure)
+    found = associate(
+        cameras.cameras, len(people.frame), people.row[index], place, points, there, sure
+    )
     people_of = []
     for one in found:
         whole = np.full((len(people.frame), len(people.views)), -1)
@@ -169,9 +211,10 @@ def matched(
 ) -> list[tuple[int, int]]:
     """(view, camera) pairs, in the order of the cameras.
 
-    A view is its camera's if ``match`` says so; if it has one of the camera's names exactly; or else if the names
-    are the same but for case, separators, leading zeros and words like json (``cam1_json`` is ``cam_01``). Raises
-    GhptDataError, listing both sides, where that is not one to one.
+    A view is its camera's if ``match`` says so; if it has one of the camera's names exactly; or
+    else if the names are the same but for case, separators, leading zeros and words like json
+    (``cam1_json`` is ``cam_01``). Raises GhptDataError, listing both sides, where that is not one
+    to one.
     """
     known = {name: None for names in _names(cameras) for name in names}
     match = {chosen_name(view, views): chosen_name(camera, known) for view, camera in match.items()}
@@ -179,15 +222,23 @@ def matched(
         wanted = [chosen_name(name, (*views, *known)) for name in wanted]
     for view, camera in match.items():
         if view not in views or camera not in known:
-            raise _unmatched(where, views, cameras, f"match says {view}: {camera}, of which one is not there")
+            raise _unmatched(
+                where, views, cameras, f"match says {view}: {camera}, of which one is not there"
+            )
     found: list[tuple[int, int]] = []
     for index, view in enumerate(views):
         own = [i for i, names in enumerate(_names(cameras)) if match.get(view, view) in names]
         if not own and view not in match:
-            own = [i for i, names in enumerate(_names(cameras)) if normal(view) in map(normal, names)]
+            own = [
+                i for i, names in enumerate(_names(cameras)) if normal(view) in map(normal, names)
+            ]
         found += [(index, camera) for camera in own]
     if wanted is not None:
-        unknown = [name for name in wanted if not any(name in (views[v], *_names(cameras)[c]) for v, c in found)]
+        unknown = [
+            name
+            for name in wanted
+            if not any(name in (views[v], *_names(cameras)[c]) for v, c in found)
+        ]
         if unknown:
             raise _unmatched(where, views, cameras, f"there is no view {unknown[0]} with a camera")
         found = [(v, c) for v, c in found if {views[v], *_names(cameras)[c]} & set(wanted)]
@@ -202,9 +253,13 @@ def matched(
 
 
 def normal(name: str) -> str:
-    """A name without case, separators, leading zeros, and words like json: ``cam1_json`` and ``Cam_01`` are cam1."""
+    """A name without case, separators, leading zeros, and words like json: ``cam1_json`` and
+    ``Cam_01`` are cam1.
+    """
     bare = re.sub(_WORDS, "", name.lower())
-    return re.sub(r"(?<!\d)0+(?=\d)", "", re.sub(r"(?<=\d)[^a-z0-9]+(?=\d)", "~", bare).translate(_SEPARATORS))
+    return re.sub(
+        r"(?<!\d)0+(?=\d)", "", re.sub(r"(?<=\d)[^a-z0-9]+(?=\d)", "~", bare).translate(_SEPARATORS)
+    )
 
 
 _SEPARATORS = {ord(c): None for c in " _.-"}
@@ -214,7 +269,9 @@ def _names(cameras: CameraFile) -> list[tuple[str, ...]]:
     return [(a, b) if b else (a,) for a, b in zip(cameras.names, cameras.other_names, strict=True)]
 
 
-def _unmatched(where: str, views: Sequence[str], cameras: CameraFile, problem: str) -> GhptDataError:
+def _unmatched(
+    where: str, views: Sequence[str], cameras: CameraFile, problem: str
+) -> GhptDataError:
     sides = f"views: {', '.join(views)}; cameras of {cameras.path}: {', '.join('/'.join(n) for n in _names(cameras))}"
     return GhptDataError(where, "views", f"{problem} ({sides})", _MEND)
 
@@ -227,9 +284,14 @@ def image_size(cameras: CameraFile) -> Float[np.ndarray, "V 2"]:
 
 
 def check_pixels(
-    where: str, pixels: Float[np.ndarray, "T V K 2"], seen: Bool[np.ndarray, "T V K"], cameras: CameraFile
+    where: str,
+    pixels: Float[np.ndarray, "T V K 2"],
+    seen: Bool[np.ndarray, "T V K"],
+    cameras: CameraFile,
 ) -> None:
-    """Raise GhptDataError for key points in [0, 1] or [-1, 1], as shares of the image, where pixels are wanted."""
+    """Raise GhptDataError for key points in [0, 1] or [-1, 1], as shares of the image, where pixels
+    are wanted.
+    """
     size = image_size(cameras)
     for view, name in enumerate(cameras.names):
         own = pixels[:, view][seen[:, view]]
@@ -251,7 +313,9 @@ def check_pixels(
 
 
 def _check_sizes(where: str, pixels: np.ndarray, seen: np.ndarray, cameras: CameraFile) -> None:
-    """Detectors place some joints beyond the image's edge; many there are those of an image of another size."""
+    """Detectors place some joints beyond the image's edge; many there are those of an image of
+    another size.
+    """
     if cameras.size is None:
         return
     size = image_size(cameras)
@@ -260,7 +324,9 @@ def _check_sizes(where: str, pixels: np.ndarray, seen: np.ndarray, cameras: Came
     for view in np.flatnonzero(share > _MOST_OUTSIDE):
         width, height = size[view]
         reach = pixels[:, view][seen[:, view]].max(0)
-        image = f"its image of {width:.0f} x {height:.0f}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
+        image = (
+            f"its image of {width:.0f} x {height:.0f}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
+        )
         problem = f"{share[view]:.0%} of the key points lie outside {image}"
         mend = "Give the intrinsics of the resolution that the key points were detected in."
         if turned[view] < 1 - _NEARLY_ALL:
@@ -270,7 +336,9 @@ def _check_sizes(where: str, pixels: np.ndarray, seen: np.ndarray, cameras: Came
 
 
 def _outside(
-    pixels: Float[np.ndarray, "T V K 2"], seen: Bool[np.ndarray, "T V K"], size: Float[np.ndarray, "V 2"]
+    pixels: Float[np.ndarray, "T V K 2"],
+    seen: Bool[np.ndarray, "T V K"],
+    size: Float[np.ndarray, "V 2"],
 ) -> Float[np.ndarray, " V"]:
     """The share of each view's key points beyond images of this size."""
     outside = seen & ((pixels < -0.5) | (pixels > size[:, None] - 0.5)).any(-1)

@@ -1,8 +1,10 @@
-"""A model of a 2D key-point detector: what it would have seen of a moving 3D body through real lenses.
+"""A model of a 2D key-point detector: what it would have seen of a moving 3D body through real
+lenses.
 
-Every error persists over time and knows the body: joints are defined a little differently than in the truth, pixel
-noise grows with the person in the image, what the body hides is found worse, sides are exchanged, and key points
-jump away or are missed for a while. All lengths are fractions of the person's stature.
+Every error persists over time and knows the body: joints are defined a little differently than in
+the truth, pixel noise grows with the person in the image, what the body hides is found worse, sides
+are exchanged, and key points jump away or are missed for a while. All lengths are fractions of the
+person's stature.
 """
 
 from __future__ import annotations
@@ -65,7 +67,9 @@ class Processes:
 
 @dataclass(frozen=True)
 class Detector:
-    """The detector's numbers: lengths in statures, rates as a share of the time, durations in seconds."""
+    """The detector's numbers: lengths in statures, rates as a share of the time, durations in
+    seconds.
+    """
 
     noise: float
     """Standard deviation of a pixel coordinate of an average joint."""
@@ -73,12 +77,16 @@ class Detector:
     noise_white: float
     """Share of the noise's variance that is new in every frame."""
     noise_slow: float
-    """Share of the noise's variance that lasts for ``noise_slow_seconds`` instead of ``noise_seconds``."""
+    """Share of the noise's variance that lasts for ``noise_slow_seconds`` instead of
+    ``noise_seconds``.
+    """
     noise_slow_seconds: float
     joints: Mapping[str, float]
     """Noise and outlier rate of ``ankle``, ``knee``, ... relative to the average joint's."""
     bias: float
-    """Size of the difference between the detector's and the truth's definition of a joint, in the body's frame."""
+    """Size of the difference between the detector's and the truth's definition of a joint, in the
+    body's frame.
+    """
     bias_seed: int
     """Which definition: the same for everybody, mirrored on the other side."""
     bias_of_subject: float
@@ -118,10 +126,13 @@ class Detector:
     ) -> Detections:
         """Detect a take (world, mm) in every view of the rig.
 
-        A view's detections depend on the seed, the subject, the take and the camera's name, not on the other
-        views. Joints whose truth is unknown must hold finite numbers; mask them afterwards.
+        A view's detections depend on the seed, the subject, the take and the camera's name, not on
+        the other views. Joints whose truth is unknown must hold finite numbers; mask them
+        afterwards.
         """
-        shown = self.shown(points, self.body_error(len(points), rate_hz, seed, subject, take), familiar)
+        shown = self.shown(
+            points, self.body_error(len(points), rate_hz, seed, subject, take), familiar
+        )
         views = []
         for view, name in enumerate(rig.names):
             processes = self.processes(len(points), rate_hz, generator(seed, "camera", take, name))
@@ -132,10 +143,14 @@ class Detector:
         self, frames: int, rate_hz: float, seed: int, subject: str, take: str
     ) -> tuple[Float[np.ndarray, "J 4"], Float[np.ndarray, "T J 3"]]:
         """Unit joint-definition bias (along the limb, and in the trunk's frame) and unit drift."""
-        bias = _symmetric(generator(self.bias_seed, "joint definition").normal(size=(len(JOINTS), 4)))
+        bias = _symmetric(
+            generator(self.bias_seed, "joint definition").normal(size=(len(JOINTS), 4))
+        )
         own = generator(seed, "subject", subject).normal(size=(len(JOINTS), 4))
         bias = np.sqrt(1.0 - self.bias_of_subject) * bias + np.sqrt(self.bias_of_subject) * own
-        drift = process(generator(seed, "drift", take), (len(JOINTS), 3), frames, self.drift_seconds * rate_hz)
+        drift = process(
+            generator(seed, "drift", take), (len(JOINTS), 3), frames, self.drift_seconds * rate_hz
+        )
         return bias / 2.0, drift / np.sqrt(3.0)
 
     def processes(self, frames: int, rate_hz: float, rng: np.random.Generator) -> Processes:
@@ -144,7 +159,9 @@ class Detector:
         white = rng.standard_normal((frames, joints, 2), dtype=np.float32)
         quick = process(rng, (joints, 2), frames, self.noise_seconds * rate_hz)
         slow = process(rng, (joints, 2), frames, self.noise_slow_seconds * rate_hz)
-        shares = np.array([self.noise_white, 1.0 - self.noise_white - self.noise_slow, self.noise_slow])
+        shares = np.array(
+            [self.noise_white, 1.0 - self.noise_white - self.noise_slow, self.noise_slow]
+        )
         shares = np.sqrt(shares).astype(np.float32)
         return Processes(
             noise=shares[0] * white + shares[1] * quick + shares[2] * slow,
@@ -186,7 +203,9 @@ class Detector:
         person = stature(points)
         hidden = occlusion(in_camera, person)
         depth = in_camera[:, PELVIS, 2].clip(min=1.0)
-        pixels = (np.sqrt(K[0, 0] * K[1, 1]) * person / depth)[:, None]  # the person's size in the image
+        pixels = (np.sqrt(K[0, 0] * K[1, 1]) * person / depth)[
+            :, None
+        ]  # the person's size in the image
 
         target = shown @ R.T + t
         in_front = target[..., 2] > 0.05 * person
@@ -197,7 +216,9 @@ class Detector:
         scale = self.familiar if familiar else 1.0
         relative = np.array([self.joints[kind] for kind in KINDS])
         spread = self.noise * (1.0 + (self.occluded_noise - 1.0) * hidden) * relative
-        error = scale * (spread[..., None] * processes.noise + self._outliers(hidden, relative, processes))
+        error = scale * (
+            spread[..., None] * processes.noise + self._outliers(hidden, relative, processes)
+        )
         swapped = self._swap(raw, in_camera, person, processes)
         found = swapped + pixels[..., None] * error
 
@@ -205,21 +226,31 @@ class Detector:
         missing = _rate(self.miss_rate, self.miss_rate_occluded, hidden)
         inside = ((found >= -0.5) & (found <= rig.size[view].numpy() - 0.5)).all(axis=-1)
         seen = inside & in_front & (in_camera[..., 2] > 0.0) & (ndtr(processes.miss) > missing)
-        key_points, undone = _undistort(found, raw, ideal.numpy(), rig.cameras.K[view], rig.distortion[view])
+        key_points, undone = _undistort(
+            found, raw, ideal.numpy(), rig.cameras.K[view], rig.distortion[view]
+        )
         seen &= undone
         key_points = np.where(seen[..., None], key_points, 0.0).astype(np.float32)
         confidence = np.where(seen, self._confidence(size, processes), 0.0).astype(np.float32)
         return key_points, confidence, seen
 
     def _outliers(
-        self, hidden: Float[np.ndarray, "T J"], relative: Float[np.ndarray, " J"], processes: Processes
+        self,
+        hidden: Float[np.ndarray, "T J"],
+        relative: Float[np.ndarray, " J"],
+        processes: Processes,
     ) -> Float[np.ndarray, "T J 2"]:
-        """Offsets of exponential length, while the process is above the quantile that the rate leaves; continuous in
-        time, because the length is a function of how far it is above."""
-        rate = (relative * _rate(self.outlier_rate, self.outlier_rate_occluded, hidden)).clip(1e-6, 0.9)
+        """Offsets of exponential length, while the process is above the quantile that the rate
+        leaves; continuous in time, because the length is a function of how far it is above.
+        """
+        rate = (relative * _rate(self.outlier_rate, self.outlier_rate_occluded, hidden)).clip(
+            1e-6, 0.9
+        )
         above = (ndtr(processes.outlier) - (1.0 - rate)) / rate
         length = -self.outlier_size * np.log1p(-above.clip(0.0, 1.0 - 1e-4))
-        direction = processes.direction / np.linalg.norm(processes.direction, axis=-1, keepdims=True).clip(min=1e-6)
+        direction = processes.direction / np.linalg.norm(
+            processes.direction, axis=-1, keepdims=True
+        ).clip(min=1e-6)
         return length[..., None] * direction
 
     def _swap(
@@ -234,14 +265,20 @@ class Detector:
         for group, pairs in enumerate(SWAPS):
             right, left = pairs[0]
             across = in_camera[:, left] - in_camera[:, right]
-            facing = across[:, 0] / np.linalg.norm(across, axis=-1).clip(min=1e-9)  # 1: to the camera, -1: away
-            rate = self.swap_rate * (0.2 + 2.0 * np.exp(-((facing / 0.35) ** 2)) + 0.6 * (facing < 0))
+            facing = across[:, 0] / np.linalg.norm(across, axis=-1).clip(
+                min=1e-9
+            )  # 1: to the camera, -1: away
+            rate = self.swap_rate * (
+                0.2 + 2.0 * np.exp(-((facing / 0.35) ** 2)) + 0.6 * (facing < 0)
+            )
             now = ndtr(processes.swap[:, group]) > 1.0 - rate
             for a, b in pairs:
                 raw[now, a], raw[now, b] = raw[now, b], raw[now, a]
         return raw
 
-    def _confidence(self, size: Float[np.ndarray, "T J"], processes: Processes) -> Float[np.ndarray, "T J"]:
+    def _confidence(
+        self, size: Float[np.ndarray, "T J"], processes: Processes
+    ) -> Float[np.ndarray, "T J"]:
         known = np.log(size.clip(min=0.01 * self.noise) / (1.25 * self.noise))
         # 0.8: the spread of the logarithm of an error's size, which chance must be compared with
         by_chance = 0.8 * np.sqrt(1.0 / self.confidence_knowledge**2 - 1.0) * processes.confidence
@@ -258,7 +295,9 @@ def _symmetric(bias: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:
     return bias
 
 
-def _rate(visible: float, occluded: float, hidden: Float[np.ndarray, "T J"]) -> Float[np.ndarray, "T J"]:
+def _rate(
+    visible: float, occluded: float, hidden: Float[np.ndarray, "T J"]
+) -> Float[np.ndarray, "T J"]:
     return visible + (occluded - visible) * hidden
 
 
@@ -275,9 +314,13 @@ def _undistort(
     K: Float[Tensor, "3 3"],
     coefficients: Float[Tensor, " C"],
 ) -> tuple[Float[np.ndarray, "T J 2"], Bool[np.ndarray, "T J"]]:
-    """Ideal pixels of found ones, and whether that worked: fixed-point steps from the truth (``raw`` through the lens,
-    ``ideal`` without), which is close, take a tenth of the time of the general ``lens.undistort``."""
-    target, point, error = torch.from_numpy(found), torch.from_numpy(ideal), torch.from_numpy(found - raw)
+    """Ideal pixels of found ones, and whether that worked: fixed-point steps from the truth
+    (``raw`` through the lens, ``ideal`` without), which is close, take a tenth of the time of the
+    general ``lens.undistort``.
+    """
+    target = torch.from_numpy(found)
+    point = torch.from_numpy(ideal)
+    error = torch.from_numpy(found - raw)
     for _ in range(4):
         point = point + error
         error = target - _distort(point, K, coefficients)

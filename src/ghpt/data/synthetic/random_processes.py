@@ -18,7 +18,9 @@ def generator(seed: int, *names: str) -> np.random.Generator:
 def process(
     rng: np.random.Generator, shape: tuple[int, ...], frames: int, persistence: float
 ) -> Float[np.ndarray, "T ..."]:
-    """Stationary unit Gaussian processes, smooth (second order), that forget within ``persistence`` frames."""
+    """Stationary unit Gaussian processes, smooth (second order), that forget within ``persistence``
+    frames.
+    """
     warm = int(np.ceil(6.0 * persistence))
     pole = np.exp(-2.0 / max(persistence, 1e-3))
     gain = np.sqrt((1.0 - pole**2) ** 3 / (1.0 + pole**2))

@@ -1,4 +1,6 @@
-"""The data that needs no licence: real rigs, synthetic people who move, and a model of their detector."""
+"""The data that needs no licence: real rigs, synthetic people who move, and a model of their
+detector.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,8 @@ HUMAN36M_RATE = 50.0
 HUMAN36M_FRAMES = {"train": 512, "validation": 512, "test": 1066}
 """Of each take; every 64th of the test split are 1,020 frames."""
 PANOPTIC_SUBJECTS = tuple(f"P{number}" for number in range(1, 9))
-PANOPTIC_RATE, PANOPTIC_FRAMES = 30.0, 12_600
+PANOPTIC_RATE = 30.0
+PANOPTIC_FRAMES = 12_600
 """Hz, and frames of a person's one sequence (7 minutes), of which 40 of every 64th are tested."""
 PANOPTIC_PARTS = {"train": (0.0, 0.6), "validation": (0.6, 0.8), "test": (0.8, 1.0)}
 
@@ -51,10 +54,12 @@ class Take:
 def embedded_recordings(
     data: str, split: str, seed: int, detector: Detector, cameras: Sequence[int] | None = None
 ) -> Iterator[Recording]:
-    """The synthetic recordings of ``h36m``, of ``cmu1`` to ``cmu4``, or of ``panoptic`` with any HD ``cameras``.
+    """The synthetic recordings of ``h36m``, of ``cmu1`` to ``cmu4``, or of ``panoptic`` with any HD
+    ``cameras``.
 
-    A pure function of its arguments; a camera's detections are the same in every arrangement that has it. Raises
-    GhptConfigError for an unknown name and GhptDataError for a bad list of cameras, at once.
+    A pure function of its arguments; a camera's detections are the same in every arrangement that
+    has it. Raises GhptConfigError for an unknown name and GhptDataError for a bad list of cameras,
+    at once.
     """
     return (_detect(take, seed, detector) for take in takes(data, split, seed, cameras))
 
@@ -71,10 +76,13 @@ def takes(data: str, split: str, seed: int, cameras: Sequence[int] | None = None
     return _panoptic(panoptic_rig(ARRANGEMENTS[data] if cameras is None else cameras), split, seed)
 
 
-def motion(seed: int, subject: str, take: str, action: str, frames: int, rate_hz: float) -> Float[np.ndarray, "T J 3"]:
+def motion(
+    seed: int, subject: str, take: str, action: str, frames: int, rate_hz: float
+) -> Float[np.ndarray, "T J 3"]:
     """One take of one person, mm, z up: the same person in all of the subject's takes."""
     person = generator(seed, "body", subject)
-    body, left_handed = random_body(person), bool(person.uniform() < 0.1)
+    body = random_body(person)
+    left_handed = bool(person.uniform() < 0.1)
     return move(body, action, frames, rate_hz, generator(seed, "motion", take), left_handed)
 
 
@@ -91,13 +99,19 @@ def _human36m(split: str, seed: int) -> Iterator[Take]:
 def _panoptic(rig: Rig, split: str, seed: int) -> Iterator[Take]:
     first, last = (round(part * PANOPTIC_FRAMES) for part in PANOPTIC_PARTS[split])
     for subject in PANOPTIC_SUBJECTS:
-        truth = motion(seed, subject, subject, "RangeOfMotion", PANOPTIC_FRAMES, PANOPTIC_RATE)[first:last]
+        truth = motion(seed, subject, subject, "RangeOfMotion", PANOPTIC_FRAMES, PANOPTIC_RATE)[
+            first:last
+        ]
         truth = np.stack([truth[..., 0], -truth[..., 2], truth[..., 1]], axis=-1)
-        yield Take(f"{subject}/{split}", subject, "RangeOfMotion", PANOPTIC_RATE, rig, truth, False, first)
+        yield Take(
+            f"{subject}/{split}", subject, "RangeOfMotion", PANOPTIC_RATE, rig, truth, False, first
+        )
 
 
 def _detect(take: Take, seed: int, detector: Detector) -> Recording:
-    found = detector(take.truth, take.rig, take.rate_hz, seed, take.subject, take.name, take.familiar)
+    found = detector(
+        take.truth, take.rig, take.rate_hz, seed, take.subject, take.name, take.familiar
+    )
     return Recording(
         name=take.name,
         subject=take.subject,

@@ -1,4 +1,6 @@
-"""The real camera rigs whose numbers the package carries, and the paper's five arrangements of them."""
+"""The real camera rigs whose numbers the package carries, and the paper's five arrangements of
+them.
+"""
 
 from __future__ import annotations
 
@@ -24,8 +26,9 @@ ARRANGEMENTS: dict[str, tuple[int, ...]] = {
     "cmu4": (6, 7, 10, 12, 16, 18, 19, 22, 23, 30),
     "h36m": (0, 1, 2, 3),
 }
-"""Camera numbers of the paper's section 4.1: Panoptic's HD cameras, and Human3.6M's four in order of
-name."""
+"""Camera numbers of the paper's section 4.1: Panoptic's HD cameras, and Human3.6M's four in order
+of name.
+"""
 
 
 @dataclass(frozen=True)
@@ -49,8 +52,12 @@ def human36m_rig(subject: str) -> Rig:
     table = _load("human36m_cameras.json")
     names = tuple(table["intrinsics"])
     if f"{subject}/{names[0]}" not in table["extrinsics"]:
-        known = sorted({key.split("/")[0] for key in table["extrinsics"]}, key=lambda name: int(name[1:]))
-        raise GhptDataError("Human3.6M", "subject", f"no subject {subject!r}", f"There are {', '.join(known)}.")
+        known = sorted(
+            {key.split("/")[0] for key in table["extrinsics"]}, key=lambda name: int(name[1:])
+        )
+        raise GhptDataError(
+            "Human3.6M", "subject", f"no subject {subject!r}", f"There are {', '.join(known)}."
+        )
     return _rig(
         names,
         [table["intrinsics"][name] | table["extrinsics"][f"{subject}/{name}"] for name in names],
@@ -67,11 +74,16 @@ def panoptic_rig(numbers: Sequence[int]) -> Rig:
     unknown = [number for number in numbers if str(number) not in table]
     if unknown:
         raise GhptDataError(
-            "Panoptic", "cameras", f"no HD camera {unknown[0]}", f"HD cameras are 0 to {len(table) - 1}."
+            "Panoptic",
+            "cameras",
+            f"no HD camera {unknown[0]}",
+            f"HD cameras are 0 to {len(table) - 1}.",
         )
     twice = [number for number, count in Counter(numbers).items() if count > 1]
     if twice:
-        raise GhptDataError("Panoptic", "cameras", f"camera {twice[0]} is listed twice", "List each camera once.")
+        raise GhptDataError(
+            "Panoptic", "cameras", f"camera {twice[0]} is listed twice", "List each camera once."
+        )
     if len(numbers) < 2:
         raise GhptDataError(
             "Panoptic",
@@ -79,12 +91,18 @@ def panoptic_rig(numbers: Sequence[int]) -> Rig:
             f"{len(numbers)} listed: {list(numbers)}",
             "Triangulation needs at least two.",
         )
-    return _rig(tuple(f"00_{number:02d}" for number in numbers), [table[str(n)] for n in numbers], mm_per_unit=10.0)
+    return _rig(
+        tuple(f"00_{number:02d}" for number in numbers),
+        [table[str(n)] for n in numbers],
+        mm_per_unit=10.0,
+    )
 
 
 @cache
 def _load(name: str) -> dict[str, Any]:
-    return json.loads(resources.files("ghpt.data.synthetic").joinpath(name).read_text(encoding="utf-8"))
+    return json.loads(
+        resources.files("ghpt.data.synthetic").joinpath(name).read_text(encoding="utf-8")
+    )
 
 
 def _rig(names: tuple[str, ...], entries: list[dict[str, Any]], mm_per_unit: float) -> Rig:

@@ -1,8 +1,9 @@
 """Classical estimators on the same key points as the learned one, and with the same output type.
 
-Thresholds and scales are fractions of the person's size in each view's image (the diagonal of the box of the
-seen key points), so that they mean the same at any resolution and distance. A robust estimator that finds
-nothing better falls back to the all-view linear one: it never gains by leaving hard joints out.
+Thresholds and scales are fractions of the person's size in each view's image (the diagonal of the
+box of the seen key points), so that they mean the same at any resolution and distance. A robust
+estimator that finds nothing better falls back to the all-view linear one: it never gains by leaving
+hard joints out.
 """
 
 from __future__ import annotations
@@ -22,9 +23,12 @@ from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.recording import KeyPointBatch, PoseEstimate
 
 
-def person_size(key_points: Float[Tensor, "*B V J 2"], seen: Bool[Tensor, "*B V J"]) -> Float[Tensor, "*B V"]:
-    """Diagonal (pixels) of the box around the seen key points of each view; 0 where fewer than two are
-    seen."""
+def person_size(
+    key_points: Float[Tensor, "*B V J 2"], seen: Bool[Tensor, "*B V J"]
+) -> Float[Tensor, "*B V"]:
+    """Diagonal (pixels) of the box around the seen key points of each view; 0 where fewer than two
+    are seen.
+    """
     seen = (seen & torch.isfinite(key_points).all(-1))[..., None]
     largest = torch.where(seen, key_points, -torch.inf).amax(-2)
     smallest = torch.where(seen, key_points, torch.inf).amin(-2)
@@ -35,8 +39,11 @@ def otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
     """``first`` where it is ok, ``second`` elsewhere."""
     chosen = {}
     for field in fields(Triangulation):
-        a, b = getattr(first, field.name), getattr(second, field.name)
-        chosen[field.name] = torch.where(first.ok[..., None] if a.ndim > first.ok.ndim else first.ok, a, b)
+        a = getattr(first, field.name)
+        b = getattr(second, field.name)
+        chosen[field.name] = torch.where(
+            first.ok[..., None] if a.ndim > first.ok.ndim else first.ok, a, b
+        )
     return Triangulation(**chosen)
 
 
@@ -49,28 +56,36 @@ def everywhere(value: float, batch: KeyPointBatch) -> Float[Tensor, " B"]:
 
 
 class Baseline(ABC):
-    """A classical estimator: ``baseline(batch)`` gives a PoseEstimate in the dtype of the key points."""
+    """A classical estimator: ``baseline(batch)`` gives a PoseEstimate in the dtype of the key
+    points.
+    """
 
     @abstractmethod
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         """The batch's joints with their status."""
 
-    def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"] | None:
-        """Largest residual of a view that counts as one that made the joint, as a fraction of the person's size, for
-        the ``points`` that this found; None where all views do."""
+    def reach(
+        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]
+    ) -> Float[Tensor, " B"] | None:
+        """Largest residual of a view that counts as one that made the joint, as a fraction of the
+        person's size, for the ``points`` that this found; None where all views do.
+        """
         return None
 
     def agreeing(
         self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
     ) -> tuple[Bool[Tensor, "B V J"], Bool[Tensor, "B J"]]:
-        """The views that made each of the ``points`` that are ``placed``, and whether two of them agree; all that see
-        the joint where fewer than two are within reach."""
+        """The views that made each of the ``points`` that are ``placed``, and whether two of them
+        agree; all that see the joint where fewer than two are within reach.
+        """
         given = batch.seen & placed[:, None]
         reach = self.reach(batch, points)
         if reach is None:
             return given, placed
         limit = reach[:, None] * person_size(batch.key_points, batch.seen)
-        near = given & (reprojection_error(batch.cameras, batch.key_points, points) <= limit[..., None])
+        near = given & (
+            reprojection_error(batch.cameras, batch.key_points, points) <= limit[..., None]
+        )
         agreed = near.sum(1) >= 2
         return torch.where(agreed[:, None], near, given), agreed
 
@@ -88,7 +103,9 @@ class Linear(Baseline):
 
 @dataclass(frozen=True)
 class WeightedLinear(Baseline):
-    """All seen views; the detector's confidence to the power ``power`` weights the squared residuals."""
+    """All seen views; the detector's confidence to the power ``power`` weights the squared
+    residuals.
+    """
 
     power: float
 
@@ -97,17 +114,19 @@ class WeightedLinear(Baseline):
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         weights = torch.where(batch.seen, batch.confidence.clamp(min=0) ** self.power, 0.0)
-        return otherwise(triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch))
+        return otherwise(
+            triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch)
+        )
 
 
 @dataclass(frozen=True)
 class MEstimator(Baseline):
     """Iteratively reweighted least squares on the reprojection error, from the linear estimate.
 
-    ``scale``: where the loss turns robust, as a fraction of the person's size in each view. Each view's
-    weight is that of its residual under ``loss`` over its squared depth, which turns the rows' residuals into
-    pixels. A joint whose last step is longer than ``tolerance`` (mm) has the status NOT_CONVERGED and its
-    last point.
+    ``scale``: where the loss turns robust, as a fraction of the person's size in each view. Each
+    view's weight is that of its residual under ``loss`` over its squared depth, which turns the
+    rows' residuals into pixels. A joint whose last step is longer than ``tolerance`` (mm) has the
+    status NOT_CONVERGED and its last point.
     """
 
     loss: Literal["huber", "cauchy", "geman_mcclure"]
@@ -116,16 +135,25 @@ class MEstimator(Baseline):
     tolerance: float
 
     def __post_init__(self) -> None:
-        check(self.loss in WEIGHTS, "loss", f"is {self.loss!r}", f"Choose from {', '.join(WEIGHTS)}.")
+        check(
+            self.loss in WEIGHTS, "loss", f"is {self.loss!r}", f"Choose from {', '.join(WEIGHTS)}."
+        )
         check_positive(scale=self.scale, iterations=self.iterations, tolerance=self.tolerance)
 
     def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"]:
-        """The scale: a residual of that size has a quarter (Geman-McClure), half (Cauchy) or all (Huber) of the
-        weight."""
+        """The scale: a residual of that size has a quarter (Geman-McClure), half (Cauchy) or all
+        (Huber) of the weight.
+        """
         return everywhere(self.scale, batch)
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         scale = (self.scale * person_size(batch.key_points, batch.seen)).clamp(min=1e-12)
         return triangulate_robustly(
-            batch.cameras, batch.key_points, batch.seen, scale, WEIGHTS[self.loss], self.iterations, self.tolerance
+            batch.cameras,
+            batch.key_points,
+            batch.seen,
+            scale,
+            WEIGHTS[self.loss],
+            self.iterations,
+            self.tolerance,
         )

@@ -29,10 +29,11 @@ _HYPOTHESES = ((True, True), (True, False), (False, True))
 class Swaps:
     """How swaps are looked for.
 
-    A pose's cost is the sum over views and limb joints of ``log(1 + r^2)``, r the reprojection error in ``scale`` (a
-    fraction of the person's size) of the pose that ``estimator`` gives: its Cauchy loss. Legs, arms or both are
-    exchanged in a view where estimating the pose anew lowers its cost by more than ``gain``. In each of ``rounds`` one
-    view of a frame, out of the ``views`` that fit worst.
+    A pose's cost is the sum over views and limb joints of ``log(1 + r^2)``, r the reprojection
+    error in ``scale`` (a fraction of the person's size) of the pose that ``estimator`` gives: its
+    Cauchy loss. Legs, arms or both are exchanged in a view where estimating the pose anew lowers
+    its cost by more than ``gain``. In each of ``rounds`` one view of a frame, out of the ``views``
+    that fit worst.
     """
 
     estimator: Baseline
@@ -52,11 +53,13 @@ def undo_swaps(
 ) -> tuple[KeyPointBatch, Bool[Tensor, "B V"]]:
     """The batch with left and right put right, and in which views of which frames they were not.
 
-    Only in frames with three views or more, and in fewer than half of these: of views that stand two against two
-    neither side is the swapped one. ``estimate``: what ``swaps.estimator`` makes of the batch, if that is known; frames
-    in which no view fits it badly cost nothing more.
+    Only in frames with three views or more, and in fewer than half of these: of views that stand
+    two against two neither side is the swapped one. ``estimate``: what ``swaps.estimator`` makes of
+    the batch, if that is known; frames in which no view fits it badly cost nothing more.
     """
-    exchanged = torch.zeros(*batch.seen.shape[:2], len(LIMBS), dtype=torch.bool, device=batch.seen.device)
+    exchanged = torch.zeros(
+        *batch.seen.shape[:2], len(LIMBS), dtype=torch.bool, device=batch.seen.device
+    )
     most = (batch.seen.any(-1).sum(-1) - 1) // 2
     if not len(batch) or int(most.max()) < 1:
         return batch, exchanged.any(-1)
@@ -72,12 +75,18 @@ def undo_swaps(
         own = exchanged[doubtful]
         candidates = _candidates(own, before[doubtful], min(swaps.views, batch.seen.shape[1]))
         count = candidates.shape[1]
-        hypotheses = _exchange(batch.rows(doubtful.repeat_interleave(count)), candidates.flatten(0, 1))
-        costs = _costs(hypotheses, swaps.estimator(hypotheses), swaps.scale).unflatten(0, (-1, count))
+        hypotheses = _exchange(
+            batch.rows(doubtful.repeat_interleave(count)), candidates.flatten(0, 1)
+        )
+        costs = _costs(hypotheses, swaps.estimator(hypotheses), swaps.scale).unflatten(
+            0, (-1, count)
+        )
         allowed = candidates.any(-1).sum(-1) <= most[doubtful, None]
         best = torch.where(allowed, costs.sum(-1), torch.inf).argmin(-1)
         row = torch.arange(len(best), device=best.device)
-        better = allowed[row, best] & (before[doubtful].sum(-1) - costs[row, best].sum(-1) > swaps.gain)
+        better = allowed[row, best] & (
+            before[doubtful].sum(-1) - costs[row, best].sum(-1) > swaps.gain
+        )
         changed = doubtful[better]
         exchanged[changed] = candidates[row, best][better]
         before[changed] = costs[row, best][better]
@@ -85,11 +94,16 @@ def undo_swaps(
     return _exchange(batch, exchanged), exchanged.any(-1)
 
 
-def _candidates(exchanged: Bool[Tensor, "S V G"], costs: Float[Tensor, "S V"], views: int) -> Bool[Tensor, "S H V G"]:
+def _candidates(
+    exchanged: Bool[Tensor, "S V G"], costs: Float[Tensor, "S V"], views: int
+) -> Bool[Tensor, "S H V G"]:
     """What is exchanged if one more of the worst views is."""
     worst = costs.topk(views, dim=-1).indices
     kinds = torch.tensor(_HYPOTHESES, device=costs.device)
-    one = torch.nn.functional.one_hot(worst, costs.shape[1]).bool()[:, :, None, :, None] & kinds[:, None]
+    one = (
+        torch.nn.functional.one_hot(worst, costs.shape[1]).bool()[:, :, None, :, None]
+        & kinds[:, None]
+    )
     return exchanged[:, None] ^ one.flatten(1, 2)
 
 
@@ -99,15 +113,22 @@ def _exchange(batch: KeyPointBatch, which: Bool[Tensor, "B V G"]) -> KeyPointBat
     mirror = torch.tensor(MIRROR, device=which.device)
     for group, limbs in enumerate(LIMBS):
         joints = torch.tensor(limbs, device=which.device)
-        order[..., joints] = torch.where(which[..., group, None], mirror[joints], order[..., joints])
+        order[..., joints] = torch.where(
+            which[..., group, None], mirror[joints], order[..., joints]
+        )
     points = batch.key_points.gather(2, order[..., None].expand(-1, -1, -1, 2))
     return replace(
-        batch, key_points=points, confidence=batch.confidence.gather(2, order), seen=batch.seen.gather(2, order)
+        batch,
+        key_points=points,
+        confidence=batch.confidence.gather(2, order),
+        seen=batch.seen.gather(2, order),
     )
 
 
 def _costs(batch: KeyPointBatch, estimate: PoseEstimate, scale: float) -> Float[Tensor, "B V"]:
-    """Each view's share of its frame's cost: of the joints that it sees and the frame places, with their mirrors."""
+    """Each view's share of its frame's cost: of the joints that it sees and the frame places, with
+    their mirrors.
+    """
     size = (scale * person_size(batch.key_points, batch.seen).double()).clamp(min=1e-12)[..., None]
     error = reprojection_error(batch.cameras, batch.key_points, estimate.points) / size
     mirror = list(MIRROR)

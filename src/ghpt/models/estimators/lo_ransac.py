@@ -21,8 +21,8 @@ from ghpt.recording import KeyPointBatch
 class LoRansac(Baseline):
     """pycolmap's LO-RANSAC over views for each joint, and its inliers triangulated together.
 
-    ``threshold``: an inlier's largest reprojection error, as a fraction of the person's size in that view.
-    ``seed`` fixes its draws. Runs on the CPU, joint by joint.
+    ``threshold``: an inlier's largest reprojection error, as a fraction of the person's size in
+    that view. ``seed`` fixes its draws. Runs on the CPU, joint by joint.
     """
 
     threshold: float
@@ -55,19 +55,25 @@ class LoRansac(Baseline):
                 if len(views) < 2:
                     continue
                 found = pycolmap.estimate_triangulation(
-                    rays[frame, views, joint], [poses[v] for v in views], [cameras[v] for v in views], options
+                    rays[frame, views, joint],
+                    [poses[v] for v in views],
+                    [cameras[v] for v in views],
+                    options,
                 )
                 if found is not None:
                     inliers[frame, views[np.asarray(found["inliers"], dtype=bool)], joint] = True
         weights = inliers.to(batch.key_points)
-        return otherwise(triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch))
+        return otherwise(
+            triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch)
+        )
 
 
 def pycolmap_cameras(
     K: np.ndarray, R: np.ndarray, t: np.ndarray, valid: np.ndarray
 ) -> tuple[dict[int, pycolmap.Camera], dict[int, pycolmap.Rigid3d]]:
     """The valid cameras by view: pycolmap refuses others."""
-    cameras, poses = {}, {}
+    cameras = {}
+    poses = {}
     for v in np.flatnonzero(valid).tolist():
         pinhole = [K[v, 0, 0], K[v, 1, 1], K[v, 0, 2], K[v, 1, 2]]
         cameras[v] = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=pinhole)

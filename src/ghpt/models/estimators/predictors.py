@@ -1,4 +1,6 @@
-"""From a batch of key points to what a recording becomes, by a classical estimator or by the learned model."""
+"""From a batch of key points to what a recording becomes, by a classical estimator or by the
+learned model.
+"""
 
 from __future__ import annotations
 
@@ -23,13 +25,19 @@ FAR = 20.0
 """A key point so many times as far from its view's median as the median one belongs to nobody."""
 
 _STATE = {
-    Status.OK: State.OBSERVED, Status.NOT_CONVERGED: State.OBSERVED, Status.FEW_VIEWS: State.FEW_VIEWS,
-    Status.PARALLEL: State.PARALLEL, Status.BEHIND: State.BEHIND, Status.NONFINITE_INPUT: State.BAD_INPUT,
-}  # fmt: skip
+    Status.OK: State.OBSERVED,
+    Status.NOT_CONVERGED: State.OBSERVED,
+    Status.FEW_VIEWS: State.FEW_VIEWS,
+    Status.PARALLEL: State.PARALLEL,
+    Status.BEHIND: State.BEHIND,
+    Status.NONFINITE_INPUT: State.BAD_INPUT,
+}
 
 
 class Predictor(Protocol):
-    """What `predict` runs: each frame's result is its own, whatever batch it is in, once ``fitted``."""
+    """What `predict` runs: each frame's result is its own, whatever batch it is in, once
+    ``fitted``.
+    """
 
     def fitted(self, batch: KeyPointBatch) -> Predictor:
         """The same with the noise level of these frames: a few hundred, spread over the recording."""
@@ -41,14 +49,19 @@ class Predictor(Protocol):
 class Classical:
     """A classical estimator with what it can say of its joints.
 
-    A view counts as one of those that made a joint if its residual is within the estimator's ``reach``; where fewer
-    than two views are, all that were given to it count, and the error and covariance say so. ``reject``: which joints
-    are REJECTED because no two views explain them; null: none. ``swaps``: how exchanged sides are looked for and
-    undone; null: they are not.
+    A view counts as one of those that made a joint if its residual is within the estimator's
+    ``reach``; where fewer than two views are, all that were given to it count, and the error and
+    covariance say so. ``reject``: which joints are REJECTED because no two views explain them;
+    null: none. ``swaps``: how exchanged sides are looked for and undone; null: they are not.
     """
 
-    def __init__(self, estimator: Baseline, quality: Quality, swaps: Swaps | None, reject: Rejection | None) -> None:
-        self.estimator, self.quality, self.swaps, self.reject = estimator, quality, swaps, reject
+    def __init__(
+        self, estimator: Baseline, quality: Quality, swaps: Swaps | None, reject: Rejection | None
+    ) -> None:
+        self.estimator = estimator
+        self.quality = quality
+        self.swaps = swaps
+        self.reject = reject
 
     def fitted(self, batch: KeyPointBatch) -> Classical:
         clean, _, _, result = _prepared(batch, self.swaps, self.estimator)
@@ -75,15 +88,23 @@ class Classical:
 class Learned:
     """A trained model's view weights with what can be said of their joints.
 
-    The views that made a joint are those on which the consensus of ``view_weights`` agrees, and error and covariance
-    are theirs. The score is the mean logit of the hypotheses under their weights, before ``limit_spread``, which
-    centres each frame's. ``swaps`` and ``reject`` as in Classical.
+    The views that made a joint are those on which the consensus of ``view_weights`` agrees, and
+    error and covariance are theirs. The score is the mean logit of the hypotheses under their
+    weights, before ``limit_spread``, which centres each frame's. ``swaps`` and ``reject`` as in
+    Classical.
     """
 
     def __init__(
-        self, view_weights: ViewWeights, quality: Quality, swaps: Swaps | None, reject: Rejection | None
+        self,
+        view_weights: ViewWeights,
+        quality: Quality,
+        swaps: Swaps | None,
+        reject: Rejection | None,
     ) -> None:
-        self.view_weights, self.quality, self.swaps, self.reject = view_weights, quality, swaps, reject
+        self.view_weights = view_weights
+        self.quality = quality
+        self.swaps = swaps
+        self.reject = reject
 
     def fitted(self, batch: KeyPointBatch) -> Learned:
         clean, _, _, robust = _prepared(batch, self.swaps, self.view_weights.consensus)
@@ -113,13 +134,17 @@ class Learned:
 def _prepared(
     batch: KeyPointBatch, swaps: Swaps | None, estimator: Baseline
 ) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"], Bool[Tensor, "B V"], Triangulation]:
-    """The batch to triangulate, what was taken out of it, in which views left and right were exchanged, and what
-    ``estimator`` makes of the batch. It does so once where it is the one that looks for swaps."""
+    """The batch to triangulate, what was taken out of it, in which views left and right were
+    exchanged, and what ``estimator`` makes of the batch. It does so once where it is the one that
+    looks for swaps.
+    """
     clean, spoilt = cleaned(batch)
     result = estimator.triangulate(clean)
     if swaps is None:
         return clean, spoilt, torch.zeros_like(batch.seen[..., 0]), result
-    clean, swapped = undo_swaps(clean, swaps, poses_of(result, clean) if estimator == swaps.estimator else None)
+    clean, swapped = undo_swaps(
+        clean, swaps, poses_of(result, clean) if estimator == swaps.estimator else None
+    )
     rows = torch.nonzero(swapped.any(-1))[:, 0]
     if len(rows):
         result = result.with_rows(rows, estimator.triangulate(clean.rows(rows)))
@@ -127,21 +152,26 @@ def _prepared(
 
 
 def cleaned(batch: KeyPointBatch) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"]]:
-    """The batch without key points that no detection can be, and which those were: not finite, of a camera that is
-    none, or ``FAR`` from all others of its view."""
+    """The batch without key points that no detection can be, and which those were: not finite, of a
+    camera that is none, or ``FAR`` from all others of its view.
+    """
     usable = batch.seen & usable_views(batch.cameras, batch.key_points)
     points = torch.where(usable[..., None], batch.key_points, torch.nan)
     offset = (points - points.nanmedian(-2, keepdim=True).values).abs().amax(-1)
     typical = offset.nanmedian(-1, keepdim=True).values.clamp(min=1.0)
     few = usable.sum(-1, keepdim=True) < 5
     seen = usable & (few | ~(offset > FAR * typical))
-    return replace(batch, seen=seen, key_points=torch.where(seen[..., None], batch.key_points, 0.0)), batch.seen & ~seen
+    return replace(
+        batch, seen=seen, key_points=torch.where(seen[..., None], batch.key_points, 0.0)
+    ), batch.seen & ~seen
 
 
 def _states(status: Int8[Tensor, "B J"], spoilt: Bool[Tensor, "B V J"]) -> Int8[Tensor, "B J"]:
     table = torch.tensor([int(_STATE[s]) for s in Status], dtype=torch.int8, device=status.device)
     state = table[status.long()]
-    return torch.where((state == State.FEW_VIEWS) & spoilt.any(1), int(State.BAD_INPUT), state).to(torch.int8)
+    return torch.where((state == State.FEW_VIEWS) & spoilt.any(1), int(State.BAD_INPUT), state).to(
+        torch.int8
+    )
 
 
 def _rejected(
@@ -169,6 +199,7 @@ def _reconstruction(
 ) -> Reconstruction:
     placed = state == State.OBSERVED
     points = torch.where(placed[..., None], points, 0.0).double()
-    error, covariance = found.error.float(), found.covariance.float()
+    error = found.error.float()
+    covariance = found.covariance.float()
     fields = (batch.sample, points, state, error, views, covariance, score.float(), swapped)
     return Reconstruction(*(x.cpu() for x in fields))

@@ -1,4 +1,6 @@
-"""RANSAC over the pairs of views of each joint, with a fixed threshold or with one that follows the frame's noise."""
+"""RANSAC over the pairs of views of each joint, with a fixed threshold or with one that follows the
+frame's noise.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +14,14 @@ from torch import Tensor
 
 from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import Cameras, reprojection_error
-from ghpt.geometry.triangulation import Status, System, Triangulation, flat_cameras, in_parts, triangulate_subsets
+from ghpt.geometry.triangulation import (
+    Status,
+    System,
+    Triangulation,
+    flat_cameras,
+    in_parts,
+    triangulate_subsets,
+)
 from ghpt.models.estimators.classical import Baseline, everywhere, person_size
 from ghpt.randomness import key, uniform
 from ghpt.recording import KeyPointBatch
@@ -20,12 +29,12 @@ from ghpt.recording import KeyPointBatch
 
 @dataclass(frozen=True)
 class Ransac(Baseline):
-    """For each joint the pair of views whose point has the most inliers (least residual among equals), then
-    the inliers together.
+    """For each joint the pair of views whose point has the most inliers (least residual among
+    equals), then the inliers together.
 
-    ``threshold``: an inlier's largest reprojection error, as a fraction of the person's size in that view.
-    ``pairs``: where the views make more pairs than this, so many random ones are tried for each joint, keyed
-    by ``seed`` and the sample.
+    ``threshold``: an inlier's largest reprojection error, as a fraction of the person's size in
+    that view. ``pairs``: where the views make more pairs than this, so many random ones are tried
+    for each joint, keyed by ``seed`` and the sample.
     """
 
     threshold: float
@@ -40,18 +49,25 @@ class Ransac(Baseline):
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         rig = flat_cameras(batch.cameras, batch.seen.shape[:1])
-        size, pairs = person_size(batch.key_points, batch.seen), self._pairs(batch)
+        size = person_size(batch.key_points, batch.seen)
+        pairs = self._pairs(batch)
 
         def part(rows: slice) -> tuple[Tensor, ...]:
             own = rig if len(rig.t) == 1 else rig.index(rows)
-            candidates = _Candidates(own, batch.key_points[rows], batch.seen[rows], size[rows], pairs[rows])
+            candidates = _Candidates(
+                own, batch.key_points[rows], batch.seen[rows], size[rows], pairs[rows]
+            )
             return candidates.fields(self._inliers(candidates))
 
         frames, views, joints = batch.seen.shape
-        return Triangulation(*in_parts(part, torch.Size((frames, max(views, pairs.shape[1]), joints))))
+        return Triangulation(
+            *in_parts(part, torch.Size((frames, max(views, pairs.shape[1]), joints)))
+        )
 
     def _inliers(self, candidates: _Candidates) -> Bool[Tensor, "V J B"]:
-        return candidates.inliers(candidates.residual.new_full((candidates.residual.shape[-1],), self.threshold))
+        return candidates.inliers(
+            candidates.residual.new_full((candidates.residual.shape[-1],), self.threshold)
+        )
 
     def _pairs(self, batch: KeyPointBatch) -> Bool[Tensor, "B P J V"]:
         """Pairs of seen views: each pair of the rig if they are few, else random ones."""
@@ -63,7 +79,9 @@ class Ransac(Baseline):
             return (eye[one] | eye[other])[None, :, None].expand(frames, -1, joints, -1)
         seen = batch.seen.mT[:, None]
         count = seen.sum(-1)
-        draw = uniform(key(self.seed, "ransac", batch.sample, device=device), (self.pairs, joints, 2))
+        draw = uniform(
+            key(self.seed, "ransac", batch.sample, device=device), (self.pairs, joints, 2)
+        )
         one = (draw[..., 0] * count).long()
         other = (draw[..., 1] * (count - 1)).long()
         other = other + (other >= one)
@@ -73,13 +91,14 @@ class Ransac(Baseline):
 
 @dataclass(frozen=True)
 class AdaptiveRansac(Ransac):
-    """RANSAC whose threshold in a frame is at least ``adapt`` times the ``quantile`` of the residuals that it leaves
-    there.
+    """RANSAC whose threshold in a frame is at least ``adapt`` times the ``quantile`` of the
+    residuals that it leaves there.
 
-    Where the whole frame is noisy or the cameras are off, views that are as good as the others are outliers to a
-    fixed threshold, and what remains are pairs that agree by chance. The threshold grows in at most ``rounds``
-    rounds. The quantile is above the median, because two of four views that agree by chance make half of the residuals
-    small; outliers do not move it as long as they are fewer than the rest.
+    Where the whole frame is noisy or the cameras are off, views that are as good as the others are
+    outliers to a fixed threshold, and what remains are pairs that agree by chance. The threshold
+    grows in at most ``rounds`` rounds. The quantile is above the median, because two of four views
+    that agree by chance make half of the residuals small; outliers do not move it as long as they
+    are fewer than the rest.
     """
 
     adapt: float
@@ -89,14 +108,18 @@ class AdaptiveRansac(Ransac):
     def __post_init__(self) -> None:
         super().__post_init__()
         check_positive(adapt=self.adapt, rounds=self.rounds)
-        check(0 < self.quantile < 1, "quantile", f"is {self.quantile}", "It must be between 0 and 1.")
+        check(
+            0 < self.quantile < 1, "quantile", f"is {self.quantile}", "It must be between 0 and 1."
+        )
 
     def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"]:
         size = person_size(batch.key_points, batch.seen).clamp(min=1e-12)[..., None]
         residual = reprojection_error(batch.cameras, batch.key_points, points) / size
         return self._reach(residual.permute(1, 2, 0), batch.seen.permute(1, 2, 0))
 
-    def _reach(self, residual: Float[Tensor, "V J B"], seen: Bool[Tensor, "V J B"]) -> Float[Tensor, " B"]:
+    def _reach(
+        self, residual: Float[Tensor, "V J B"], seen: Bool[Tensor, "V J B"]
+    ) -> Float[Tensor, " B"]:
         """From residuals of the points, as fractions of the person's size."""
         counted = (seen & (seen.sum(0) >= 2) & ~residual.isnan()).flatten(0, 1)
         ordered = torch.where(counted, residual.flatten(0, 1), torch.inf).sort(dim=0).values
@@ -108,7 +131,9 @@ class AdaptiveRansac(Ransac):
         inlier = super()._inliers(candidates)
         thresholds = candidates.residual.new_full(inlier.shape[-1:], self.threshold)
         for _ in range(self.rounds):
-            wider = self._reach(candidates.residuals(candidates.point(inlier)), candidates.system.used)
+            wider = self._reach(
+                candidates.residuals(candidates.point(inlier)), candidates.system.used
+            )
             rows = torch.nonzero(wider > thresholds)[:, 0]
             if not len(rows):
                 break
@@ -131,11 +156,15 @@ class _Candidates:
         size: Float[Tensor, "B V"],
         pairs: Bool[Tensor, "B P J V"],
     ) -> None:
-        whole = Cameras(*(x.expand(len(seen), *x.shape[1:]) for x in (cameras.K, cameras.R, cameras.t)))
+        whole = Cameras(
+            *(x.expand(len(seen), *x.shape[1:]) for x in (cameras.K, cameras.R, cameras.t))
+        )
         points, ok = triangulate_subsets(whole, key_points, seen, pairs)
         self.seen = seen.permute(1, 2, 0)
         self.system = System(cameras, key_points, self.seen)
-        self.square = torch.where(self.system.used, size.double().clamp(min=1e-12).mT[:, None] ** 2, 0.0)
+        self.square = torch.where(
+            self.system.used, size.double().clamp(min=1e-12).mT[:, None] ** 2, 0.0
+        )
         points = torch.where(ok[..., None], points - self.system.origin[:, None, None], torch.nan)
         self.residual = self.residuals(points.permute(3, 1, 2, 0).contiguous())
 
@@ -145,16 +174,24 @@ class _Candidates:
         return self.system.solve(self.system.used.double())
 
     def residuals(self, points: Float[Tensor, "3 *P J B"]) -> Float[Tensor, "V *P J B"]:
-        """Of points of the local world; inf where there is none, and for views that do not see it or have it behind."""
+        """Of points of the local world; inf where there is none, and for views that do not see it
+        or have it behind.
+        """
         views = range(len(self.square))
-        return torch.stack([self.system.square_residuals(points, self.square, view) for view in views]).sqrt()
+        return torch.stack(
+            [self.system.square_residuals(points, self.square, view) for view in views]
+        ).sqrt()
 
-    def inliers(self, thresholds: Float[Tensor, " B"], rows: Tensor | None = None) -> Bool[Tensor, "V J B"]:
-        """The views within the frame's threshold of each joint's best point: that with the most of them, and with the
-        least sum of residuals among equals. ``rows``: of some of the frames."""
+    def inliers(
+        self, thresholds: Float[Tensor, " B"], rows: Tensor | None = None
+    ) -> Bool[Tensor, "V J B"]:
+        """The views within the frame's threshold of each joint's best point: that with the most of
+        them, and with the least sum of residuals among equals. ``rows``: of some of the frames.
+        """
         residual = self.residual if rows is None else self.residual[..., rows]
         # the residuals sum up to less than one more inlier
-        slope, score = 1 / (thresholds * (len(residual) + 1)), 0.0
+        slope = 1 / (thresholds * (len(residual) + 1))
+        score = 0.0
         for of_view in residual:
             score = score + torch.where(of_view <= thresholds, 1 - of_view * slope, 0.0)
         best = score.argmax(0).expand(len(residual), 1, -1, -1)
@@ -163,8 +200,13 @@ class _Candidates:
     def point(self, inlier: Bool[Tensor, "V J B"]) -> Float[Tensor, "3 J B"]:
         """Of the inliers; of all views where those do not fix one."""
         point, cond = self.system.solve(inlier.double())
-        point, fixed = torch.stack(list(point)), torch.isfinite(cond)
-        return point if fixed.all() else torch.where(fixed, point, torch.stack(list(self.of_all_views[0])))
+        point = torch.stack(list(point))
+        fixed = torch.isfinite(cond)
+        return (
+            point
+            if fixed.all()
+            else torch.where(fixed, point, torch.stack(list(self.of_all_views[0])))
+        )
 
     def fields(self, inlier: Bool[Tensor, "V J B"]) -> tuple[Tensor, ...]:
         """The fields of Triangulation, of the inliers; of all views where those have no point."""
@@ -175,5 +217,6 @@ class _Candidates:
             return robust
         linear = system.fields(*self.of_all_views, system.used, (self.seen & ~system.used).any(0))
         return tuple(
-            torch.where(ok[..., None] if a.ndim > ok.ndim else ok, a, b) for a, b in zip(robust, linear, strict=True)
+            torch.where(ok[..., None] if a.ndim > ok.ndim else ok, a, b)
+            for a, b in zip(robust, linear, strict=True)
         )

@@ -21,12 +21,14 @@ _FEW = 6
 class Rejection:
     """A joint is explained if it lies within ``limit`` of the rays of two views or more.
 
-    The distance is the reprojection error taken to the depth of the joint, in extents of the person: the median over
-    frames and views of the box around the person, taken to the person's depth. A box in the image would not do: it
-    shrinks with the joints that a view misses. ``extent`` is that length in mm; null: of each batch on its own.
+    The distance is the reprojection error taken to the depth of the joint, in extents of the
+    person: the median over frames and views of the box around the person, taken to the person's
+    depth. A box in the image would not do: it shrinks with the joints that a view misses.
+    ``extent`` is that length in mm; null: of each batch on its own.
 
-    0.1 is 12 to 18 cm. It rejects no joint of the embedded data, none of Pose2Sim's recording by either detector, and
-    0.6 % of the seated person's of caliscope, where two of the views are a hand's breadth off.
+    0.1 is 12 to 18 cm. It rejects no joint of the embedded data, none of Pose2Sim's recording by
+    either detector, and 0.6 % of the seated person's of caliscope, where two of the views are a
+    hand's breadth off.
     """
 
     limit: float
@@ -35,7 +37,9 @@ class Rejection:
     def __post_init__(self) -> None:
         check_positive(limit=self.limit)
 
-    def fitted(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]) -> Rejection:
+    def fitted(
+        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
+    ) -> Rejection:
         """The same with the extent of the person in these frames."""
         return replace(self, extent=float(self._extent(batch, points, placed)))
 
@@ -43,7 +47,9 @@ class Rejection:
     def explained(
         self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
     ) -> Bool[Tensor, "B J"]:
-        """Which of the ``placed`` joints two views explain; all of them where the person's extent is not known."""
+        """Which of the ``placed`` joints two views explain; all of them where the person's extent
+        is not known.
+        """
         distance, used, _ = _distances(batch, points, placed)
         extent = self._extent(batch, points, placed) if self.extent is None else self.extent
         if not extent > 0:
@@ -51,7 +57,9 @@ class Rejection:
         return ((distance <= self.limit * extent) & used).sum(1) >= 2
 
     @staticmethod
-    def _extent(batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]) -> Float[Tensor, ""]:
+    def _extent(
+        batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
+    ) -> Float[Tensor, ""]:
         _, used, depth = _distances(batch, points, placed)
         middle = torch.where(used, depth, torch.nan).nanmedian(-1).values
         size = person_size(batch.key_points, batch.seen).double() * middle / _focal(batch)[..., 0]
@@ -62,7 +70,9 @@ class Rejection:
 def _distances(
     batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
 ) -> tuple[Float[Tensor, "B V J"], Bool[Tensor, "B V J"], Float[Tensor, "B V J"]]:
-    """How far each joint is from each view's ray (mm), where that can be told, and the joint's depth (mm)."""
+    """How far each joint is from each view's ray (mm), where that can be told, and the joint's
+    depth (mm).
+    """
     projected, depth = project(batch.cameras, points)
     pixels = (projected - batch.key_points).norm(dim=-1)
     used = batch.seen & placed[:, None] & (depth > 0) & torch.isfinite(pixels)

@@ -29,17 +29,19 @@ class JointQuality:
 class Quality:
     """Covariance = noise variance x (sum over the used views of J^T J / size^2)^-1 + shared^2.
 
-    J is the derivative of the view's pixels by the position, ``size`` the person's in the view (``person_size``).
-    ``noise``: deviation of a pixel coordinate as a fraction of the size; null: each batch's own (``pooled_noise``).
-    A joint's own residuals count as their 2 V - 3 degrees of freedom, the pooled noise as ``prior``: few views say
-    little about their noise. ``shared``: deviation (mm) of what all views have in common, and no residual shows:
-    where a detector takes the joint to be.
+    J is the derivative of the view's pixels by the position, ``size`` the person's in the view
+    (``person_size``). ``noise``: deviation of a pixel coordinate as a fraction of the size; null:
+    each batch's own (``pooled_noise``). A joint's own residuals count as their 2 V - 3 degrees of
+    freedom, the pooled noise as ``prior``: few views say little about their noise. ``shared``:
+    deviation (mm) of what all views have in common, and no residual shows: where a detector takes
+    the joint to be.
 
-    With conf/estimator/default.yaml and adaptive RANSAC 76, 98 and 99 % of the true positions of embedded Human3.6M lie
-    within the ellipsoids of 50, 90 and 95 % for people that the detector was trained on (too cautious), 49, 88 and 93 %
-    for others. On embedded Panoptic, whose joints are defined 19 mm elsewhere, 18, 48 and 55 %: there shared = 11 fits.
-    Views are taken to be weighted by ``size``^-2, as linear triangulation and so adaptive RANSAC weights them where
-    focal lengths are equal.
+    With conf/estimator/default.yaml and adaptive RANSAC 76, 98 and 99 % of the true positions of
+    embedded Human3.6M lie within the ellipsoids of 50, 90 and 95 % for people that the detector was
+    trained on (too cautious), 49, 88 and 93 % for others. On embedded Panoptic, whose joints are
+    defined 19 mm elsewhere, 18, 48 and 55 %: there shared = 11 fits. Views are taken to be weighted
+    by ``size``^-2, as linear triangulation and so adaptive RANSAC weights them where focal lengths
+    are equal.
     """
 
     noise: float | None
@@ -47,11 +49,18 @@ class Quality:
     shared: float
 
     def __post_init__(self) -> None:
-        check(self.noise is None or self.noise > 0, "noise", f"is {self.noise}", "It must be > 0, or null.")
+        check(
+            self.noise is None or self.noise > 0,
+            "noise",
+            f"is {self.noise}",
+            "It must be > 0, or null.",
+        )
         check(self.prior > 0, "prior", f"is {self.prior}", "It must be > 0.")
         check(self.shared >= 0, "shared", f"is {self.shared}", "It must be >= 0.")
 
-    def fitted(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]) -> Quality:
+    def fitted(
+        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
+    ) -> Quality:
         """The same with the noise of these frames."""
         _, relative, _ = self._fit(batch, points, views)
         return replace(self, noise=float(pooled_noise(relative, views)))
@@ -64,19 +73,24 @@ class Quality:
         square, relative, normal = self._fit(batch, points, views)
         count = views.sum(1)
         made = count >= 2
-        noise = pooled_noise(relative, views) if self.noise is None else square.new_tensor(self.noise)
+        noise = (
+            pooled_noise(relative, views) if self.noise is None else square.new_tensor(self.noise)
+        )
         freedom = (2 * count - 3).clamp(min=0)
         variance = (self.prior * noise**2 + relative.sum(1)) / (self.prior + freedom)
         covariance = _inverse(normal) * variance[..., None]
         covariance = covariance + self.shared**2 * covariance.new_tensor([1.0, 0, 0, 1, 0, 1])
         error = (square.sum(1) / count.clamp(min=1)).sqrt()
-        return JointQuality(torch.where(made, error, 0.0), torch.where(made[..., None], covariance, 0.0))
+        return JointQuality(
+            torch.where(made, error, 0.0), torch.where(made[..., None], covariance, 0.0)
+        )
 
     def _fit(
         self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
     ) -> tuple[Float[Tensor, "B V J"], Float[Tensor, "B V J"], Float[Tensor, "B J 6"]]:
-        """Squared residuals in pixels and over the size (0 in views that are not used), and the sum of
-        J^T J / size^2."""
+        """Squared residuals in pixels and over the size (0 in views that are not used), and the sum
+        of J^T J / size^2.
+        """
         rig = flat_cameras(batch.cameras, batch.seen.shape[:1])
         local, origin = local_cameras(rig)
         used = views.permute(1, 2, 0)
@@ -93,8 +107,12 @@ class Quality:
         return square.permute(2, 0, 1), (square / size**2).permute(2, 0, 1), normal.permute(2, 1, 0)
 
 
-def pooled_noise(relative: Float[Tensor, "B V J"], views: Bool[Tensor, "B V J"]) -> Float[Tensor, ""]:
-    """Deviation of a coordinate from squared residuals over squared sizes: robust, since the median joint's."""
+def pooled_noise(
+    relative: Float[Tensor, "B V J"], views: Bool[Tensor, "B V J"]
+) -> Float[Tensor, ""]:
+    """Deviation of a coordinate from squared residuals over squared sizes: robust, since the median
+    joint's.
+    """
     count = views.sum(1)
     freedom = (2 * count - 3).clamp(min=1).double()
     middle = freedom * (1 - 2 / (9 * freedom)) ** 3  # median of chi-square (Wilson and Hilferty)
@@ -108,4 +126,6 @@ def _inverse(normal: Float[Tensor, "*B 6"]) -> Float[Tensor, "*B 6"]:
     matrix = normal.unbind(-1)
     cofactors = torch.stack(minors(matrix), dim=-1)
     determinant = (normal[..., :3] * cofactors[..., :3]).sum(-1, keepdim=True)
-    return torch.where(determinant > 0, cofactors / torch.where(determinant > 0, determinant, 1.0), 0.0)
+    return torch.where(
+        determinant > 0, cofactors / torch.where(determinant > 0, determinant, 1.0), 0.0
+    )

@@ -1,12 +1,15 @@
-"""Learned view weights: the scorer says how much each view's key point is worth, and one triangulation uses it.
+"""Learned view weights: the scorer says how much each view's key point is worth, and one
+triangulation uses it.
 
-The average of 3D hypotheses, the paper's estimate, is made of triangulations from few views and is hardly better than
-they are. Their weights say more: views that are in likely poses are good views. So the weight of a view, for a joint,
-is the probability that a hypothesis drawn by its weight has that view in its subset, and the joint is triangulated once
-from all views under these weights. The scorer still sees 3D poses alone, and is the one that the paper's loss trained.
+The average of 3D hypotheses, the paper's estimate, is made of triangulations from few views and is
+hardly better than they are. Their weights say more: views that are in likely poses are good views.
+So the weight of a view, for a joint, is the probability that a hypothesis drawn by its weight has
+that view in its subset, and the joint is triangulated once from all views under these weights. The
+scorer still sees 3D poses alone, and is the one that the paper's loss trained.
 
-The pool is drawn from views that agree. A scorer trained on a good detector has never seen what a far outlier does to a
-pose; a robust estimator finds those without any knowledge of poses, so each does what it can do.
+The pool is drawn from views that agree. A scorer trained on a good detector has never seen what a
+far outlier does to a pose; a robust estimator finds those without any knowledge of poses, so each
+does what it can do.
 """
 
 from __future__ import annotations
@@ -42,25 +45,30 @@ class Weighed:
 
 
 class ViewWeights(Baseline):
-    """``model``'s scores of poses made of the views on which ``consensus`` finds agreement, turned into view weights.
+    """``model``'s scores of poses made of the views on which ``consensus`` finds agreement, turned
+    into view weights.
 
-    ``power``: of the probabilities; 1 is their definition, more trusts the scorer more. In a frame whose views disagree
-    as a whole (cameras that are off, much noise) it falls with the square root of how far the consensus had to reach:
-    what makes a pose likely there is hardly a single view.
+    ``power``: of the probabilities; 1 is their definition, more trusts the scorer more. In a frame
+    whose views disagree as a whole (cameras that are off, much noise) it falls with the square root
+    of how far the consensus had to reach: what makes a pose likely there is hardly a single view.
     """
 
     def __init__(self, model: StochasticEstimator, consensus: Ransac, power: float) -> None:
         check(power > 0, "view_weights.power", f"is {power}", "It must be > 0.")
-        self.model, self.consensus, self.power = model.eval(), consensus, power
+        self.model = model.eval()
+        self.consensus = consensus
+        self.power = power
 
     def triangulate(self, batch: KeyPointBatch) -> Triangulation:
         return self.weigh(batch).triangulation
 
     @torch.no_grad()
     def weigh(self, batch: KeyPointBatch, robust: Triangulation | None = None) -> Weighed:
-        """The joints and all that they were made of. ``robust``: what ``consensus`` makes of the batch, if that is
-        known."""
-        model, problem = self.model, self.model.problem
+        """The joints and all that they were made of. ``robust``: what ``consensus`` makes of the
+        batch, if that is known.
+        """
+        model = self.model
+        problem = self.model.problem
         robust = robust or self.consensus.triangulate(batch)
         views, _ = self.consensus.agreeing(batch, robust.points, robust.placed)
         agreed = replace(batch, seen=views)

@@ -18,9 +18,22 @@ from ghpt.skeleton import JOINTS
 
 FORMAT_VERSION = 1
 NAMES = (
-    "weight", "average", "most", "least", "stochastic", "random", "best", "worst",
-    "view_weights", "linear", "weighted_linear", "ransac", "adaptive_ransac", "m_estimator", "lo_ransac",
-)  # fmt: skip
+    "weight",
+    "average",
+    "most",
+    "least",
+    "stochastic",
+    "random",
+    "best",
+    "worst",
+    "view_weights",
+    "linear",
+    "weighted_linear",
+    "ransac",
+    "adaptive_ransac",
+    "m_estimator",
+    "lo_ransac",
+)
 """The order of every table: the selections, the learned view weights, then the baselines."""
 
 _CHUNK = 2048
@@ -68,27 +81,35 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
     """The content of metrics.json; lengths in mm, null where nothing could be measured.
 
     ``selections[name]``: ``mpjpe_absolute``, ``mpjpe_relative`` (to the pelvis), ``mpjpe_aligned``
-    (Procrustes), ``mpjpe_6_joints`` (relative; elbows, wrists, knees), ``coverage`` (estimated joint-frames /
-    joint-frames with a truth), ``per_joint`` and ``per_action`` (relative), ``pose_prior`` (S^2 by subject and
-    part) and, where the data hold damaged takes, ``without_damaged`` (the four means again).
+    (Procrustes), ``mpjpe_6_joints`` (relative; elbows, wrists, knees), ``coverage`` (estimated
+    joint-frames / joint-frames with a truth), ``per_joint`` and ``per_action`` (relative),
+    ``pose_prior`` (S^2 by subject and part) and, where the data hold damaged takes,
+    ``without_damaged`` (the four means again).
     """
     actions = sorted(set(predictions.recording_action))
     subjects = sorted(set(predictions.recording_subject))
     action_of = torch.tensor([actions.index(a) for a in predictions.recording_action])
     subject_of = torch.tensor([subjects.index(s) for s in predictions.recording_subject])
     damaged = torch.tensor([name in DAMAGED for name in predictions.recording_name])
-    names = sorted(predictions.names, key=lambda n: (NAMES.index(n) if n in NAMES else len(NAMES), n))
+    names = sorted(
+        predictions.names, key=lambda n: (NAMES.index(n) if n in NAMES else len(NAMES), n)
+    )
     whole = {name: _Selection(len(actions), len(subjects)) for name in names}
-    sound = {name: _Selection(len(actions), len(subjects)) for name in names} if damaged.any() else {}
+    sound = (
+        {name: _Selection(len(actions), len(subjects)) for name in names} if damaged.any() else {}
+    )
     for chunk in predictions.chunks(_CHUNK):
         keep = ~damaged[chunk.recording]
-        action, subject = action_of[chunk.recording], subject_of[chunk.recording]
+        action = action_of[chunk.recording]
+        subject = subject_of[chunk.recording]
         for name in names:
             estimate = chunk.estimates[name]
             whole[name].update(estimate, chunk.truth, chunk.truth_seen, action, subject)
             if sound:
                 kept = PoseEstimate(estimate.points[keep], estimate.estimated[keep])
-                sound[name].update(kept, chunk.truth[keep], chunk.truth_seen[keep], action[keep], subject[keep])
+                sound[name].update(
+                    kept, chunk.truth[keep], chunk.truth_seen[keep], action[keep], subject[keep]
+                )
     selections = {name: _selection(whole[name], actions, subjects) for name in names}
     for name, metrics in sound.items():
         selections[name]["without_damaged"] = metrics.numbers()
@@ -103,12 +124,15 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
 
 
 def _selection(metrics: _Selection, actions: list[str], subjects: list[str]) -> dict[str, Any]:
-    relative, prior = metrics.relative.compute(), metrics.prior.compute()
+    relative = metrics.relative.compute()
+    prior = metrics.prior.compute()
     return {
         **metrics.numbers(),
         "coverage": _number(metrics.absolute.compute().coverage),
         "per_joint": dict(zip(JOINTS, map(_number, relative.per_joint), strict=True)),
-        "per_action": dict(zip(actions, map(_number, torch.atleast_1d(relative.per_group)), strict=True)),
+        "per_action": dict(
+            zip(actions, map(_number, torch.atleast_1d(relative.per_group)), strict=True)
+        ),
         "pose_prior": {
             subject: dict(zip(PARTS, map(_number, row), strict=True))
             for subject, row in zip(subjects, prior, strict=True)

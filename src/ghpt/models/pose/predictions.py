@@ -1,4 +1,6 @@
-"""predictions.npz: every selection's poses of a test run. It is written first; all numbers come from it."""
+"""predictions.npz: every selection's poses of a test run. It is written first; all numbers come
+from it.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,9 @@ def _layout(names: Sequence[str], joints: int) -> Layout:
 class PredictionWriter:
     """Writes the frames of a test run: a ``RowWriter`` with a row for each."""
 
-    def __init__(self, folder: str | Path, count: int, names: Sequence[str], joints: int = len(JOINTS)) -> None:
+    def __init__(
+        self, folder: str | Path, count: int, names: Sequence[str], joints: int = len(JOINTS)
+    ) -> None:
         self._rows = RowWriter(folder, count, "frames", names, _layout(names, joints))
 
     def write(
@@ -43,9 +47,15 @@ class PredictionWriter:
         frame: Int[Tensor, " B"],
         weights: Mapping[str, Float[Tensor, " B"]],
     ) -> None:
-        """Write frames to their row numbers. A point that is not finite is written as not estimated."""
+        """Write frames to their row numbers. A point that is not finite is written as not
+        estimated.
+        """
         self._rows.check(estimates, weights)
-        values: dict[str, Tensor] = {"truth_seen": truth_seen, "recording": recording, "frame": frame}
+        values: dict[str, Tensor] = {
+            "truth_seen": truth_seen,
+            "recording": recording,
+            "frame": frame,
+        }
         values["truth"] = truth.masked_fill(~truth_seen[..., None], torch.nan)
         for name, estimate in estimates.items():
             estimated = estimate.estimated & estimate.points.isfinite().all(-1)
@@ -53,17 +63,22 @@ class PredictionWriter:
             values[f"points_{name}"] = estimate.points.masked_fill(~estimated[..., None], torch.nan)
         self._rows.write(rows, values, weights)
 
-    def finish(self, path: str | Path, recordings: Sequence[Recording], meta: Mapping[str, Any]) -> None:
+    def finish(
+        self, path: str | Path, recordings: Sequence[Recording], meta: Mapping[str, Any]
+    ) -> None:
         """Make the file ``path``.
 
         ``meta``: ``data``, ``source`` ("embedded" or the path of the data), ``split``, ``seed`` and
-        ``provenance``, as plain data. The same content gives the same bytes. Raises GhptError if a row is missing.
+        ``provenance``, as plain data. The same content gives the same bytes. Raises GhptError if a
+        row is missing.
         """
         tables = {
-            **{f"recording_{key}": np.array([getattr(r, key) for r in recordings], dtype=np.str_)
-               for key in ("name", "subject", "action")},
+            **{
+                f"recording_{key}": np.array([getattr(r, key) for r in recordings], dtype=np.str_)
+                for key in ("name", "subject", "action")
+            },
             "joint_name": np.array(JOINTS),
-        }  # fmt: skip
+        }
         self._rows.finish(path, tables, meta, verify=open_predictions)
 
 
@@ -95,17 +110,26 @@ class Predictions:
         return self._members["frame"].shape[0]
 
     def read(self, start: int, stop: int) -> PredictionChunk:
-        """The rows from ``start`` up to ``stop``. Raises GhptDataError if they name a recording there is not."""
+        """The rows from ``start`` up to ``stop``. Raises GhptDataError if they name a recording
+        there is not.
+        """
         arrays = [*_layout(self.names, len(JOINTS)), *(f"weights_{summary}" for summary in WEIGHTS)]
-        rows = {name: torch.from_numpy(read_rows(self.path, self._members[name], start, stop)) for name in arrays}
+        rows = {
+            name: torch.from_numpy(read_rows(self.path, self._members[name], start, stop))
+            for name in arrays
+        }
         recording = rows["recording"].long()
         if ((recording < 0) | (recording >= len(self.recording_name))).any():
-            raise GhptDataError(self.path, "recording", "names a recording that is not listed", MEND)
+            raise GhptDataError(
+                self.path, "recording", "names a recording that is not listed", MEND
+            )
         estimates = {}
         for name in self.names:
             points = rows[f"points_{name}"]
             estimated = rows[f"estimated_{name}"] & points.isfinite().all(-1)
-            estimates[name] = PoseEstimate(torch.where(estimated[..., None], points, 0.0), estimated)
+            estimates[name] = PoseEstimate(
+                torch.where(estimated[..., None], points, 0.0), estimated
+            )
         seen = rows["truth_seen"] & rows["truth"].isfinite().all(-1)
         truth = torch.where(seen[..., None], rows["truth"], 0.0)
         weights = {summary: rows[f"weights_{summary}"] for summary in WEIGHTS}
@@ -113,14 +137,16 @@ class Predictions:
 
     def chunks(self, size: int) -> Iterator[PredictionChunk]:
         """All rows, ``size`` at a time."""
-        return (self.read(start, min(start + size, len(self))) for start in range(0, len(self), size))
+        return (
+            self.read(start, min(start + size, len(self))) for start in range(0, len(self), size)
+        )
 
 
 def open_predictions(path: str | Path) -> Predictions:
     """Open and check a predictions file; nothing in it is executed or unpacked.
 
-    Raises GhptDataError if it is missing, damaged (every byte is compared with its checksum), of another version,
-    or if its arrays do not belong together.
+    Raises GhptDataError if it is missing, damaged (every byte is compared with its checksum), of
+    another version, or if its arrays do not belong together.
     """
     path = Path(path)
     texts = ("recording_name", "recording_subject", "recording_action", "joint_name")

@@ -1,4 +1,6 @@
-"""The pose problem (paper, section 3.1): a hypothesis triangulates each joint from its own random subset of views."""
+"""The pose problem (paper, section 3.1): a hypothesis triangulates each joint from its own random
+subset of views.
+"""
 
 from dataclasses import dataclass
 
@@ -39,15 +41,16 @@ class PoseTriangulation:
             "neither coordinates nor lengths is on",
             "Switch on at least one kind of features.",
         )
-        self.coordinates, self.lengths = coordinates, lengths
+        self.coordinates = coordinates
+        self.lengths = lengths
         self.feature_size = len(JOINTS) * 3 * coordinates + len(BONES) * lengths
 
     @torch.no_grad()
     def generate(self, batch: KeyPointBatch, count: int, keys: Int[Tensor, " B"]) -> PoseHypotheses:
         """Joint by joint a uniformly random subset of at least two seen views, triangulated.
 
-        Where a subset is degenerate (parallel rays, a point behind a camera), all seen views stand in for it, so
-        that every hypothesis has every joint that the frame determines.
+        Where a subset is degenerate (parallel rays, a point behind a camera), all seen views stand
+        in for it, so that every hypothesis has every joint that the frame determines.
         """
         whole = triangulate(batch.cameras, batch.key_points, batch.seen.double())
         views = random_subsets(batch.seen, count, keys)
@@ -71,7 +74,9 @@ class PoseTriangulation:
         return torch.cat(kinds, dim=-1)
 
     def combine(self, hypotheses: PoseHypotheses, weights: Float[Tensor, "B H"]) -> PoseEstimate:
-        """The weighted average of the poses, taken about the pool's mean so that float32 keeps its digits."""
+        """The weighted average of the poses, taken about the pool's mean so that float32 keeps its
+        digits.
+        """
         centre = hypotheses.points.mean(dim=1, keepdim=True)
         offset = torch.einsum("bh,bhjc->bjc", weights.to(centre.dtype), hypotheses.points - centre)
         return PoseEstimate(centre[:, 0] + offset, hypotheses.estimated)
@@ -80,12 +85,18 @@ class PoseTriangulation:
         estimated = hypotheses.estimated[:, None].expand(hypotheses.points.shape[:-1])
         return PoseEstimate(hypotheses.points, estimated)
 
-    def error(self, estimate: PoseEstimate, batch: KeyPointBatch) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
+    def error(
+        self, estimate: PoseEstimate, batch: KeyPointBatch
+    ) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
         """Pelvis-relative MPJPE (eq:mpjpe) over the joints that are estimated and have a truth, mm."""
         extra = (None,) * (estimate.points.dim() - 3)
-        truth, truth_seen = batch.truth[:, *extra], batch.truth_seen[:, *extra]
+        truth = batch.truth[:, *extra]
+        truth_seen = batch.truth_seen[:, *extra]
         errors, counted = joint_errors(
-            estimate, truth.expand_as(estimate.points), truth_seen.expand_as(estimate.estimated), "relative"
+            estimate,
+            truth.expand_as(estimate.points),
+            truth_seen.expand_as(estimate.estimated),
+            "relative",
         )
         number = counted.sum(dim=-1)
         mean = torch.where(counted, errors, 0.0).sum(dim=-1) / number.clamp_min(1)

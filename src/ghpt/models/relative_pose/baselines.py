@@ -1,9 +1,10 @@
 """Classical estimators of a pair's relative pose, on the same correspondences as the learned one.
 
-Correspondences are the joints that both views of the pair see, in all its frames. Thresholds are fractions of the
-person's size in the image (the median, over the pair's frames and views, of the diagonal of the box around the seen key
-points), so that they mean the same at any resolution and distance. A robust estimator that fails, or finds fewer than 8
-inliers, falls back to the 8-point algorithm on all correspondences: it never gains by leaving hard pairs out.
+Correspondences are the joints that both views of the pair see, in all its frames. Thresholds are
+fractions of the person's size in the image (the median, over the pair's frames and views, of the
+diagonal of the box around the seen key points), so that they mean the same at any resolution and
+distance. A robust estimator that fails, or finds fewer than 8 inliers, falls back to the 8-point
+algorithm on all correspondences: it never gains by leaving hard pairs out.
 """
 
 from __future__ import annotations
@@ -38,15 +39,18 @@ def size_in_image(batch: PairBatch) -> Float[Tensor, " B"]:
 def linear_pose(
     a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B N"]
 ) -> tuple[RelativePoseEstimate, Bool[Tensor, "*B"]]:
-    """The 8-point algorithm's pose of the used correspondences, and whether they determine an essential matrix."""
+    """The 8-point algorithm's pose of the used correspondences, and whether they determine an
+    essential matrix.
+    """
     E, determined = eight_point(a, b, used.double())
     R, t, ok = pose_in_front(E, a, b, used & determined[..., None])
     return RelativePoseEstimate(R, t, ok), determined
 
 
 class PairBaseline(ABC):
-    """A classical estimator: ``baseline(batch)`` gives float64 poses with t of length 1, each pair's a function of that
-    pair alone."""
+    """A classical estimator: ``baseline(batch)`` gives float64 poses with t of length 1, each
+    pair's a function of that pair alone.
+    """
 
     @abstractmethod
     def __call__(self, batch: PairBatch) -> RelativePoseEstimate: ...
@@ -61,21 +65,26 @@ class EightPoint(PairBaseline):
 
 
 class Robust(PairBaseline):
-    """An estimator that tells inliers from outliers, pair by pair; ``EightPoint`` where it finds too few."""
+    """An estimator that tells inliers from outliers, pair by pair; ``EightPoint`` where it finds
+    too few.
+    """
 
     @abstractmethod
     def pose(
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
     ) -> RelativePoseEstimate | None:
-        """The pose of one pair from N >= 8 correspondences (normalised image coordinates) of a person of that
-        ``size``; None where there is none."""
+        """The pose of one pair from N >= 8 correspondences (normalised image coordinates) of a
+        person of that ``size``; None where there is none.
+        """
 
     @torch.no_grad()
     def __call__(self, batch: PairBatch) -> RelativePoseEstimate:
         a, b, used = batch.correspondences()
         size = size_in_image(batch)
         linear, determined = linear_pose(a, b, used)
-        R, t, ok = linear.R.clone(), linear.t.clone(), linear.estimated.clone()
+        R = linear.R.clone()
+        t = linear.t.clone()
+        ok = linear.estimated.clone()
         for i in torch.nonzero(determined & (size > 0)).flatten().tolist():
             found = self.pose(a[i, used[i]], b[i, used[i]], size[i].item(), batch.sample[i])
             if found is not None and found.estimated:
@@ -85,11 +94,11 @@ class Robust(PairBaseline):
 
 @dataclass(frozen=True)
 class Ransac(Robust):
-    """Of ``samples`` random minimal samples the essential matrix with the least truncated squared error (MSAC), then
-    the 8-point algorithm on its inliers.
+    """Of ``samples`` random minimal samples the essential matrix with the least truncated squared
+    error (MSAC), then the 8-point algorithm on its inliers.
 
-    ``threshold``: an inlier's largest Sampson error, as a fraction of the person's size. The samples are keyed by
-    ``seed`` and the pair's ``sample``.
+    ``threshold``: an inlier's largest Sampson error, as a fraction of the person's size. The
+    samples are keyed by ``seed`` and the pair's ``sample``.
     """
 
     samples: int
@@ -104,7 +113,9 @@ class Ransac(Robust):
     ) -> RelativePoseEstimate | None:
         keys = key(self.seed, "pair ransac", sample, device=a.device)
         chosen = _distinct(uniform(keys, (self.samples, MINIMUM)), len(a))
-        E, ok = eight_point(a[chosen], b[chosen], torch.ones(chosen.shape, dtype=a.dtype, device=a.device))
+        E, ok = eight_point(
+            a[chosen], b[chosen], torch.ones(chosen.shape, dtype=a.dtype, device=a.device)
+        )
         error = sampson_error(E, a, b) / (self.threshold * size)
         score = torch.where(ok, (1 - error.square()).clamp_min(0).sum(-1), -1.0)
         best = score.argmax()
@@ -114,12 +125,13 @@ class Ransac(Robust):
 
 @dataclass(frozen=True)
 class Usac(Robust):
-    """OpenCV's ``findEssentialMat`` with one of its USAC methods; of the four poses the one with most of its inliers in
-    front.
+    """OpenCV's ``findEssentialMat`` with one of its USAC methods; of the four poses the one with
+    most of its inliers in front.
 
-    ``threshold``: as a fraction of the person's size. ``pixels``: the person's size that OpenCV sees. Its methods hold
-    constants in pixels (MAGSAC's largest threshold, the cells of the neighbourhoods), so that neither normalised
-    coordinates nor the camera's own resolution would do. Their random state is OpenCV's fixed one.
+    ``threshold``: as a fraction of the person's size. ``pixels``: the person's size that OpenCV
+    sees. Its methods hold constants in pixels (MAGSAC's largest threshold, the cells of the
+    neighbourhoods), so that neither normalised coordinates nor the camera's own resolution would
+    do. Their random state is OpenCV's fixed one.
     """
 
     method: str
@@ -130,16 +142,31 @@ class Usac(Robust):
 
     def __post_init__(self) -> None:
         known = [name for name in dir(cv2) if name.startswith("USAC_")]
-        check(self.method in known, "method", f"is {self.method!r}", f"Choose from {', '.join(known)}.")
+        check(
+            self.method in known,
+            "method",
+            f"is {self.method!r}",
+            f"Choose from {', '.join(known)}.",
+        )
         check_positive(threshold=self.threshold, pixels=self.pixels, iterations=self.iterations)
-        check(0 < self.confidence < 1, "confidence", f"is {self.confidence}", "It must be between 0 and 1.")
+        check(
+            0 < self.confidence < 1,
+            "confidence",
+            f"is {self.confidence}",
+            "It must be between 0 and 1.",
+        )
 
     def pose(
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
     ) -> RelativePoseEstimate | None:
         focal = self.pixels / size
         x, y = ((focal * points).cpu().numpy() for points in (a, b))
-        settings = (getattr(cv2, self.method), self.confidence, self.threshold * self.pixels, self.iterations)
+        settings = (
+            getattr(cv2, self.method),
+            self.confidence,
+            self.threshold * self.pixels,
+            self.iterations,
+        )
         try:
             E, mask = cv2.findEssentialMat(x, y, np.diag([focal, focal, 1.0]), *settings)
         except cv2.error:
@@ -153,9 +180,11 @@ class Usac(Robust):
 
 @dataclass(frozen=True)
 class PoseLib(Robust):
-    """PoseLib's LO-RANSAC of the 5-point solver, then its refinement on the inliers under a robust loss.
+    """PoseLib's LO-RANSAC of the 5-point solver, then its refinement on the inliers under a robust
+    loss.
 
-    ``threshold`` (largest epipolar error of an inlier) and ``scale`` (of the loss) are fractions of the person's size.
+    ``threshold`` (largest epipolar error of an inlier) and ``scale`` (of the loss) are fractions of
+    the person's size.
     """
 
     threshold: float
@@ -166,14 +195,25 @@ class PoseLib(Robust):
 
     def __post_init__(self) -> None:
         check_positive(threshold=self.threshold, scale=self.scale, iterations=self.iterations)
-        check(self.loss in _LOSSES, "loss", f"is {self.loss!r}", f"Choose from {', '.join(_LOSSES)}.")
+        check(
+            self.loss in _LOSSES, "loss", f"is {self.loss!r}", f"Choose from {', '.join(_LOSSES)}."
+        )
 
     def pose(
         self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
     ) -> RelativePoseEstimate | None:
         # pixels in units of the person's size
-        camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": [1 / size, 1 / size, 0.0, 0.0]}
-        ransac = {"max_epipolar_error": self.threshold, "max_iterations": self.iterations, "seed": self.seed}
+        camera = {
+            "model": "PINHOLE",
+            "width": 1,
+            "height": 1,
+            "params": [1 / size, 1 / size, 0.0, 0.0],
+        }
+        ransac = {
+            "max_epipolar_error": self.threshold,
+            "max_iterations": self.iterations,
+            "seed": self.seed,
+        }
         bundle = {"loss_type": self.loss, "loss_scale": self.scale}
         x, y = ((points / size).cpu().numpy() for points in (a, b))
         found, info = poselib.estimate_relative_pose(x, y, camera, camera, ransac, bundle)
@@ -184,7 +224,9 @@ class PoseLib(Robust):
 
 
 def _distinct(draws: Float[Tensor, "S T"], count: int) -> Int[Tensor, "S T"]:
-    """T distinct numbers below ``count`` from T uniform draws, every subset equally likely (Floyd's algorithm)."""
+    """T distinct numbers below ``count`` from T uniform draws, every subset equally likely (Floyd's
+    algorithm).
+    """
     chosen = torch.full(draws.shape, -1, dtype=torch.int64, device=draws.device)
     for i, last in enumerate(range(count - draws.shape[1], count)):
         candidate = (draws[:, i] * (last + 1)).long()

@@ -1,4 +1,6 @@
-"""predictions.npz of the camera problem: every selection's relative pose of every pair, and the true rigs."""
+"""predictions.npz of the camera problem: every selection's relative pose of every pair, and the
+true rigs.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +28,11 @@ PROBLEM = "camera"
 def _layout(names: Sequence[str]) -> Layout:
     layout: Layout = {}
     for name in names:
-        layout |= {f"R_{name}": ("<f8", (3, 3)), f"t_{name}": ("<f8", (3,)), f"estimated_{name}": ("|b1", ())}
+        layout |= {
+            f"R_{name}": ("<f8", (3, 3)),
+            f"t_{name}": ("<f8", (3,)),
+            f"estimated_{name}": ("|b1", ()),
+        }
     layout |= {"truth_R": ("<f8", (3, 3)), "truth_t": ("<f8", (3,))}
     return layout | {"rig": ("<i4", ()), "draw": ("<i8", ()), "pair": ("<i4", (2,))}
 
@@ -47,10 +53,17 @@ class PairWriter:
         pair: Int[Tensor, "B 2"],
         weights: Mapping[str, Float[Tensor, " B"]],
     ) -> None:
-        """Write pairs to their row numbers; t in mm. A pose that is not finite, or whose t is 0 because nothing
-        gave it a length, is written as not estimated."""
+        """Write pairs to their row numbers; t in mm. A pose that is not finite, or whose t is 0
+        because nothing gave it a length, is written as not estimated.
+        """
         self._rows.check(estimates, weights)
-        values: dict[str, Tensor] = {"truth_R": truth[0], "truth_t": truth[1], "rig": rig, "draw": draw, "pair": pair}
+        values: dict[str, Tensor] = {
+            "truth_R": truth[0],
+            "truth_t": truth[1],
+            "rig": rig,
+            "draw": draw,
+            "pair": pair,
+        }
         for name, estimate in estimates.items():
             estimated = _usable(estimate.R, estimate.t, estimate.estimated)
             values[f"estimated_{name}"] = estimated
@@ -107,10 +120,16 @@ class PairPredictions:
         return self._members["draw"].shape[0]
 
     def read(self, start: int, stop: int) -> PairChunk:
-        """The rows from ``start`` up to ``stop``. Raises GhptDataError if they name a rig or view there is not."""
+        """The rows from ``start`` up to ``stop``. Raises GhptDataError if they name a rig or view
+        there is not.
+        """
         arrays = [*_layout(self.names), *(f"weights_{summary}" for summary in WEIGHTS)]
-        rows = {name: torch.from_numpy(read_rows(self.path, self._members[name], start, stop)) for name in arrays}
-        rig, pair = rows["rig"].long(), rows["pair"].long()
+        rows = {
+            name: torch.from_numpy(read_rows(self.path, self._members[name], start, stop))
+            for name in arrays
+        }
+        rig = rows["rig"].long()
+        pair = rows["pair"].long()
         rigs, views = self.cameras.K.shape[:2]
         if ((rig < 0) | (rig >= rigs)).any():
             raise GhptDataError(self.path, "rig", "names a rig that is not listed", MEND)
@@ -120,31 +139,46 @@ class PairPredictions:
             raise GhptDataError(self.path, "truth_R", "holds values that are not finite", MEND)
         estimates = {}
         for name in self.names:
-            R, t = rows[f"R_{name}"], rows[f"t_{name}"]
+            R = rows[f"R_{name}"]
+            t = rows[f"t_{name}"]
             estimated = _usable(R, t, rows[f"estimated_{name}"])
             R = torch.where(estimated[:, None, None], R, torch.eye(3, dtype=R.dtype))
-            estimates[name] = RelativePoseEstimate(R, torch.where(estimated[:, None], t, 0.0), estimated)
+            estimates[name] = RelativePoseEstimate(
+                R, torch.where(estimated[:, None], t, 0.0), estimated
+            )
         weights = {summary: rows[f"weights_{summary}"] for summary in WEIGHTS}
-        return PairChunk(estimates, rows["truth_R"], rows["truth_t"], rig, rows["draw"], pair, weights)
+        return PairChunk(
+            estimates, rows["truth_R"], rows["truth_t"], rig, rows["draw"], pair, weights
+        )
 
     def chunks(self, size: int) -> Iterator[PairChunk]:
         """All rows, ``size`` at a time."""
-        return (self.read(start, min(start + size, len(self))) for start in range(0, len(self), size))
+        return (
+            self.read(start, min(start + size, len(self))) for start in range(0, len(self), size)
+        )
 
 
 def open_pairs(path: str | Path) -> PairPredictions:
-    """Open and check a predictions file of the camera problem, as ``open_predictions`` does one of poses."""
+    """Open and check a predictions file of the camera problem, as ``open_predictions`` does one of
+    poses.
+    """
     path = Path(path)
     members, tables, meta, names = read_tables(path, ("rig_name", "camera_name"))
     if meta.get("problem") != PROBLEM:
-        raise GhptDataError(path, "meta.problem", f"is {meta.get('problem')!r}, not {PROBLEM!r}", MEND)
+        raise GhptDataError(
+            path, "meta.problem", f"is {meta.get('problem')!r}, not {PROBLEM!r}", MEND
+        )
     check_arrays(path, members, _layout(names), row_count(members, "draw"))
     rigs = len(tables["rig_name"])
     views, points = (_second(members, name) for name in ("rig_K", "rig_points"))
     shapes = {"rig_K": (rigs, views, 3, 3), "rig_R": (rigs, views, 3, 3), "rig_t": (rigs, views, 3)}
     arrays = {}
     for name, shape in (shapes | {"rig_points": (rigs, points, 3)}).items():
-        if name not in members or members[name][1:] != (np.dtype("<f8"), shape) or not math.prod(shape):
+        if (
+            name not in members
+            or members[name][1:] != (np.dtype("<f8"), shape)
+            or not math.prod(shape)
+        ):
             raise GhptDataError(path, name, f"is not <f8 of shape {shape}", MEND)
         arrays[name] = torch.from_numpy(read_rows(path, members[name], 0, rigs))
         if not arrays[name].isfinite().all():
@@ -154,10 +188,14 @@ def open_pairs(path: str | Path) -> PairPredictions:
     flat = tables["camera_name"]
     camera_names = tuple(flat[i * views : (i + 1) * views] for i in range(rigs))
     cameras = Cameras(arrays["rig_K"], arrays["rig_R"], arrays["rig_t"])
-    return PairPredictions(path, meta, names, tables["rig_name"], camera_names, cameras, arrays["rig_points"], members)
+    return PairPredictions(
+        path, meta, names, tables["rig_name"], camera_names, cameras, arrays["rig_points"], members
+    )
 
 
-def _usable(R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"], estimated: Bool[Tensor, " B"]) -> Bool[Tensor, " B"]:
+def _usable(
+    R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"], estimated: Bool[Tensor, " B"]
+) -> Bool[Tensor, " B"]:
     return estimated & R.isfinite().flatten(-2).all(-1) & t.isfinite().all(-1) & (t != 0).any(-1)
 
 

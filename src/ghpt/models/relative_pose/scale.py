@@ -20,10 +20,16 @@ from ghpt.recording import PairBatch, RelativePoseEstimate
 from ghpt.skeleton import BONES, JOINTS
 
 _PARTS = {
-    "shank": ("ankle", "knee"), "thigh": ("knee", "hip"), "upper_arm": ("shoulder", "elbow"),
-    "forearm": ("elbow", "wrist"), "hip": ("hip", "pelvis"), "clavicle": ("thorax", "shoulder"),
-    "lumbar": ("pelvis", "spine"), "thorax": ("spine", "thorax"), "neck": ("thorax", "head_top"),
-}  # fmt: skip
+    "shank": ("ankle", "knee"),
+    "thigh": ("knee", "hip"),
+    "upper_arm": ("shoulder", "elbow"),
+    "forearm": ("elbow", "wrist"),
+    "hip": ("hip", "pelvis"),
+    "clavicle": ("thorax", "shoulder"),
+    "lumbar": ("pelvis", "spine"),
+    "thorax": ("spine", "thorax"),
+    "neck": ("thorax", "head_top"),
+}
 
 
 def _name(bone: tuple[int, int]) -> str:
@@ -34,9 +40,10 @@ def _name(bone: tuple[int, int]) -> str:
 
 
 SEGMENTS = tuple(map(_name, BONES))
-"""Names of the parts in the order of ``ghpt.skeleton.BONES``: right_shank, right_thigh, right_hip (to the pelvis), the
-same of the left, lumbar, thorax, neck (to the head's top), head_top_nose, right_clavicle, right_upper_arm,
-right_forearm, and of the left."""
+"""Names of the parts in the order of ``ghpt.skeleton.BONES``: right_shank, right_thigh, right_hip
+(to the pelvis), the same of the left, lumbar, thorax, neck (to the head's top), head_top_nose,
+right_clavicle, right_upper_arm, right_forearm, and of the left.
+"""
 
 STATURES = (900.0, 2300.0)
 """mm: from a child of four years, whose limbs are short for its height, to the tallest. What is
@@ -46,7 +53,8 @@ HUMAN = (600.0, 2800.0)
 """mm: beyond, a measured stature is nobody's: the unit of length is wrong."""
 
 MEASURED_FRAMES = 300
-"""At most so many, evenly spread, give the stature of the person in a recording, in every command."""
+"""At most so many, evenly spread, give the stature of the person in a recording, in every command.
+"""
 
 LIMBS = ("shank", "thigh", "upper_arm", "forearm")
 """The parts whose ends detectors define alike."""
@@ -57,7 +65,9 @@ def typical_lengths() -> tuple[float, ...]:
     """The lengths of an average adult's parts in statures, in the order of BONES."""
     one, other = np.array(BONES).T
     lengths = []
-    for number in range(256):  # the median of many people is the model's average, whatever a person is made of
+    for number in range(
+        256
+    ):  # the median of many people is the model's average, whatever a person is made of
         adult = random_body(np.random.default_rng(number))
         standing = pose(adult, np.zeros((1, len(body.SEGMENTS), 3)))[0] / adult.stature
         lengths.append(np.linalg.norm(standing[one] - standing[other], axis=-1))
@@ -72,9 +82,13 @@ def average_lengths() -> tuple[float, ...]:
 
 
 def part_scales(
-    points: Float[Tensor, "*B M J 3"], estimated: Bool[Tensor, "*B M J"], lengths: Float[Tensor, " L"]
+    points: Float[Tensor, "*B M J 3"],
+    estimated: Bool[Tensor, "*B M J"],
+    lengths: Float[Tensor, " L"],
 ) -> Float[Tensor, "*B L"]:
-    """For each part its known length over the median of its measured ones; NaN where unknown or never measured."""
+    """For each part its known length over the median of its measured ones; NaN where unknown or
+    never measured.
+    """
     one, other = torch.tensor(BONES, device=points.device).T
     measured = (points[..., one, :] - points[..., other, :]).double().norm(dim=-1)
     both = estimated[..., one] & estimated[..., other] & torch.isfinite(measured)
@@ -84,21 +98,31 @@ def part_scales(
 
 
 def body_scale(
-    points: Float[Tensor, "*B M J 3"], estimated: Bool[Tensor, "*B M J"], lengths: Float[Tensor, " L"]
+    points: Float[Tensor, "*B M J 3"],
+    estimated: Bool[Tensor, "*B M J"],
+    lengths: Float[Tensor, " L"],
 ) -> Float[Tensor, "*B"]:
-    """mm per unit of ``points``: the median over the parts of known length (mm, in the order of BONES; NaN or 0 where
-    unknown) of that length over the median measured one; 0 where no known part was measured."""
+    """mm per unit of ``points``: the median over the parts of known length (mm, in the order of
+    BONES; NaN or 0 where unknown) of that length over the median measured one; 0 where no known
+    part was measured.
+    """
     return part_scales(points, estimated, lengths).nanmedian(-1).values.nan_to_num(0.0)
 
 
-def stature(points: Float[Tensor, "*B M J 3"], estimated: Bool[Tensor, "*B M J"]) -> Float[Tensor, "*B"]:
-    """The stature of the person in view from its limbs, in the unit of ``points``; 0 where no limb was measured."""
+def stature(
+    points: Float[Tensor, "*B M J 3"], estimated: Bool[Tensor, "*B M J"]
+) -> Float[Tensor, "*B"]:
+    """The stature of the person in view from its limbs, in the unit of ``points``; 0 where no limb
+    was measured.
+    """
     scale = body_scale(points, estimated, torch.tensor(average_lengths(), dtype=torch.float64))
     return torch.where(scale > 0, 1 / torch.where(scale > 0, scale, 1.0), 0.0)
 
 
 class Scale(ABC):
-    """``scale(estimate, batch)``: mm per unit of each estimate's t, float64; 0 where nothing determines it."""
+    """``scale(estimate, batch)``: mm per unit of each estimate's t, float64; 0 where nothing
+    determines it.
+    """
 
     @abstractmethod
     def __call__(self, estimate: RelativePoseEstimate, batch: PairBatch) -> Float[Tensor, "*B"]: ...
@@ -112,7 +136,9 @@ class KnownScale(Scale):
         true = (baseline[:, 1] - baseline[:, 0]).norm(dim=-1)
         length = estimate.t.double().norm(dim=-1)
         true = true.reshape(-1, *[1] * (length.ndim - 1)).expand(length.shape)
-        return torch.where(estimate.estimated & (length > 0), true / torch.where(length > 0, length, 1.0), 0.0)
+        return torch.where(
+            estimate.estimated & (length > 0), true / torch.where(length > 0, length, 1.0), 0.0
+        )
 
 
 class BodyScale(Scale):
@@ -122,34 +148,59 @@ class BodyScale(Scale):
 
     @torch.no_grad()
     def __call__(self, estimate: RelativePoseEstimate, batch: PairBatch) -> Float[Tensor, "*B"]:
-        key_points, seen = batch.of_pair(batch.key_points), batch.of_pair(batch.seen)
+        key_points = batch.of_pair(batch.key_points)
+        seen = batch.of_pair(batch.seen)
         K = batch.pair_cameras().K.double()
         lengths = torch.tensor(self.lengths, dtype=torch.float64)
         scales = [
-            self._of_pair(estimate.R[i].double(), estimate.t[i].double(), K[i], key_points[i], seen[i], lengths)
-            for i in range(len(batch))  # pair by pair: the memory of all hypotheses' people at once is gigabytes
+            self._of_pair(
+                estimate.R[i].double(),
+                estimate.t[i].double(),
+                K[i],
+                key_points[i],
+                seen[i],
+                lengths,
+            )
+            for i in range(
+                len(batch)
+            )  # pair by pair: the memory of all hypotheses' people at once is gigabytes
         ]
-        scale = torch.stack(scales) if scales else estimate.t.new_zeros(estimate.t.shape[:-1], dtype=torch.float64)
+        scale = (
+            torch.stack(scales)
+            if scales
+            else estimate.t.new_zeros(estimate.t.shape[:-1], dtype=torch.float64)
+        )
         return torch.where(estimate.estimated, scale, 0.0)
 
     @staticmethod
     def _of_pair(
-        R: Float[Tensor, "*H 3 3"], t: Float[Tensor, "*H 3"], K: Float[Tensor, "2 3 3"],
-        key_points: Float[Tensor, "2 M J 2"], seen: Bool[Tensor, "2 M J"], lengths: Float[Tensor, " L"],
-    ) -> Float[Tensor, "*H"]:  # fmt: skip
-        leading, shape = R.shape[:-2], seen.shape[1:]
+        R: Float[Tensor, "*H 3 3"],
+        t: Float[Tensor, "*H 3"],
+        K: Float[Tensor, "2 3 3"],
+        key_points: Float[Tensor, "2 M J 2"],
+        seen: Bool[Tensor, "2 M J"],
+        lengths: Float[Tensor, " L"],
+    ) -> Float[Tensor, "*H"]:
+        leading = R.shape[:-2]
+        shape = seen.shape[1:]
         world = torch.eye(3, dtype=R.dtype, device=R.device).expand_as(R), torch.zeros_like(t)
         cameras = Cameras(
-            K.expand(*leading, 2, 3, 3), torch.stack((world[0], R), dim=-3), torch.stack((world[1], t), dim=-2)
+            K.expand(*leading, 2, 3, 3),
+            torch.stack((world[0], R), dim=-3),
+            torch.stack((world[1], t), dim=-2),
         )
         pixels = key_points.double().flatten(1, 2)
         weights = seen.all(0).flatten().double().expand(*leading, 2, -1)
         result = triangulate(cameras, pixels.expand(*leading, *pixels.shape), weights)
-        return body_scale(result.points.unflatten(-2, shape), result.ok.unflatten(-1, shape), lengths)
+        return body_scale(
+            result.points.unflatten(-2, shape), result.ok.unflatten(-1, shape), lengths
+        )
 
 
 class BodyHeight(BodyScale):
-    """The limbs of an average adult of this height (mm): proportions differ by about 3 % between people."""
+    """The limbs of an average adult of this height (mm): proportions differ by about 3 % between
+    people.
+    """
 
     def __init__(self, mm: float) -> None:
         low, high = HUMAN
@@ -166,7 +217,11 @@ class SegmentLengths(BodyScale):
         check(len(lengths) > 0, "lengths", "is empty", mend)
         found = dict.fromkeys(SEGMENTS, 0.0)
         for name, mm in lengths.items():
-            own = [s for s in SEGMENTS if s == name or s.removeprefix("right_").removeprefix("left_") == name]
+            own = [
+                s
+                for s in SEGMENTS
+                if s == name or s.removeprefix("right_").removeprefix("left_") == name
+            ]
             check(bool(own), "lengths", f"names {name!r}, which is no part of the body", mend)
             check(mm > 0, "lengths", f"says {name} is {mm}", "Give lengths in millimetres.")
             found |= dict.fromkeys(own, float(mm))

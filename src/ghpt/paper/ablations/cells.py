@@ -1,4 +1,6 @@
-"""The cells of the ablations: a model with a setting changed, and its errors on validation and test subjects."""
+"""The cells of the ablations: a model with a setting changed, and its errors on validation and test
+subjects.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,8 @@ def evaluated(
     seconds: float = 5.0,
 ) -> Cell:
     """A model on splits of Human3.6M, with other (hypotheses, temperature) where not None."""
-    strides, sets = setup.sizes["ablation"]["stride"], {}
+    strides = setup.sizes["ablation"]["stride"]
+    sets = {}
     for split in splits:
         own = (f"data.evaluate={split}", f"data.stride={strides[split]}")
         whole = setup.composed("test", BASE, *setup.overrides["test"], *own)
@@ -45,6 +48,8 @@ def evaluated(
     return Cell(name, "ghpt.paper.ablations.work.evaluate", config, needs, seconds=seconds)
 
 
-def number(results: Results, cell: str, split: str, selection: str = "weight", setting: int = 0) -> Spread:
+def number(
+    results: Results, cell: str, split: str, selection: str = "weight", setting: int = 0
+) -> Spread:
     """Pelvis-relative MPJPE of an `evaluated` cell, mm."""
     return Spread(tuple(float(each[split][setting][selection]) for each in results.read(cell)))

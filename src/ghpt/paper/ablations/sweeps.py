@@ -53,13 +53,21 @@ def _novel(setup: Setup) -> list[str]:
 
 def temperature(results: Results) -> Section:
     setup = results.setup
-    values, usual = (f(setup, *x, "model", "temperature") for f, x in ((levels, ("temperature",)), (default, ())))
+    values, usual = (
+        f(setup, *x, "model", "temperature") for f, x in ((levels, ("temperature",)), (default, ()))
+    )
     lines: dict[str, Mapping[Place, Row]] = {
-        "weight": {v: (DEFAULT, "weight", i) if v == usual else (f"{v:g}", "weight", 0) for i, v in enumerate(values)},
+        "weight": {
+            v: (DEFAULT, "weight", i) if v == usual else (f"{v:g}", "weight", 0)
+            for i, v in enumerate(values)
+        },
         "tested": {v: (DEFAULT, "weight", i) for i, v in enumerate(values)},
         "average": {v: (DEFAULT, "average", i) for i, v in enumerate(values)},
     }
-    labels = LABELS | {"weight": "trained and tested with it", "tested": f"trained with {usual:g}, tested with it"}
+    labels = LABELS | {
+        "weight": "trained and tested with it",
+        "tested": f"trained with {usual:g}, tested with it",
+    }
     for novel in _novel(setup):
         lines["trained"] = {v: (novel, "weight", i) for i, v in enumerate(values)}
         labels["trained"] = f"the same, trained on {NAMES[novel]}"
@@ -71,45 +79,57 @@ def temperature(results: Results) -> Section:
 
 
 def hypotheses_cells(setup: Setup) -> dict[str, Cell]:
-    values, usual = levels(setup, "hypotheses", "model", "hypotheses"), default(setup, "model", "hypotheses")
-    cells = {DEFAULT: evaluated(setup, setup.trained(BASE), [(value, None) for value in values], seconds=30.0)}
+    values = levels(setup, "hypotheses", "model", "hypotheses")
+    usual = default(setup, "model", "hypotheses")
+    cells = {
+        DEFAULT: evaluated(
+            setup, setup.trained(BASE), [(value, None) for value in values], seconds=30.0
+        )
+    }
     for value in setup.sizes["ablation"]["hypotheses_trained"]:
         if value != usual:
             seconds = 4 + 16 * value / usual
-            model = trained(setup, BASE, f"model.hypotheses={value}", name=f"hypotheses{value}", seconds=seconds)
+            model = trained(
+                setup, BASE, f"model.hypotheses={value}", name=f"hypotheses{value}", seconds=seconds
+            )
             cells[f"{value}"] = evaluated(setup, model, [(usual, None)])
     return cells
 
 
 def hypotheses(results: Results) -> Section:
     setup = results.setup
-    values, usual = (f(setup, *x, "model", "hypotheses") for f, x in ((levels, ("hypotheses",)), (default, ())))
+    values, usual = (
+        f(setup, *x, "model", "hypotheses") for f, x in ((levels, ("hypotheses",)), (default, ()))
+    )
     lines: dict[str, Mapping[Place, Row]] = {
-        name: {v: (DEFAULT, name, i) for i, v in enumerate(values)} for name in ("weight", "average", "best")
+        name: {v: (DEFAULT, name, i) for i, v in enumerate(values)}
+        for name in ("weight", "average", "best")
     }
     taught = sorted({*setup.sizes["ablation"]["hypotheses_trained"], usual})
     lines["trained"] = {
-        v: (DEFAULT, "weight", values.index(usual)) if v == usual else (f"{v}", "weight", 0) for v in taught
+        v: (DEFAULT, "weight", values.index(usual)) if v == usual else (f"{v}", "weight", 0)
+        for v in taught
     }
     labels = LABELS | {
         "weight": f"learned, trained with {usual}, tested with it",
         "trained": f"learned, trained with it, tested with {usual}",
-    }  # fmt: skip
-    text = (
-        "Hypotheses in a pool. A smaller pool is the beginning of a larger one. The best hypothesis looks at the truth."
-    )
+    }
+    text = "Hypotheses in a pool. A smaller pool is the beginning of a larger one. The best hypothesis looks at the truth."
     return _section(results, "hypotheses", "hypotheses", lines, labels, text, usual)
 
 
 def samples_cells(setup: Setup) -> dict[str, Cell]:
-    usual, hypotheses = default(setup, "data", "train_samples"), default(setup, "model", "hypotheses")
+    usual = default(setup, "data", "train_samples")
+    hypotheses = default(setup, "model", "hypotheses")
     pool = setup.sizes["ablation"]["samples_hypotheses"]
     cells = {"model": setup.trained(BASE)}
     for value in levels(setup, "samples", "data", "train_samples"):
-        changes, seconds = [f"model.hypotheses={pool}"], 4 + 25 * value / usual * pool / hypotheses
+        changes = [f"model.hypotheses={pool}"]
+        seconds = 4 + 25 * value / usual * pool / hypotheses
         name = f"hypotheses{pool}"
         if value != usual:
-            changes, name = [*changes, f"data.train_samples={value}"], f"samples{value}-{name}"
+            changes = [*changes, f"data.train_samples={value}"]
+            name = f"samples{value}-{name}"
         model = trained(setup, BASE, *changes, name=name, seconds=seconds)
         cells[f"{value}"] = evaluated(setup, model, [(hypotheses, None)])
     return cells
@@ -117,9 +137,12 @@ def samples_cells(setup: Setup) -> dict[str, Cell]:
 
 def samples(results: Results) -> Section:
     setup = results.setup
-    values, usual = (f(setup, *x, "data", "train_samples") for f, x in ((levels, ("samples",)), (default, ())))
+    values, usual = (
+        f(setup, *x, "data", "train_samples") for f, x in ((levels, ("samples",)), (default, ()))
+    )
     name = {v: f"{v}" for v in values}
-    pool, tested = setup.sizes["ablation"]["samples_hypotheses"], default(setup, "model", "hypotheses")
+    pool = setup.sizes["ablation"]["samples_hypotheses"]
+    tested = default(setup, "model", "hypotheses")
     lines: Lines = {
         "weight": {v: (name[v], "weight", 0) for v in values},
         "average": {v: (name[v], "average", 0) for v in values},
@@ -142,34 +165,61 @@ def _enough(results: Results, cells: Mapping[Place, str], usual: Place) -> Claim
         f"{errors[usual]:.1f} mm of {usual:g}; the best of {', '.join(f'{n:g}' for n in cells)} is {best:g} with "
         f"{errors[best]:.1f} mm ({signed(100 * (errors[best] / errors[usual] - 1))} %)"
     )
-    return Claim("best results with only 500 samples (held if within 1 % of the best)", "C",
-                 errors[usual] <= 1.01 * errors[best], by)  # fmt: skip
+    return Claim(
+        "best results with only 500 samples (held if within 1 % of the best)",
+        "C",
+        errors[usual] <= 1.01 * errors[best],
+        by,
+    )
 
 
 def _minutes(results: Results) -> Claim:
     seconds = Spread(tuple(about["seconds"] for about in results.read("model", "cell.json")))
-    return Claim("about 3 minutes to train", "C", seconds.mean <= 180,
-                 f"{seconds.mean:.0f} s on a processor, beside other work")  # fmt: skip
+    return Claim(
+        "about 3 minutes to train",
+        "C",
+        seconds.mean <= 180,
+        f"{seconds.mean:.0f} s on a processor, beside other work",
+    )
 
 
 def _section(
-    results: Results, name: str, head: str, lines: Lines, labels: Mapping[str, str], text: str, usual: Place,
+    results: Results,
+    name: str,
+    head: str,
+    lines: Lines,
+    labels: Mapping[str, str],
+    text: str,
+    usual: Place,
     claims: Sequence[Claim] = (),
-) -> Section:  # fmt: skip
+) -> Section:
     """A table with a row for each place, and a panel for each set."""
     numbers = {
-        split: {style: {x: number(results, cell, split, selection, i) for x, (cell, selection, i) in row.items()}
-                for style, row in lines.items()}
+        split: {
+            style: {
+                x: number(results, cell, split, selection, i)
+                for x, (cell, selection, i) in row.items()
+            }
+            for style, row in lines.items()
+        }
         for split in SETS
-    }  # fmt: skip
+    }
     panels = [
-        Panel(f"{head}; {SETS[split]}", {style: (list(row), list(row.values())) for style, row in rows.items()},
-              logarithmic=True, mark=usual)
+        Panel(
+            f"{head}; {SETS[split]}",
+            {style: (list(row), list(row.values())) for style, row in rows.items()},
+            logarithmic=True,
+            mark=usual,
+        )
         for split, rows in numbers.items()
-    ]  # fmt: skip
+    ]
     data = results.words(BASE)
     figure = curves(
-        panels, f"{data}, trained on its training subjects unless said", "pelvis-relative MPJPE, mm", labels, False
+        panels,
+        f"{data}, trained on its training subjects unless said",
+        "pelvis-relative MPJPE, mm",
+        labels,
+        False,
     )
     body = [
         f"{text} Trained and tested on Human3.6M unless said.",
@@ -185,19 +235,24 @@ def _section(
 
 def _table(
     head: str, lines: Mapping[str, Mapping[Place, Spread]], labels: Mapping[str, str], usual: Place
-) -> str:  # fmt: skip
+) -> str:
     """A row for each place, a column for each line."""
     places = sorted({x for row in lines.values() for x in row})
     return markdown(
         [head, *(labels.get(name, name) for name in lines)],
-        [[f"{x:g}{' (default)' * (x == usual)}", *(_text(row.get(x)) for row in lines.values())] for x in places],
+        [
+            [f"{x:g}{' (default)' * (x == usual)}", *(_text(row.get(x)) for row in lines.values())]
+            for x in places
+        ],
     )
 
 
 def _chosen(validation: Mapping[Place, Spread], test: Mapping[Place, Spread], usual: Place) -> str:
     """What the validation subject would choose, and what that is worth on the test."""
     best = min(validation, key=lambda x: validation[x].mean)
-    gain, worth = (signed(100 * (errors[best].mean / errors[usual].mean - 1)) for errors in (validation, test))
+    gain, worth = (
+        signed(100 * (errors[best].mean / errors[usual].mean - 1)) for errors in (validation, test)
+    )
     if validation[best].mean > (1 - CHANCE) * validation[usual].mean:
         least = "" if best == usual else f" (the least error is at {best:g}, {gain} %)"
         return f"Validation keeps the default, {usual:g}{least}. {NOTE}"

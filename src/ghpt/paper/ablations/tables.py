@@ -1,4 +1,6 @@
-"""Ablations: one setting of the pose model changed at a time; validation chooses, the test says what it is worth."""
+"""Ablations: one setting of the pose model changed at a time; validation chooses, the test says
+what it is worth.
+"""
 
 from __future__ import annotations
 
@@ -16,9 +18,14 @@ Variants = Mapping[str, str]
 """Name -> experiment of conf/experiment; none for the default."""
 GUMBEL: Variants = {"with Gumbel noise (default)": "", "without": "no_gumbel"}
 FEATURES: Variants = {
-    "coordinates and lengths (default)": "", "coordinates only": "coordinates_only", "lengths only": "lengths_only",
-}  # fmt: skip
-SELECTION: Variants = {"weighted average (default)": "", "one drawn, straight through": "selection_stochastic"}
+    "coordinates and lengths (default)": "",
+    "coordinates only": "coordinates_only",
+    "lengths only": "lengths_only",
+}
+SELECTION: Variants = {
+    "weighted average (default)": "",
+    "one drawn, straight through": "selection_stochastic",
+}
 
 
 def _cells(setup: Setup, variants: Variants) -> dict[str, Cell]:
@@ -27,7 +34,9 @@ def _cells(setup: Setup, variants: Variants) -> dict[str, Cell]:
             return setup.trained(data)
         return trained(setup, data, f"experiment={experiment}", name=experiment)
 
-    splits = dict.fromkeys(setup.sizes["ablation"]["also_trained_on"], ("test",)) | {BASE: tuple(SETS)}
+    splits = dict.fromkeys(setup.sizes["ablation"]["also_trained_on"], ("test",)) | {
+        BASE: tuple(SETS)
+    }
     return {
         f"{data}: {name}": evaluated(setup, model(data, experiment), splits=of_data)
         for data, of_data in splits.items()
@@ -38,14 +47,20 @@ def _cells(setup: Setup, variants: Variants) -> dict[str, Cell]:
 def _section(results: Results, variants: Variants, about: str) -> Section:
     novel = [(data, "test") for data in results.setup.sizes["ablation"]["also_trained_on"]]
     columns = [*((BASE, split) for split in SETS), *novel]
-    numbers = {name: [number(results, f"{data}: {name}", split) for data, split in columns] for name in variants}
+    numbers = {
+        name: [number(results, f"{data}: {name}", split) for data, split in columns]
+        for name in variants
+    }
     usual = next(iter(variants))
     average = [number(results, f"{data}: {usual}", split, "average") for data, split in columns]
     rows = [[name, *(s.text() for s in spreads)] for name, spreads in numbers.items()]
     rows.append(["average of the same pool", *(s.text() for s in average)])
     head = [
         "MPJPE, mm",
-        *(SETS[split] if data == BASE else f"test, trained on {NAMES[data]}" for data, split in columns),
+        *(
+            SETS[split] if data == BASE else f"test, trained on {NAMES[data]}"
+            for data, split in columns
+        ),
     ]
     table = "Pelvis-relative MPJPE of the weighted selection on Human3.6M, trained on Human3.6M unless said."
     body = [f"{about} {table}", markdown(head, rows), _chosen(numbers)]
@@ -60,27 +75,65 @@ def _chosen(numbers: Mapping[str, Sequence[Spread]]) -> str:
     parts = ["Validation keeps the default." if tied else f"Validation would choose: {best}."]
     for name, spreads in numbers.items():
         if name != usual:
-            changes = (100 * (a.mean / b.mean - 1) for a, b in zip(spreads, numbers[usual], strict=True))
-            parts.append(f"Against the default, {name}: {', '.join(f'{signed(change)} %' for change in changes)}.")
+            changes = (
+                100 * (a.mean / b.mean - 1) for a, b in zip(spreads, numbers[usual], strict=True)
+            )
+            parts.append(
+                f"Against the default, {name}: {', '.join(f'{signed(change)} %' for change in changes)}."
+            )
     return " ".join([*parts, NOTE])
 
 
 def _training(label: str, title: str, variants: Variants, about: str) -> Item:
-    return Item(label, "ablation", title, partial(_cells, variants=variants),
-                partial(_section, variants=variants, about=about))  # fmt: skip
+    return Item(
+        label,
+        "ablation",
+        title,
+        partial(_cells, variants=variants),
+        partial(_section, variants=variants, about=about),
+    )
 
 
 ITEMS = (
-    _training("ablation-gumbel", "Gumbel noise in training", GUMBEL,
-              "With the noise the weights of training are drawn from the Gumbel-softmax, without it they are the plain "
-              "softmax of the test."),
-    _training("ablation-features", "What the scorer sees", FEATURES,
-              "The scorer sees the normalised coordinates of the 17 joints and the 16 body part lengths."),
-    _training("ablation-selection", "The hypothesis of the estimation loss", SELECTION,
-              "The estimation loss is that of the weighted average, or of one hypothesis drawn from the weights (its "
-              "gradient is that of the weights)."),
-    Item("ablation-temperature", "ablation", "Temperature of the softmax",
-         sweeps.temperature_cells, sweeps.temperature),
-    Item("ablation-hypotheses", "ablation", "Number of hypotheses", sweeps.hypotheses_cells, sweeps.hypotheses),
-    Item("ablation-samples", "ablation", "Number of training samples", sweeps.samples_cells, sweeps.samples),
-)  # fmt: skip
+    _training(
+        "ablation-gumbel",
+        "Gumbel noise in training",
+        GUMBEL,
+        "With the noise the weights of training are drawn from the Gumbel-softmax, without it they are the plain "
+        "softmax of the test.",
+    ),
+    _training(
+        "ablation-features",
+        "What the scorer sees",
+        FEATURES,
+        "The scorer sees the normalised coordinates of the 17 joints and the 16 body part lengths.",
+    ),
+    _training(
+        "ablation-selection",
+        "The hypothesis of the estimation loss",
+        SELECTION,
+        "The estimation loss is that of the weighted average, or of one hypothesis drawn from the weights (its "
+        "gradient is that of the weights).",
+    ),
+    Item(
+        "ablation-temperature",
+        "ablation",
+        "Temperature of the softmax",
+        sweeps.temperature_cells,
+        sweeps.temperature,
+    ),
+    Item(
+        "ablation-hypotheses",
+        "ablation",
+        "Number of hypotheses",
+        sweeps.hypotheses_cells,
+        sweeps.hypotheses,
+    ),
+    Item(
+        "ablation-samples",
+        "ablation",
+        "Number of training samples",
+        sweeps.samples_cells,
+        sweeps.samples,
+    ),
+)

@@ -1,4 +1,6 @@
-"""The work of the ablations: a model's selections on several sets of frames, at several pool sizes and temperatures."""
+"""The work of the ablations: a model's selections on several sets of frames, at several pool sizes
+and temperatures.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -25,10 +27,11 @@ SELECTIONS = ("weight", "average", "best")
 @torch.no_grad()
 def evaluate(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
     """Test the model of ``needs["model"]`` on each data module of ``config["sets"]`` under each of
-    ``config["settings"]``, pairs of a number of hypotheses and a temperature (None: the model's own).
+    ``config["settings"]``, pairs of a number of hypotheses and a temperature (None: the model's
+    own).
 
-    result.json: set -> for each setting selection -> pelvis-relative MPJPE (mm). A smaller pool is the beginning of a
-    larger one, the same that test.py draws with so many hypotheses.
+    result.json: set -> for each setting selection -> pelvis-relative MPJPE (mm). A smaller pool is
+    the beginning of a larger one, the same that test.py draws with so many hypotheses.
     """
     model, _ = load_model(needs["model"] / CHECKPOINT, seed=config["seed"])
     model.eval()
@@ -53,8 +56,18 @@ def errors(
         logits = model.scorer(model.problem.describe(pool))
         for each, (count, temperature) in zip(metrics, settings, strict=True):
             part = PoseHypotheses(pool.points[:, :count], pool.views[:, :count], pool.estimated)
-            update(each, model, part, limit_spread(logits[:, :count], model.spread), temperature, batch, keys)
-    return [{name: metric.compute().mean.item() for name, metric in each.items()} for each in metrics]
+            update(
+                each,
+                model,
+                part,
+                limit_spread(logits[:, :count], model.spread),
+                temperature,
+                batch,
+                keys,
+            )
+    return [
+        {name: metric.compute().mean.item() for name, metric in each.items()} for each in metrics
+    ]
 
 
 def update(

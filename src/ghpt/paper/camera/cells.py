@@ -19,12 +19,18 @@ def camera_model(setup: Setup) -> Cell:
 
 def of_test(composed: Mapping[str, Any]) -> dict[str, Any]:
     """What every test depends on, out of test.py's whole configuration."""
-    return {key: composed[key] for key in ("data", "seed", "hypotheses", "files") if key in composed}
+    return {
+        key: composed[key] for key in ("data", "seed", "hypotheses", "files") if key in composed
+    }
 
 
 def tested_pairs(setup: Setup) -> dict[str, Cell]:
     """The camera model on Human3.6M with all classical estimators."""
-    return {"test": setup.tested(camera_model(setup), "h36m", f"frames={FUNDAMENTAL_FRAMES}", seconds=75.0)}
+    return {
+        "test": setup.tested(
+            camera_model(setup), "h36m", f"frames={FUNDAMENTAL_FRAMES}", seconds=75.0
+        )
+    }
 
 
 def of_pair(results: Results, method: str, pair: str, *keys: str) -> Spread:
@@ -39,10 +45,21 @@ def of_pair(results: Results, method: str, pair: str, *keys: str) -> Spread:
 
 def measured(spread: Spread, times: float = 1.0) -> Spread | None:
     """The number in another unit; None where it is not finite."""
-    return Spread(tuple(times * value for value in spread.values)) if math.isfinite(spread.mean) else None
+    return (
+        Spread(tuple(times * value for value in spread.values))
+        if math.isfinite(spread.mean)
+        else None
+    )
 
 
 def three_rows(pair: str, numbers: Sequence[Compared], more: Sequence[str]) -> list[list[str]]:
     """Rows *paper*, *ours* and *difference* of a pair; ``more`` is what else there is of ours."""
-    kinds = zip(("paper", "ours", "difference"), zip(*(n.cells() for n in numbers), strict=True), strict=True)
-    return [[f"{pair} {kind}", *cells, *(more if kind == "ours" else [""] * len(more))] for kind, cells in kinds]
+    kinds = zip(
+        ("paper", "ours", "difference"),
+        zip(*(n.cells() for n in numbers), strict=True),
+        strict=True,
+    )
+    return [
+        [f"{pair} {kind}", *cells, *(more if kind == "ours" else [""] * len(more))]
+        for kind, cells in kinds
+    ]

@@ -14,36 +14,46 @@ from ghpt.report.tables import markdown
 
 
 def _dissection(results: Results) -> Section:
-    rows, compared = [], []
+    rows = []
+    compared = []
     for ab, printed in FUNDAMENTAL_DISSECTION.items():
         pair = f"{ab[0]}-{ab[1]}"
         numbers = [
-            Compared(f"{pair} {error}, {part.replace('_', ' ')}", printed[part][error],
-                     measured(of_pair(results, "weight", pair, part, error)))
+            Compared(
+                f"{pair} {error}, {part.replace('_', ' ')}",
+                printed[part][error],
+                measured(of_pair(results, "weight", pair, part, error)),
+            )
             for part in ALONE
             for error in ("E_2D", "E_3D")
-        ]  # fmt: skip
+        ]
         rows += three_rows(pair, numbers, [of_pair(results, "weight", pair, "E_3D").text()])
         compared += numbers
     head = ["pair", "R: E_2D, px", "R: E_3D, mm", "t: E_2D, px", "t: E_3D, mm", "both: E_3D, mm"]
-    text = (
-        "Errors of the weighted hypothesis when one part of the pose is estimated and the other one is true; medians."
-    )
+    text = "Errors of the weighted hypothesis when one part of the pose is estimated and the other one is true; medians."
     alone = {
         f"{a}-{b}": [of_pair(results, "weight", f"{a}-{b}", part, "E_3D").mean for part in ALONE]
         for a, b in FUNDAMENTAL
     }
-    pixels = [[of_pair(results, "weight", pair, part, "E_2D").mean for part in ALONE] for pair in alone]
+    pixels = [
+        [of_pair(results, "weight", pair, part, "E_2D").mean for part in ALONE] for pair in alone
+    ]
     higher = [pair for pair, (R, t) in alone.items() if t > R]
     both_higher = len(higher) + sum(t > R for R, t in pixels)
     claim = Claim(
-        "errors of estimated translations are always higher than those of estimated rotations", "appendix A",
+        "errors of estimated translations are always higher than those of estimated rotations",
+        "appendix A",
         both_higher == 2 * len(alone),
         f"in {len(higher)} of {len(alone)} pairs in E_3D, in {both_higher - len(higher)} in E_2D "
         f"(largest opposite: {_largest_opposite(alone)})",
-    )  # fmt: skip
+    )
     return Section(
-        results.words("h36m"), f"{text}\n\n{markdown(head, rows)}", {}, compared, [claim], _compensation(results, alone)
+        results.words("h36m"),
+        f"{text}\n\n{markdown(head, rows)}",
+        {},
+        compared,
+        [claim],
+        _compensation(results, alone),
     )
 
 
@@ -70,5 +80,9 @@ def _compensation(results: Results, alone: Mapping[str, Sequence[float]]) -> str
 
 
 DISSECTION = Item(
-    "fundamental-dissection", "table", "Relative camera poses, one part estimated", tested_pairs, _dissection
+    "fundamental-dissection",
+    "table",
+    "Relative camera poses, one part estimated",
+    tested_pairs,
+    _dissection,
 )

@@ -1,4 +1,6 @@
-"""The work of poses from estimated cameras (appendix A): extrinsics from draws of frames, and the poses they give."""
+"""The work of poses from estimated cameras (appendix A): extrinsics from draws of frames, and the
+poses they give.
+"""
 
 from __future__ import annotations
 
@@ -43,14 +45,21 @@ def relative(cameras: Cameras) -> Extrinsics:
 
 
 def replaced(truth: Cameras, estimate: Extrinsics, use_R: bool, use_t: bool) -> Cameras:
-    """The true cameras with the estimated relative rotations, translations or both; the first camera is as it was."""
-    (true_R, true_t), (R, t) = relative(truth), estimate
+    """The true cameras with the estimated relative rotations, translations or both; the first
+    camera is as it was.
+    """
+    (true_R, true_t) = relative(truth)
+    (R, t) = estimate
     reference = truth.index((slice(0, 1),))
-    return Cameras(truth.K, *camera_after(reference, R if use_R else true_R, t if use_t else true_t))
+    return Cameras(
+        truth.K, *camera_after(reference, R if use_R else true_R, t if use_t else true_t)
+    )
 
 
 def with_true_scale(cameras: Cameras, truth: Cameras) -> Extrinsics:
-    """A rig's relative poses times one number, the median ratio of true to estimated distances between cameras."""
+    """A rig's relative poses times one number, the median ratio of true to estimated distances
+    between cameras.
+    """
     R, t = relative(cameras)
     return R, t * (torch.pdist(truth.centre) / torch.pdist(cameras.centre)).median()
 
@@ -60,13 +69,15 @@ def from_pairs(estimate: RelativePoseEstimate, batch: PairBatch, name: str) -> E
     rows = torch.nonzero(batch.pair[:, 0] == 0)[:, 0]
     if not estimate.estimated[rows].all():
         raise GhptDataError(f"draw {int(batch.draw[0])}", name, "a pair has no estimate", MEND)
-    eye, zero = torch.eye(3, dtype=torch.float64)[None], torch.zeros(1, 3, dtype=torch.float64)
+    eye = torch.eye(3, dtype=torch.float64)[None]
+    zero = torch.zeros(1, 3, dtype=torch.float64)
     return torch.cat((eye, estimate.R[rows].double())), torch.cat((zero, estimate.t[rows].double()))
 
 
 def from_rig(calibration: Any, batch: PairBatch) -> Extrinsics:
     """All views of a draw calibrated together; the one scale is the true one."""
-    truth, draw = batch.cameras.index(0), int(batch.draw[0])
+    truth = batch.cameras.index(0)
+    draw = int(batch.draw[0])
     arrays = (x[0].transpose(0, 1) for x in (batch.key_points, batch.confidence, batch.seen))
     found = calibration([str(view) for view in range(len(truth.K))], truth.K, *arrays, None, draw)
     if not found.calibrated.all():
@@ -76,22 +87,30 @@ def from_rig(calibration: Any, batch: PairBatch) -> Extrinsics:
 
 @torch.no_grad()
 def estimate_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Extrinsics from ``draws`` draws of ``frames`` frames of each rig, by ``source``: ``weight``, the camera model of
-    ``needs["model"]``; ``rig``; or one of the pairs' classical estimators. What is not ``weight`` is built from
-    ``estimator``, and a pair's t gets its length from ``scale``.
+    """Extrinsics from ``draws`` draws of ``frames`` frames of each rig, by ``source``: ``weight``,
+    the camera model of ``needs["model"]``; ``rig``; or one of the pairs' classical estimators. What
+    is not ``weight`` is built from ``estimator``, and a pair's t gets its length from ``scale``.
 
-    result.json: for each rig the numbers of its recordings, and R and t (mm) of its cameras after the first in each
-    draw.
+    result.json: for each rig the numbers of its recordings, and R and t (mm) of its cameras after
+    the first in each draw.
     """
-    source, draws = config["source"], config["draws"]
+    source = config["source"]
+    draws = config["draws"]
     data = build(config["data"], "data")
-    pairs = Pairs(data.recordings(data.evaluate), PairSettings(config["frames"], draws, 1), config["seed"])
+    pairs = Pairs(
+        data.recordings(data.evaluate), PairSettings(config["frames"], draws, 1), config["seed"]
+    )
     pairs.pairs = [pair for pair in pairs.pairs if pair[0] == 0]
     if source == "weight":
-        changes = {"seed": config["seed"], "hypotheses": config["hypotheses"], "problem.frames": config["frames"]}
+        changes = {
+            "seed": config["seed"],
+            "hypotheses": config["hypotheses"],
+            "problem.frames": config["frames"],
+        }
         model = load_model(needs["model"] / CHECKPOINT, **changes)[0].eval()
     else:
-        estimator, scale = build(config["estimator"], "estimator"), build(config["scale"], "scale")
+        estimator = build(config["estimator"], "estimator")
+        scale = build(config["scale"], "scale")
     found: list[list[list[Any]]] = [[] for _ in pairs.rigs]
     for draw in range(len(pairs.rigs) * draws):
         batch = pairs[range(draw * len(pairs.pairs), (draw + 1) * len(pairs.pairs))]
@@ -101,15 +120,20 @@ def estimate_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: 
             extrinsics = from_rig(estimator, batch)
         else:
             pose = estimator(batch)
-            extrinsics = from_pairs(replace(pose, t=pose.t * scale(pose, batch)[..., None]), batch, source)
+            extrinsics = from_pairs(
+                replace(pose, t=pose.t * scale(pose, batch)[..., None]), batch, source
+            )
         found[draw // draws].append([x.tolist() for x in extrinsics])
-    rigs = [{"recordings": list(r.recordings), "draws": d} for r, d in zip(pairs.rigs, found, strict=True)]
+    rigs = [
+        {"recordings": list(r.recordings), "draws": d}
+        for r, d in zip(pairs.rigs, found, strict=True)
+    ]
     write_json(folder / "result.json", rigs)
 
 
 def poses_from_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Test the pose model of ``needs["model"]`` with some ``parts`` of the extrinsics from ``needs["extrinsics"]``, or
-    where there are none with the true ones.
+    """Test the pose model of ``needs["model"]`` with some ``parts`` of the extrinsics from
+    ``needs["extrinsics"]``, or where there are none with the true ones.
 
     result.json: part of `PARTS` (or ``known``) -> kind -> MPJPE (mm) of ``weight``.
     """
@@ -120,18 +144,28 @@ def poses_from_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder
     frames = {"known": data.frames["test"]}
     if "extrinsics" in needs:
         rigs = read_json(needs["extrinsics"] / "result.json")
-        frames = {part: seen_by(data.frames["test"], rigs, *PARTS[part]) for part in config["parts"]}
-    write_json(folder / "result.json", {part: pose_errors(model, f, data.batch_size) for part, f in frames.items()})
+        frames = {
+            part: seen_by(data.frames["test"], rigs, *PARTS[part]) for part in config["parts"]
+        }
+    write_json(
+        folder / "result.json",
+        {part: pose_errors(model, f, data.batch_size) for part, f in frames.items()},
+    )
 
 
 def seen_by(frames: Frames, rigs: Sequence[Mapping[str, Any]], use_R: bool, use_t: bool) -> Frames:
-    """The frames, each through the cameras of one draw; the draws take turns, so that all of them cost one test."""
-    draws, recordings = len(rigs[0]["draws"]), []
+    """The frames, each through the cameras of one draw; the draws take turns, so that all of them
+    cost one test.
+    """
+    draws = len(rigs[0]["draws"])
+    recordings = []
     for draw in range(draws):
         estimates = {index: rig["draws"][draw] for rig in rigs for index in rig["recordings"]}
         for index, recording in enumerate(frames.recordings):
             R, t = (torch.tensor(x, dtype=torch.float64) for x in estimates[index])
-            recordings.append(replace(recording, cameras=replaced(recording.cameras, (R, t), use_R, use_t)))
+            recordings.append(
+                replace(recording, cameras=replaced(recording.cameras, (R, t), use_R, use_t))
+            )
     turn = np.arange(len(frames)) % draws
     return Frames(recordings, frames.frames + turn * frames.start[-1])
 

@@ -10,7 +10,15 @@ from ghpt.paper.engine.cells import Cell
 from ghpt.paper.engine.item import Claim, Item, Results, Section
 from ghpt.paper.engine.setup import Setup
 from ghpt.report.pair_tables import NAMES
-from ghpt.report.sweep import CLIP, Sweep, frames_sweep, pairs_table, statistics_of, sweep_table, wins
+from ghpt.report.sweep import (
+    CLIP,
+    Sweep,
+    frames_sweep,
+    pairs_table,
+    statistics_of,
+    sweep_table,
+    wins,
+)
 
 BASELINES = ("eight_point", "ransac", "poselib")
 PAPER_PAIR = (2, 3)
@@ -27,11 +35,18 @@ def _cells(setup: Setup) -> dict[str, Cell]:
         "draws": size["draws"],
         "pairs": None if size["all_pairs"] else [list(PAPER_PAIR)],
     }
-    needs = {"model": camera_model(setup), "data": setup.prepared("h36m", whole["data"]["evaluate"])}
+    needs = {
+        "model": camera_model(setup),
+        "data": setup.prepared("h36m", whole["data"]["evaluate"]),
+    }
     work = "ghpt.paper.camera.sweep.errors_of_draws"
     return {
         str(frames): Cell(
-            f"frames-sweep-{frames}-seed{setup.seed}", work, config | {"frames": frames}, needs, seconds=6.0
+            f"frames-sweep-{frames}-seed{setup.seed}",
+            work,
+            config | {"frames": frames},
+            needs,
+            seconds=6.0,
         )
         for frames in size["frames"]
     }
@@ -40,7 +55,8 @@ def _cells(setup: Setup) -> dict[str, Cell]:
 def _section(results: Results) -> Section:
     sweeps = _sweeps(results)
     name = f"{PAPER_PAIR[0]}-{PAPER_PAIR[1]}"
-    paper, frames = sweeps[name], sorted(sweeps[name]["weight"])
+    paper = sweeps[name]
+    frames = sorted(sweeps[name]["weight"])
     draws = len(paper["weight"][frames[0]])
     words = results.words("h36m")
     heading = f"Cameras {name} of {words}, {draws} draws of M frames"
@@ -48,8 +64,11 @@ def _section(results: Results) -> Section:
         f"E_3D against the number of frames M: mean and standard deviation of {draws} draws, cut at {CLIP:.0f} mm; "
         "the bands of RANSAC and PoseLib are the fainter ones"
     )
-    body = [f"![{caption}](comparison-to-8-point.svg)",
-            f"E_3D of pair {name} in mm, mean ± deviation (median) of {draws} draws.", sweep_table(paper)]  # fmt: skip
+    body = [
+        f"![{caption}](comparison-to-8-point.svg)",
+        f"E_3D of pair {name} in mm, mean ± deviation (median) of {draws} draws.",
+        sweep_table(paper),
+    ]
     if len(sweeps) > 1:
         body += ["### All pairs", _counted(sweeps), pairs_table(sweeps, ("weight", *BASELINES))]
     figures = {"comparison-to-8-point": frames_sweep(paper, heading)}
@@ -63,7 +82,9 @@ def _sweeps(results: Results) -> dict[str, dict[str, dict[int, list[float]]]]:
         for content in results.read(str(frames)):
             for pair, errors in content.items():
                 for method in ("weight", *BASELINES):
-                    values = sweeps.setdefault(pair, {}).setdefault(method, {}).setdefault(frames, [])
+                    values = (
+                        sweeps.setdefault(pair, {}).setdefault(method, {}).setdefault(frames, [])
+                    )
                     values += [math.inf if error is None else error for error in errors[method]]
     return sweeps
 
@@ -72,19 +93,32 @@ def _claims(sweep: Sweep, frames: Sequence[int]) -> list[Claim]:
     lower = wins([sweep], "weight", "eight_point", MEAN)
     steadier = wins([sweep], "weight", "eight_point", DEVIATION)
     means, deviations = (
-        "; ".join(f"M = {m}: {_against(sweep, m, statistic)} mm" for m in dict.fromkeys((frames[0], frames[-1])))
+        "; ".join(
+            f"M = {m}: {_against(sweep, m, statistic)} mm"
+            for m in dict.fromkeys((frames[0], frames[-1]))
+        )
         for statistic in (MEAN, DEVIATION)
     )
     return [
-        Claim("consistently outperforms the 8-point algorithm on the pair (2, 3)", "4.4", all(lower),
-              f"lower mean for {sum(lower)} of {len(lower)} numbers of frames; {means}"),
-        Claim("lower variance than the 8-point algorithm on the pair (2, 3)", "4.4", all(steadier),
-              f"lower deviation for {sum(steadier)} of {len(steadier)} numbers of frames; {deviations}"),
-    ]  # fmt: skip
+        Claim(
+            "consistently outperforms the 8-point algorithm on the pair (2, 3)",
+            "4.4",
+            all(lower),
+            f"lower mean for {sum(lower)} of {len(lower)} numbers of frames; {means}",
+        ),
+        Claim(
+            "lower variance than the 8-point algorithm on the pair (2, 3)",
+            "4.4",
+            all(steadier),
+            f"lower deviation for {sum(steadier)} of {len(steadier)} numbers of frames; {deviations}",
+        ),
+    ]
 
 
 def _against(sweep: Sweep, frames: int, statistic: int) -> str:
-    ours, theirs = (statistics_of(sweep[method][frames])[statistic] for method in ("weight", "eight_point"))
+    ours, theirs = (
+        statistics_of(sweep[method][frames])[statistic] for method in ("weight", "eight_point")
+    )
     return f"{ours:.1f} {'<' if ours < theirs else '≥'} {theirs:.1f}"
 
 
@@ -99,4 +133,6 @@ def _counted(sweeps: dict[str, Sweep]) -> str:
     )
 
 
-SWEEP = Item("comparison-to-8-point", "figure", "E_3D against the number of frames", _cells, _section)
+SWEEP = Item(
+    "comparison-to-8-point", "figure", "E_3D against the number of frames", _cells, _section
+)

@@ -18,10 +18,11 @@ from ghpt.paper.engine.work import CHECKPOINT
 
 
 def errors_of_draws(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Test the camera model of ``needs["model"]`` on ``draws`` draws of ``frames`` frames of each rig.
+    """Test the camera model of ``needs["model"]`` on ``draws`` draws of ``frames`` frames of each
+    rig.
 
-    ``pairs``: of views, counted from 1; None: all. result.json: pair -> selection or baseline -> E_3D (mm, null where
-    a draw was not estimated) of each draw; beside it predictions.npz.
+    ``pairs``: of views, counted from 1; None: all. result.json: pair -> selection or baseline ->
+    E_3D (mm, null where a draw was not estimated) of each draw; beside it predictions.npz.
     """
     changes = {"problem.frames": config["frames"], "problem.draws": config["draws"]}
     changes |= {"seed": config["seed"], "hypotheses": config["hypotheses"]}
@@ -31,8 +32,15 @@ def errors_of_draws(config: dict[str, Any], needs: dict[str, Path], folder: Path
     data.setup("test")
     pairs = data.frames["test"]
     views = len(pairs.rigs[0].names)
-    pairs.pairs = [(a - 1, b - 1) for a, b in config["pairs"] or combinations(range(1, views + 1), 2)]
-    meta = {"data": data.name, "source": data.source, "split": data.evaluate, "seed": config["seed"]}
+    pairs.pairs = [
+        (a - 1, b - 1) for a, b in config["pairs"] or combinations(range(1, views + 1), 2)
+    ]
+    meta = {
+        "data": data.name,
+        "source": data.source,
+        "split": data.evaluate,
+        "seed": config["seed"],
+    }
     collect = CollectPairs(folder, build(config["camera_baselines"], "camera_baselines"), meta)
     collect.data = pairs
     collect.open([*SELECTIONS, *collect.estimators])

@@ -19,11 +19,11 @@ from ghpt.provenance import provenance
 
 @dataclass(frozen=True)
 class Cell:
-    """``work`` is the full name of a function ``(config, needs, folder)`` that writes its result into ``folder``;
-    ``needs`` gives it the folders of the cells that came before.
+    """``work`` is the full name of a function ``(config, needs, folder)`` that writes its result
+    into ``folder``; ``needs`` gives it the folders of the cells that came before.
 
-    Two cells with the same work, config, needs and code are one: whichever item of the report asks, it is computed
-    once. ``name`` is for people.
+    Two cells with the same work, config, needs and code are one: whichever item of the report asks,
+    it is computed once. ``name`` is for people.
     """
 
     name: str
@@ -44,7 +44,9 @@ class Cell:
             "needs": {name: cell.key for name, cell in self.needs.items()},
             "code": code_digest(self.work.rpartition(".")[0]),
         }
-        return hashlib.sha256(json.dumps(content, sort_keys=True, allow_nan=False).encode()).hexdigest()[:16]
+        return hashlib.sha256(
+            json.dumps(content, sort_keys=True, allow_nan=False).encode()
+        ).hexdigest()[:16]
 
     def folder(self, cells: Path) -> Path:
         return cells / f"{self.name}-{self.key}"
@@ -61,10 +63,15 @@ def perform(cell: Cell, cells: Path) -> None:
         needs = {name: before.folder(cells) for name, before in cell.needs.items()}
         with atomic_folder(cell.folder(cells)) as folder:
             getattr(importlib.import_module(module), function)(dict(cell.config), needs, folder)
-            about = {"name": cell.name, "work": cell.work, "config": cell.config, "command": cell.command,
-                     "needs": {name: before.folder(cells).name for name, before in cell.needs.items()},
-                     "seconds": round(time.perf_counter() - start, 2),
-                     "provenance": provenance(cell.config.get("seed", 0))}  # fmt: skip
+            about = {
+                "name": cell.name,
+                "work": cell.work,
+                "config": cell.config,
+                "command": cell.command,
+                "needs": {name: before.folder(cells).name for name, before in cell.needs.items()},
+                "seconds": round(time.perf_counter() - start, 2),
+                "provenance": provenance(cell.config.get("seed", 0)),
+            }
             write_json(folder / "cell.json", about)
 
 

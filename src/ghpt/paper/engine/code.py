@@ -1,4 +1,6 @@
-"""What of the source code decides a number: a cell is made again when this changes, and not for a comment."""
+"""What of the source code decides a number: a cell is made again when this changes, and not for a
+comment.
+"""
 
 import ast
 import functools
@@ -13,14 +15,26 @@ import torch
 
 PACKAGE = Path(__file__).parents[2]
 DECIDES = (
-    "data", "geometry", "models", "metrics", "calibration", "randomness.py", "recording.py", "skeleton.py", 
-    "commands/train.py", "commands/test.py", "report/poses.py", "report/pairs.py",
-)  # fmt: skip
+    "data",
+    "geometry",
+    "models",
+    "metrics",
+    "calibration",
+    "randomness.py",
+    "recording.py",
+    "skeleton.py",
+    "commands/train.py",
+    "commands/test.py",
+    "report/poses.py",
+    "report/pairs.py",
+)
 """Every cell depends on these files and folders of ghpt, and on the module of its own work."""
 
 
 def code_digest(module: str) -> str:
-    """A digest of the code behind a cell whose work is in ``module``, and of the libraries that compute."""
+    """A digest of the code behind a cell whose work is in ``module``, and of the libraries that
+    compute.
+    """
     own = importlib.util.find_spec(module)
     files = [PACKAGE / name for name in DECIDES]
     versions = f"torch {torch.__version__} numpy {np.__version__} lightning {lightning.__version__}"
@@ -29,7 +43,9 @@ def code_digest(module: str) -> str:
 
 
 def _python_files(paths: Iterable[Path]) -> list[Path]:
-    return [file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])]
+    return [
+        file for path in paths for file in (sorted(path.rglob("*.py")) if path.is_dir() else [path])
+    ]
 
 
 @functools.cache
@@ -44,4 +60,8 @@ def meaning(file: Path) -> str:
 
 
 def _is_text(node: ast.AST) -> bool:
-    return isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str)
+    return (
+        isinstance(node, ast.Expr)
+        and isinstance(node.value, ast.Constant)
+        and isinstance(node.value.value, str)
+    )

@@ -1,4 +1,6 @@
-"""An item of the report, a table or a figure: the cells it is made of, and what it makes of their results."""
+"""An item of the report, a table or a figure: the cells it is made of, and what it makes of their
+results.
+"""
 
 from __future__ import annotations
 
@@ -47,7 +49,11 @@ def signed(value: float) -> str:
 
 def over_seeds(function: Callable[..., float], *spreads: Spread) -> Spread:
     """A function of several numbers, seed by seed."""
-    return Spread(tuple(function(*values) for values in zip(*(spread.values for spread in spreads), strict=True)))
+    return Spread(
+        tuple(
+            function(*values) for values in zip(*(spread.values for spread in spreads), strict=True)
+        )
+    )
 
 
 @dataclass(frozen=True)
@@ -58,7 +64,9 @@ class Compared:
     paper: float | None
     ours: Spread | None
     better: Literal["lower", "same"] = "lower"
-    """``same``: there is no better, such as for the worst hypothesis; any large difference is a miss."""
+    """``same``: there is no better, such as for the worst hypothesis; any large difference is a
+    miss.
+    """
     digits: int = 1
 
     @property
@@ -74,14 +82,21 @@ class Compared:
 
     def cells(self) -> list[str]:
         """*paper | ours | difference* as text; a miss is marked."""
-        difference = NONE if self.difference is None else f"{signed(100 * self.difference)} %{' (miss)' * self.miss}"
+        difference = (
+            NONE
+            if self.difference is None
+            else f"{signed(100 * self.difference)} %{' (miss)' * self.miss}"
+        )
         paper = NONE if self.paper is None else f"{self.paper:.{self.digits}f}"
         return [paper, NONE if self.ours is None else self.ours.text(self.digits), difference]
 
 
 def comparison(rows: Sequence[Compared], head: str, unit: str = "mm") -> str:
     """A Markdown table of *paper | ours | difference*."""
-    return markdown([head, f"paper, {unit}", f"ours, {unit}", "difference"], [[row.what, *row.cells()] for row in rows])
+    return markdown(
+        [head, f"paper, {unit}", f"ours, {unit}", "difference"],
+        [[row.what, *row.cells()] for row in rows],
+    )
 
 
 @dataclass(frozen=True)
@@ -92,7 +107,9 @@ class Claim:
     where: str
     """Section of the paper."""
     holds: bool | None
-    """None where the data cannot tell: what others published of real images is no measure for embedded data."""
+    """None where the data cannot tell: what others published of real images is no measure for
+    embedded data.
+    """
     by: str
     """By how much, with the paper's own numbers where it has them."""
 
@@ -114,14 +131,20 @@ class Section:
     """Every number that the paper prints, for the summary and the list of misses."""
     claims: Sequence[Claim] = ()
     explained: str = ""
-    """What explains the misses of embedded data, and the claims that do not hold; shown where there are any."""
+    """What explains the misses of embedded data, and the claims that do not hold; shown where there
+    are any.
+    """
 
 
 class Results:
     """The results of an item's cells, for each seed."""
 
-    def __init__(self, setups: Sequence[Setup], cells: Sequence[Mapping[str, Cell]], folder: Path) -> None:
-        self.setups, self._cells, self._folder = setups, cells, folder
+    def __init__(
+        self, setups: Sequence[Setup], cells: Sequence[Mapping[str, Cell]], folder: Path
+    ) -> None:
+        self.setups = setups
+        self._cells = cells
+        self._folder = folder
 
     @property
     def setup(self) -> Setup:

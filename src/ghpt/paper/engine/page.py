@@ -27,7 +27,9 @@ TITLE = "Generalizable Human Pose Triangulation: the paper's tables and figures 
 PREFIX = {"table": "tab:", "figure": "fig:"}
 FOLDER = "figures"
 EMBEDDED = "embedded"
-logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells every glyph that goes into a PDF
+logging.getLogger("fontTools").setLevel(
+    logging.WARNING
+)  # it tells every glyph that goes into a PDF
 
 
 @dataclass(frozen=True)
@@ -93,19 +95,34 @@ class Page:
             "## Summary",
             f"{held} of {len(self.claims)} claims hold; {compared - len(misses)} of {compared} numbers are not a miss. "
             f"A claim with – is about what others published of real images, which {EMBEDDED} data cannot tell.",
-            markdown(["table or figure", "numbers", "median difference", "misses", "claims that hold"],
-                     [_summary_row(entry) for entry in self.entries]),
-        ]  # fmt: skip
-        failed = [(entry, claim) for entry in self.entries for claim in entry.section.claims if claim.holds is False]
+            markdown(
+                ["table or figure", "numbers", "median difference", "misses", "claims that hold"],
+                [_summary_row(entry) for entry in self.entries],
+            ),
+        ]
+        failed = [
+            (entry, claim)
+            for entry in self.entries
+            for claim in entry.section.claims
+            if claim.holds is False
+        ]
         if failed:
-            rows = [[entry.item.label, claim.statement, claim.where, claim.by] for entry, claim in failed]
+            rows = [
+                [entry.item.label, claim.statement, claim.where, claim.by]
+                for entry, claim in failed
+            ]
             parts += [
                 "## Claims that do not hold",
-                markdown(["in", "claim", "section", "by (the paper's in brackets)"], rows, range(4)),
+                markdown(
+                    ["in", "claim", "section", "by (the paper's in brackets)"], rows, range(4)
+                ),
             ]
         if misses:
             rows = [[entry.item.label, number.what, *number.cells()] for entry, number in misses]
-            parts += ["## Misses", markdown(["in", "number", "paper", "ours", "difference"], rows, range(2))]
+            parts += [
+                "## Misses",
+                markdown(["in", "number", "paper", "ours", "difference"], rows, range(2)),
+            ]
         return "\n\n".join(parts)
 
 
@@ -122,7 +139,8 @@ def told(entry: Entry) -> list[Claim]:
 
 
 def _summary_row(entry: Entry) -> list[str]:
-    claims, numbers = told(entry), entry.section.compared
+    claims = told(entry)
+    numbers = entry.section.compared
     # a comparison may lack a number, the paper's or ours
     known = [number.difference for number in numbers if number.difference is not None]
     return [
@@ -153,10 +171,16 @@ def write_page(page: Page, folder: Path) -> None:
 
 
 def drawn(figure: Figure, kind: str) -> bytes:
-    """The same bytes for the same figure: no date, no random names; letters as outlines, so that no font is needed."""
+    """The same bytes for the same figure: no date, no random names; letters as outlines, so that no
+    font is needed.
+    """
     content = BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "ghpt", "svg.fonttype": "path", "pdf.fonttype": 42}):
-        figure.savefig(content, format=kind, metadata={"Date" if kind == "svg" else "CreationDate": None})
+    with matplotlib.rc_context(
+        {"svg.hashsalt": "ghpt", "svg.fonttype": "path", "pdf.fonttype": 42}
+    ):
+        figure.savefig(
+            content, format=kind, metadata={"Date" if kind == "svg" else "CreationDate": None}
+        )
     return content.getvalue()
 
 
@@ -167,9 +191,16 @@ def as_markdown(page: Page) -> str:
         for name in entry.section.figures:
             body = body.replace(f"]({name}.svg)", f"]({FOLDER}/{name}.svg)")
         commands = "\n".join(entry.commands)
-        parts += [f'<a id="{entry.item.label}"></a>', f"## {escaped(entry.heading)}", body, f"Again: `{entry.again}`"]
+        parts += [
+            f'<a id="{entry.item.label}"></a>',
+            f"## {escaped(entry.heading)}",
+            body,
+            f"Again: `{entry.again}`",
+        ]
         parts += ["By hand:", code_block(commands, "bash")] if commands else []
-    return "\n\n".join([*parts, "## Configuration", code_block(page.config.rstrip(), "yaml")]) + "\n"
+    return (
+        "\n\n".join([*parts, "## Configuration", code_block(page.config.rstrip(), "yaml")]) + "\n"
+    )
 
 
 def as_html(page: Page, pictures: Mapping[str, bytes]) -> str:
@@ -177,18 +208,25 @@ def as_html(page: Page, pictures: Mapping[str, bytes]) -> str:
     renderer = MarkdownIt("commonmark", {"html": False}).enable("table")
     renderer.add_render_rule("table_open", lambda *_: '<div class="table"><table>')
     renderer.add_render_rule("table_close", lambda *_: "</table></div>")
-    renderer.add_render_rule("image", lambda _, tokens, index, *__: _picture(tokens[index], pictures))
+    renderer.add_render_rule(
+        "image", lambda _, tokens, index, *__: _picture(tokens[index], pictures)
+    )
     entries = "\n".join(
         f'<section id="{entry.item.label}">\n<h2>{escape(entry.heading)}</h2>\n{renderer.render(entry.text())}'
         f"<p class='again'>Again: <code>{escape(entry.again)}</code></p>{_details(entry.commands)}</section>"
         for entry in page.entries
     )
-    links = "".join(f'<li><a href="#{e.item.label}">{escape(e.item.label)}</a></li>' for e in page.entries)
+    links = "".join(
+        f'<li><a href="#{e.item.label}">{escape(e.item.label)}</a></li>' for e in page.entries
+    )
     template = files("ghpt.paper.engine").joinpath("page.html").read_text(encoding="utf-8")
     blocks = {
-        "TITLE": escape(TITLE), "LINKS": links, "FRONT": renderer.render(page.front()), "ENTRIES": entries,
+        "TITLE": escape(TITLE),
+        "LINKS": links,
+        "FRONT": renderer.render(page.front()),
+        "ENTRIES": entries,
         "CONFIG": escape(page.config),
-    }  # fmt: skip
+    }
     for name, text in blocks.items():
         template = template.replace(f"<!--{name}-->", text)
     return template
@@ -202,7 +240,9 @@ def _picture(token: Any, pictures: Mapping[str, bytes]) -> str:
 def _details(commands: Sequence[str]) -> str:
     if not commands:
         return ""
-    return f"<details><summary>By hand</summary><pre>{escape(chr(10).join(commands))}</pre></details>"
+    return (
+        f"<details><summary>By hand</summary><pre>{escape(chr(10).join(commands))}</pre></details>"
+    )
 
 
 def as_data(page: Page) -> dict[str, Any]:
@@ -214,12 +254,16 @@ def as_data(page: Page) -> dict[str, Any]:
             entry.item.label: {
                 "data": entry.section.data,
                 "numbers": [
-                    {"what": n.what, "paper": n.paper, "ours": None if n.ours is None else list(n.ours.values),
-                     "miss": n.miss}
+                    {
+                        "what": n.what,
+                        "paper": n.paper,
+                        "ours": None if n.ours is None else list(n.ours.values),
+                        "miss": n.miss,
+                    }
                     for n in entry.section.compared
                 ],
                 "claims": [vars(claim) for claim in entry.section.claims],
             }
             for entry in page.entries
         },
-    }  # fmt: skip
+    }

@@ -18,7 +18,14 @@ from pathlib import Path
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    Progress,
+    TaskProgressColumn,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
 from ghpt.errors import GhptConfigError, GhptError
 from ghpt.files import sweep_temporaries
@@ -29,23 +36,29 @@ _log = logging.getLogger(__name__)
 
 
 def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> int:
-    """Do every cell that is wanted or needed and is not yet done, ``jobs`` at a time; returns how many that were.
+    """Do every cell that is wanted or needed and is not yet done, ``jobs`` at a time; returns how
+    many that were.
 
-    A cell's result is kept as soon as it is there: after an error or an interruption, which end this at once, the same
-    call goes on where it was. Raises what the cell raised, a GhptError with the cell's name before it.
+    A cell's result is kept as soon as it is there: after an error or an interruption, which end
+    this at once, the same call goes on where it was. Raises what the cell raised, a GhptError with
+    the cell's name before it.
     """
     cells.mkdir(parents=True, exist_ok=True)
     sweep_temporaries(cells)
     missing = {key: cell for key, cell in with_needs(wanted).items() if not cell.done(cells)}
-    number, chain = len(missing), _chains(missing)
+    number = len(missing)
+    chain = _chains(missing)
     with (
         stopped_by_signals(),
         _progress(list(missing.values()), show) as tell,
         _executor(min(jobs, len(missing))) as submit,
     ):
-        waiting, running = dict(missing), {}
+        waiting = dict(missing)
+        running = {}
         while waiting or running:
-            ready = [c for c in waiting.values() if not any(b.key in missing for b in c.needs.values())]
+            ready = [
+                c for c in waiting.values() if not any(b.key in missing for b in c.needs.values())
+            ]
             for cell in sorted(ready, key=lambda c: -chain[c.key])[: jobs - len(running)]:
                 running[submit(cell, cells)] = waiting.pop(cell.key)
                 tell(running.values(), None)
@@ -70,7 +83,9 @@ def _killed(running: Iterable[Cell]) -> GhptConfigError:
 
 
 def _chains(cells: dict[str, Cell]) -> dict[str, float]:
-    """Seconds of the longest chain of cells that begins with each: what is first in a long one is done first."""
+    """Seconds of the longest chain of cells that begins with each: what is first in a long one is
+    done first.
+    """
     chain = {key: cell.seconds for key, cell in cells.items()}
     for key, cell in reversed(cells.items()):  # needs come before those who need them
         for before in cell.needs.values():
@@ -81,12 +96,16 @@ def _chains(cells: dict[str, Cell]) -> dict[str, float]:
 
 @contextlib.contextmanager
 def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[None]]]:
-    """Submit cells to ``jobs`` processes, or with one to this process; on the way out nothing is left running."""
+    """Submit cells to ``jobs`` processes, or with one to this process; on the way out nothing is
+    left running.
+    """
     if jobs <= 1:
         yield _here
         return
     threads = max(1, (os.cpu_count() or 1) // jobs)
-    executor = ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _start, (threads, os.getpid()))
+    executor = ProcessPoolExecutor(
+        jobs, multiprocessing.get_context("spawn"), _start, (threads, os.getpid())
+    )
     try:
         yield lambda cell, cells: executor.submit(_quietly, cell, cells)
     except BaseException:
@@ -123,7 +142,9 @@ def _end_with(parent: int) -> None:
 
 def _quietly(cell: Cell, cells: Path) -> None:
     """`perform` without what the commands would say on the way."""
-    loggers = [logging.getLogger(name) for name in ("ghpt", "lightning.pytorch", "lightning.fabric")]
+    loggers = [
+        logging.getLogger(name) for name in ("ghpt", "lightning.pytorch", "lightning.fabric")
+    ]
     levels = [logger.level for logger in loggers]
     try:
         for logger in loggers:
@@ -137,13 +158,22 @@ def _quietly(cell: Cell, cells: Path) -> None:
 
 
 @contextlib.contextmanager
-def _progress(cells: Sequence[Cell], show: bool) -> Iterator[Callable[[Iterable[Cell], Cell | None], None]]:
-    """A bar over all cells, as long as their expected seconds; without it, or a terminal, a line for each.
+def _progress(
+    cells: Sequence[Cell], show: bool
+) -> Iterator[Callable[[Iterable[Cell], Cell | None], None]]:
+    """A bar over all cells, as long as their expected seconds; without it, or a terminal, a line
+    for each.
 
     What it yields is told which cells are being made, and which one has been finished.
     """
-    columns = (TextColumn("{task.fields[count]}"), BarColumn(None), TaskProgressColumn(), TimeElapsedColumn(),
-               TimeRemainingColumn(), TextColumn("{task.description}"))  # fmt: skip
+    columns = (
+        TextColumn("{task.fields[count]}"),
+        BarColumn(None),
+        TaskProgressColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+        TextColumn("{task.description}"),
+    )
     console = Console(stderr=True)
     show = show and console.is_terminal and len(cells) > 0
     bar = Progress(*columns, console=console, disable=not show)

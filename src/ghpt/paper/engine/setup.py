@@ -24,8 +24,12 @@ SECONDS = {"h36m": 40.0}
 def compose(conf: Path, name: str, overrides: tuple[str, ...]) -> dict[str, Any]:
     """``<conf>/<name>.yaml`` under ``overrides``, as plain data. Do not change it."""
     with contextlib.ExitStack() as stack:
-        if not GlobalHydra.instance().is_initialized():  # as it is under a command, whose folder is ``conf`` too
-            stack.enter_context(hydra.initialize_config_dir(str(conf.resolve()), version_base="1.3"))
+        if (
+            not GlobalHydra.instance().is_initialized()
+        ):  # as it is under a command, whose folder is ``conf`` too
+            stack.enter_context(
+                hydra.initialize_config_dir(str(conf.resolve()), version_base="1.3")
+            )
         return plain(hydra.compose(name, [*overrides, "output=unused", "progress_bar=false"]))
 
 
@@ -37,7 +41,9 @@ class Setup:
     roots: Mapping[str, str | None]
     """``human36m`` and ``panoptic``: folder of the real data set, None for the embedded one."""
     overrides: Mapping[str, Sequence[str]]
-    """``train``: of every training, in the words of train.py's command line; ``test``: of every test."""
+    """``train``: of every training, in the words of train.py's command line; ``test``: of every
+    test.
+    """
     sizes: Mapping[str, Any]
     """``conf/reproduce.yaml``'s ``sizes``."""
     seed: int
@@ -53,24 +59,46 @@ class Setup:
     def words(self, data: str, *overrides: str) -> tuple[str, ...]:
         """What a command line says of the data and the seed."""
         root = self.root(data)
-        return (f"data={data}", *([] if root is None else [typed("data.root", root)]), f"seed={self.seed}", *overrides)
+        return (
+            f"data={data}",
+            *([] if root is None else [typed("data.root", root)]),
+            f"seed={self.seed}",
+            *overrides,
+        )
 
     def composed(self, name: str, data: str, *overrides: str) -> dict[str, Any]:
         """A command's whole configuration; of real data also what identifies the files."""
         config = compose(self.conf, name, (*self.words(data), "trainer.devices=1", *overrides))
-        config = {key: value for key, value in config.items() if key not in ("output", "progress_bar")}
-        return config | ({} if self.root(data) is None else {"files": _files(self.conf, self.words(data))})
+        config = {
+            key: value for key, value in config.items() if key not in ("output", "progress_bar")
+        }
+        return config | (
+            {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
+        )
 
     def prepared(self, data: str, split: str) -> Cell:
         """The recordings of a split in the cache."""
         config = {"data": _of_source(self.composed("test", data)["data"]), "split": split}
         files = {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
-        return Cell(f"prepare-{data}-{split}", "ghpt.paper.engine.work.prepare_split", config | files, seconds=8.0)
+        return Cell(
+            f"prepare-{data}-{split}",
+            "ghpt.paper.engine.work.prepare_split",
+            config | files,
+            seconds=8.0,
+        )
 
-    def trained(self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 30.0) -> Cell:
-        """A model trained on a data set; ``overrides`` are those of train.py, ``name`` tells them apart."""
+    def trained(
+        self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 30.0
+    ) -> Cell:
+        """A model trained on a data set; ``overrides`` are those of train.py, ``name`` tells them
+        apart.
+        """
         words = (f"model={model}", *self.overrides["train"], *overrides)
-        config = {k: v for k, v in self.composed("train", data, *words).items() if k not in ("save_every", "resume")}
+        config = {
+            k: v
+            for k, v in self.composed("train", data, *words).items()
+            if k not in ("save_every", "resume")
+        }
         needs = {split: self.prepared(data, split) for split in ("train", "validation")}
         name = "-".join(filter(None, ["train", model, data, name, f"seed{self.seed}"]))
         command = " ".join(["python train.py", *self.words(data), *words, _output(name)])
@@ -86,20 +114,27 @@ class Setup:
         view_weights: bool = True,
         seconds: float | None = None,
     ) -> Cell:
-        """The model of a `trained` cell on a data set; ``baselines`` False leaves the classical estimators out,
-        ``view_weights`` False the learned view weights."""
+        """The model of a `trained` cell on a data set; ``baselines`` False leaves the classical
+        estimators out, ``view_weights`` False the learned view weights.
+        """
         overrides = (*self.overrides["test"], *overrides)
         config = self.composed("test", data, *overrides)
         pairs = model.config["model"]["problem"].get("frames")
         unused = ("ckpt", *(("baselines", "view_weights") if pairs else ("camera_baselines",)))
         config = {key: value for key, value in config.items() if key not in unused}
-        left_out = {"baselines": not baselines, "camera_baselines": not baselines, "view_weights": not view_weights}
+        left_out = {
+            "baselines": not baselines,
+            "camera_baselines": not baselines,
+            "view_weights": not view_weights,
+        }
         config |= {key: {} for key, out in left_out.items() if out and key in config}
         needs = {"model": model, "data": self.prepared(data, config["data"]["evaluate"])}
         trained = model.name.removeprefix("train-").removesuffix(f"-seed{self.seed}")
         name = "-".join(filter(None, ["test", trained, "on", data, name, f"seed{self.seed}"]))
         checkpoint = f"ckpt={_output(model.name).removeprefix('output=')}/last.ckpt"
-        command = " ".join(["python test.py", checkpoint, *self.words(data), *overrides, _output(name)])
+        command = " ".join(
+            ["python test.py", checkpoint, *self.words(data), *overrides, _output(name)]
+        )
         seconds = seconds or SECONDS.get(data, 13.0)
         return Cell(name, "ghpt.paper.engine.work.test_model", config, needs, command, seconds)
 
@@ -110,7 +145,9 @@ def _output(name: str) -> str:
 
 
 def _of_source(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The data settings that do not change the recordings set to one value, so that seeds share them."""
+    """The data settings that do not change the recordings set to one value, so that seeds share
+    them.
+    """
     return dict(data) | {"seed": 0, "evaluate": "test", "stride": 64}
 
 

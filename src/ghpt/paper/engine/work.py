@@ -14,13 +14,16 @@ CHECKPOINT = LAST
 
 
 def prepare_split(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Have the recordings of ``config["data"]``, split ``config["split"]``, in the cache of prepared recordings."""
+    """Have the recordings of ``config["data"]``, split ``config["split"]``, in the cache of
+    prepared recordings.
+    """
     recordings = build(config["data"], "data").recordings(config["split"])
     write_json(folder / "result.json", {"frames": sum(map(len, recordings))})
 
 
 def train_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """What train.py does; the checkpoint is kept without the optimiser, two thirds of it, for nobody goes on from here.
+    """What train.py does; the checkpoint is kept without the optimiser, two thirds of it, for
+    nobody goes on from here.
 
     result.json: the validation errors (mm).
     """

@@ -20,11 +20,14 @@ from ghpt.report.escape import escaped
 from ghpt.report.tables import NAMES, NONE, markdown
 
 PANOPTIC = "cmu3"
-"""Which of the four arrangements stands for Panoptic, of which the paper prints one column: its 24.9 mm occurs in
-tab:generalization-evaluation with CMU3's cameras alone."""
+"""Which of the four arrangements stands for Panoptic, of which the paper prints one column: its
+24.9 mm occurs in tab:generalization-evaluation with CMU3's cameras alone.
+"""
 SELF = {"h36m": "h36m on h36m", PANOPTIC: f"{PANOPTIC} on {PANOPTIC}"}
 SCORED = ("weight", "most", "stochastic")
-"""The selections that a better scorer makes better; the others need none, look at the truth, or are bad on purpose."""
+"""The selections that a better scorer makes better; the others need none, look at the truth, or are
+bad on purpose.
+"""
 BASELINES = ("ransac", "adaptive_ransac", "linear", "weighted_linear", "m_estimator", "lo_ransac")
 VIEW_WEIGHTS = "view weights (not in the paper)"
 
@@ -36,19 +39,32 @@ def on_itself(setup: Setup, *names: str) -> dict[str, Cell]:
 
 def _quantitative(results: Results) -> Section:
     def actions(name: str, selection: str) -> list[Spread]:
-        found = [results.spread(name, "selections", selection, "per_action", action) for action in QUANTITATIVE]
+        found = [
+            results.spread(name, "selections", selection, "per_action", action)
+            for action in QUANTITATIVE
+        ]
         return [*found, results.relative(name, selection)]
 
     ours = actions(SELF["h36m"], "weight")
     paper = [*QUANTITATIVE.values(), QUANTITATIVE_MEAN]
-    compared = [Compared(a, p, o) for a, p, o in zip([*QUANTITATIVE, "mean"], paper, ours, strict=True)]
+    compared = [
+        Compared(a, p, o) for a, p, o in zip([*QUANTITATIVE, "mean"], paper, ours, strict=True)
+    ]
     columns = list(zip(*(number.cells() for number in compared), strict=True))
-    rows = [[f"{name} (as published)", *map("{:.1f}".format, values)] for name, values in QUANTITATIVE_OTHERS.items()]
+    rows = [
+        [f"{name} (as published)", *map("{:.1f}".format, values)]
+        for name, values in QUANTITATIVE_OTHERS.items()
+    ]
     kinds = ("weight, the paper's", "weight, ours", "difference")
     rows += [[kind, *cells] for kind, cells in zip(kinds, columns, strict=True)]
     rows.append([VIEW_WEIGHTS, *(s.text() for s in actions(SELF["h36m"], "view_weights"))])
-    rows += [[f"{NAMES.get(name, name)} on our detections", *(s.text() for s in actions(SELF["h36m"], name))]
-             for name in BASELINES]  # fmt: skip
+    rows += [
+        [
+            f"{NAMES.get(name, name)} on our detections",
+            *(s.text() for s in actions(SELF["h36m"], name)),
+        ]
+        for name in BASELINES
+    ]
     header = ["MPJPE, mm", *(QUANTITATIVE_COLUMNS[action] for action in QUANTITATIVE), "Avg"]
     text = (
         "The published rows are other systems' on real images. The embedded actions carry Human3.6M's names and are "
@@ -57,10 +73,19 @@ def _quantitative(results: Results) -> Section:
     mean = ours[-1].mean
     beaten = [name for name, values in QUANTITATIVE_OTHERS.items() if mean < values[-1]]
     claim = Claim(
-        "2.2 mm behind epipolar transformers, and ahead of most other methods without additional data", "4.2",
-        results.on_real("h36m", len(beaten) >= 4), f"{mean:.1f} mm: ahead of {len(beaten)} of 5 (29.1 mm: 4 of 5)",
-    )  # fmt: skip
-    return Section(results.words("h36m"), f"{text}\n\n{markdown(header, rows)}", {}, compared, [claim], _ACTIONS)
+        "2.2 mm behind epipolar transformers, and ahead of most other methods without additional data",
+        "4.2",
+        results.on_real("h36m", len(beaten) >= 4),
+        f"{mean:.1f} mm: ahead of {len(beaten)} of 5 (29.1 mm: 4 of 5)",
+    )
+    return Section(
+        results.words("h36m"),
+        f"{text}\n\n{markdown(header, rows)}",
+        {},
+        compared,
+        [claim],
+        _ACTIONS,
+    )
 
 
 _ACTIONS = (
@@ -70,36 +95,63 @@ _ACTIONS = (
 
 
 def _hypotheses(results: Results) -> Section:
-    tables, compared, claims = [], [], []
+    tables = []
+    compared = []
+    claims = []
     for data, test in SELF.items():
         name = "Human3.6M" if data == "h36m" else "Panoptic Studio"
         paper = QUANTITATIVE_HYPOTHESES["h36m" if data == "h36m" else "panoptic"]
         rows = [
-            Compared(NAMES.get(s, s), value, results.relative(test, s), "lower" if s in SCORED else "same")
+            Compared(
+                NAMES.get(s, s),
+                value,
+                results.relative(test, s),
+                "lower" if s in SCORED else "same",
+            )
             for s, value in paper.items()
         ]
         others = [Compared(VIEW_WEIGHTS, None, results.relative(test, "view_weights"))]
-        others += [Compared(NAMES.get(s, s), None, results.relative(test, s)) for s in BASELINES[1:]]
+        others += [
+            Compared(NAMES.get(s, s), None, results.relative(test, s)) for s in BASELINES[1:]
+        ]
         about = f"**{escaped(results.words(data))}**, trained on the same"
         tables.append(f"{about}\n\n{comparison([*rows, *others], 'hypothesis')}")
-        compared += [Compared(f"{name}, {row.what}", row.paper, row.ours, row.better) for row in rows]
-        claims += _hypotheses_claims(name, {s: results.relative(test, s).mean for s in paper}, paper)
-    gaps = {data: results.relative(t, "worst").mean - results.relative(t, "best").mean for data, t in SELF.items()}
+        compared += [
+            Compared(f"{name}, {row.what}", row.paper, row.ours, row.better) for row in rows
+        ]
+        claims += _hypotheses_claims(
+            name, {s: results.relative(test, s).mean for s in paper}, paper
+        )
+    gaps = {
+        data: results.relative(t, "worst").mean - results.relative(t, "best").mean
+        for data, t in SELF.items()
+    }
     claims.append(
-        Claim("hypotheses on Panoptic are more alike than on Human3.6M (worst - best)", "4.2",
-              gaps[PANOPTIC] < 0.5 * gaps["h36m"],
-              f"{gaps[PANOPTIC]:.1f} against {gaps['h36m']:.1f} mm (6.6 against 76.6)")
-    )  # fmt: skip
-    return Section(f"{results.words('h36m')} and {results.words(PANOPTIC)}",
-                   "\n\n".join(tables), {}, compared, claims, _explained_hypotheses(results))  # fmt: skip
+        Claim(
+            "hypotheses on Panoptic are more alike than on Human3.6M (worst - best)",
+            "4.2",
+            gaps[PANOPTIC] < 0.5 * gaps["h36m"],
+            f"{gaps[PANOPTIC]:.1f} against {gaps['h36m']:.1f} mm (6.6 against 76.6)",
+        )
+    )
+    return Section(
+        f"{results.words('h36m')} and {results.words(PANOPTIC)}",
+        "\n\n".join(tables),
+        {},
+        compared,
+        claims,
+        _explained_hypotheses(results),
+    )
 
 
 def _explained_hypotheses(results: Results) -> str:
     def ours(data: str, selection: str) -> str:
         return f"{results.relative(SELF[data], selection).mean:.1f}"
 
-    h36m, panoptic = ({s: ours(data, s) for s in ("weight", "average", "most", "least", "stochastic", "random")}
-                      for data in SELF)  # fmt: skip
+    h36m, panoptic = (
+        {s: ours(data, s) for s in ("weight", "average", "most", "least", "stochastic", "random")}
+        for data in SELF
+    )
     return (
         "The embedded detector was fitted to the learning-free rows (random, average, best, worst; RANSAC on "
         "Human3.6M), so these agree by construction and the learned rows are results. There our scorer tells "
@@ -116,17 +168,30 @@ def _hypotheses_claims(name: str, ours: dict[str, float], paper: dict[str, float
     """The sentences of section 4.2 on one data set."""
 
     def order(statement: str, low: str, high: str) -> Claim:
-        by = f"{ours[low]:.1f} < {ours[high]:.1f}" if ours[low] < ours[high] else f"{ours[low]:.1f} >= {ours[high]:.1f}"
-        return Claim(f"{name}: {statement}", "4.2", ours[low] < ours[high], f"{by} mm ({paper[low]} and {paper[high]})")
+        by = (
+            f"{ours[low]:.1f} < {ours[high]:.1f}"
+            if ours[low] < ours[high]
+            else f"{ours[low]:.1f} >= {ours[high]:.1f}"
+        )
+        return Claim(
+            f"{name}: {statement}",
+            "4.2",
+            ours[low] < ours[high],
+            f"{by} mm ({paper[low]} and {paper[high]})",
+        )
 
     without_truth = {s: e for s, e in ours.items() if s not in ("best", "worst", "ransac")}
     second = min(e for s, e in without_truth.items() if s != "weight")
     claims = [
-        Claim(f"{name}: the weighted hypothesis is the best of those that do not look at the truth", "4.2",
-              ours["weight"] < second, f"{ours['weight']:.1f} mm, the next one {second:.1f}"),
+        Claim(
+            f"{name}: the weighted hypothesis is the best of those that do not look at the truth",
+            "4.2",
+            ours["weight"] < second,
+            f"{ours['weight']:.1f} mm, the next one {second:.1f}",
+        ),
         order("most < least", "most", "least"),
         order("average < stochastic", "average", "stochastic"),
-    ]  # fmt: skip
+    ]
     if name == "Human3.6M":
         claims.append(order("RANSAC < weight (the paper's one loss)", "ransac", "weight"))
     else:
@@ -141,7 +206,9 @@ def _hypotheses_claims(name: str, ours: dict[str, float], paper: dict[str, float
 def _limitation_cells(setup: Setup) -> dict[str, Cell]:
     model = setup.trained("h36m")
     splits = {
-        split: setup.tested(model, "h36m", f"data.evaluate={split}", name=split, baselines=False, view_weights=False)
+        split: setup.tested(
+            model, "h36m", f"data.evaluate={split}", name=split, baselines=False, view_weights=False
+        )
         for split in ("train", "validation")
     }
     return splits | {"test": setup.tested(model, "h36m")}
@@ -151,23 +218,27 @@ def _limitation(results: Results) -> Section:
     rows = [Compared(split, value, results.relative(split)) for split, value in LIMITATION.items()]
     train, validation, test = (row.ours.mean for row in rows)
     claim = Claim(
-        "validation is as good as training and the test subjects are far worse: the detector has not seen them", "D",
+        "validation is as good as training and the test subjects are far worse: the detector has not seen them",
+        "D",
         abs(validation / train - 1) < 0.1 and test > 1.5 * train,
         f"{train:.1f}, {validation:.1f}, {test:.1f} mm (13.8, 14.2, 29.1)",
-    )  # fmt: skip
+    )
     note = (
         "The embedded detector is twice as precise on training and validation subjects by design, for the paper's was "
         "trained on them."
     )
     text = comparison(rows, "split of Human3.6M")
     embedded = results.setup.root("h36m") is None
-    return Section(results.words("h36m"), f"{text}\n\n{note}" if embedded else text, {}, rows, [claim])
+    return Section(
+        results.words("h36m"), f"{text}\n\n{note}" if embedded else text, {}, rows, [claim]
+    )
 
 
 def _hyperparameters(results: Results) -> Section:
     pose, camera = (_settings(results.setup, model) for model in ("pose", "camera"))
     rows = [
-        [what, paper[0] or NONE, pose[what], paper[1] or NONE, camera[what]] for what, paper in HYPERPARAMETERS.items()
+        [what, paper[0] or NONE, pose[what], paper[1] or NONE, camera[what]]
+        for what, paper in HYPERPARAMETERS.items()
     ]
     text = (
         "Read from the composed configuration. The paper prints the learning rates as 5\\*10e-4 and 10e-5; the "
@@ -179,9 +250,13 @@ def _hyperparameters(results: Results) -> Section:
 
 def _settings(setup: Setup, name: str) -> dict[str, str]:
     """tab:hyperparameters' rows of one model's configuration."""
-    config: dict[str, Any] = compose(setup.conf, "train", (f"model={name}", "data=h36m", *setup.overrides["train"]))
-    model, loss = config["model"], config["model"]["loss"]
-    samples, epochs = config["data"]["train_samples"], config["trainer"]["max_epochs"]
+    config: dict[str, Any] = compose(
+        setup.conf, "train", (f"model={name}", "data=h36m", *setup.overrides["train"])
+    )
+    model = config["model"]
+    loss = config["model"]["loss"]
+    samples = config["data"]["train_samples"]
+    epochs = config["trainer"]["max_epochs"]
     return {
         "learning rate": f"{model['optimizer']['lr']:g}",
         "temperature": str(model["temperature"]),
@@ -195,10 +270,26 @@ def _settings(setup: Setup, name: str) -> dict[str, str]:
 
 
 ITEMS = (
-    Item("quantitative", "table", "Human3.6M, action by action",
-         lambda setup: on_itself(setup, "h36m"), _quantitative),
-    Item("quantitative-hypotheses", "table", "The hypotheses compared",
-         lambda setup: on_itself(setup, *SELF), _hypotheses),
-    Item("limitation-table", "table", "Train, validation and test subjects", _limitation_cells, _limitation),
+    Item(
+        "quantitative",
+        "table",
+        "Human3.6M, action by action",
+        lambda setup: on_itself(setup, "h36m"),
+        _quantitative,
+    ),
+    Item(
+        "quantitative-hypotheses",
+        "table",
+        "The hypotheses compared",
+        lambda setup: on_itself(setup, *SELF),
+        _hypotheses,
+    ),
+    Item(
+        "limitation-table",
+        "table",
+        "Train, validation and test subjects",
+        _limitation_cells,
+        _limitation,
+    ),
     Item("hyperparameters", "table", "Hyper-parameters", lambda setup: {}, _hyperparameters),
-)  # fmt: skip
+)

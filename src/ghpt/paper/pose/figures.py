@@ -38,17 +38,26 @@ def _qualitative(results: Results) -> Section:
             chunk.truth[row].double().numpy(),
             {name: chunk.estimates[name].points[row].double().numpy() for name in SHOWN},
             up,
-            _heading(results, predictions, chunk, int(row), f"the {quantile:.0%} quantile of the errors under weight"),
+            _heading(
+                results,
+                predictions,
+                chunk,
+                int(row),
+                f"the {quantile:.0%} quantile of the errors under weight",
+            ),
         )
     order = [float(np.mean(errors[name][whole])) for name in SHOWN]
     claim = Claim(
         "weight is closest to the truth, then most, random, least",
         "4.2, figure",
         order == sorted(order),
-        ", ".join(f"{name} {error:.1f}" for name, error in zip(SHOWN, order, strict=True)) + " mm on the mean",
+        ", ".join(f"{name} {error:.1f}" for name, error in zip(SHOWN, order, strict=True))
+        + " mm on the mean",
     )
     text = "Two frames, chosen by a rule: the median and the 90 % quantile of the errors (mm) under *weight*."
-    pictures = "\n\n".join(f"![{kind} frame]({name}.svg)" for kind, name in zip(QUANTILES, figures, strict=True))
+    pictures = "\n\n".join(
+        f"![{kind} frame]({name}.svg)" for kind, name in zip(QUANTILES, figures, strict=True)
+    )
     return Section(results.words("h36m"), f"{text}\n\n{pictures}", figures, (), [claim])
 
 
@@ -58,7 +67,9 @@ def _relative_errors(chunk: PredictionChunk, name: str) -> Float[np.ndarray, " N
     return torch.where(counted.all(-1), errors.mean(-1), torch.nan).numpy()
 
 
-def _heading(results: Results, predictions: Predictions, chunk: PredictionChunk, row: int, which: str) -> str:
+def _heading(
+    results: Results, predictions: Predictions, chunk: PredictionChunk, row: int, which: str
+) -> str:
     take = predictions.recording_name[int(chunk.recording[row])]
     return f"{results.words('h36m')}, test split: {take}, frame {int(chunk.frame[row])}, {which}"
 
@@ -67,28 +78,56 @@ def _pose_prior(results: Results) -> Section:
     metrics = results.read(TEST, "metrics.json")
     figure = pose_prior_bars(metrics[0], SUBJECT)
     prior = {
-        name: np.mean([[m["selections"][name]["pose_prior"][SUBJECT][part] for part in PARTS] for m in metrics], axis=0)
+        name: np.mean(
+            [
+                [m["selections"][name]["pose_prior"][SUBJECT][part] for part in PARTS]
+                for m in metrics
+            ],
+            axis=0,
+        )
         for name in ("weight", "average", "most", "least", "stochastic", "random", "best", "worst")
     }
     others = [name for name in prior if name not in ("weight", "best")]
     lowest = int(sum(prior["weight"] <= np.min([prior[name] for name in others], axis=0)))
-    second = int(sum(prior["average"] <= np.min([prior[n] for n in others if n != "average"], axis=0)))
+    second = int(
+        sum(prior["average"] <= np.min([prior[n] for n in others if n != "average"], axis=0))
+    )
     ratio = _ratio(prior["weight"], prior["best"])
     claims = [
-        Claim("the pose prior is generally lowest for weight", "4.3", lowest > len(PARTS) / 2,
-              f"in {lowest} of {len(PARTS)} parts, best left aside"),
-        Claim("followed by the average", "4.3", second > len(PARTS) / 2, f"second in {second} of {len(PARTS)} parts"),
-        Claim("most < least: the scorer has learned symmetry", "4.3", bool((prior["most"] < prior["least"]).all()),
-              f"in {sum(prior['most'] < prior['least'])} of {len(PARTS)} parts, "
-              f"{_ratio(prior['least'], prior['most']):.1f} times on the mean"),
-        Claim("best is comparable to weight", "4.3", 0.5 < ratio < 2, f"weight / best = {ratio:.2f} on the mean"),
-    ]  # fmt: skip
+        Claim(
+            "the pose prior is generally lowest for weight",
+            "4.3",
+            lowest > len(PARTS) / 2,
+            f"in {lowest} of {len(PARTS)} parts, best left aside",
+        ),
+        Claim(
+            "followed by the average",
+            "4.3",
+            second > len(PARTS) / 2,
+            f"second in {second} of {len(PARTS)} parts",
+        ),
+        Claim(
+            "most < least: the scorer has learned symmetry",
+            "4.3",
+            bool((prior["most"] < prior["least"]).all()),
+            f"in {sum(prior['most'] < prior['least'])} of {len(PARTS)} parts, "
+            f"{_ratio(prior['least'], prior['most']):.1f} times on the mean",
+        ),
+        Claim(
+            "best is comparable to weight",
+            "4.3",
+            0.5 < ratio < 2,
+            f"weight / best = {ratio:.2f} on the mean",
+        ),
+    ]
     text = (
         f"Variance over the frames of {SUBJECT} of the ratio of left to right length, six pairs of parts, eight "
         "hypotheses. The paper prints no numbers here, so there is nothing to set beside them but its sentences."
     )
     table = markdown(*prior_table(metrics[0], SUBJECT))
-    body = f"{text}\n\n![pose prior](pose-prior.svg)\n\n1000 S², seed {results.setup.seed}:\n\n{table}"
+    body = (
+        f"{text}\n\n![pose prior](pose-prior.svg)\n\n1000 S², seed {results.setup.seed}:\n\n{table}"
+    )
     return Section(results.words("h36m"), body, {"pose-prior": figure}, (), claims)
 
 

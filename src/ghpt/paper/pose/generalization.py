@@ -18,8 +18,12 @@ from ghpt.report.tables import markdown, max_difference
 PANOPTIC = ARRANGEMENTS[:4]
 
 
-def grid(setup: Setup, trained: Sequence[str] = ARRANGEMENTS, tested: Sequence[str] = ARRANGEMENTS) -> dict[str, Cell]:
-    """Every training set with every test set: ``"cmu1 on h36m"``; classical estimators where the two are the same."""
+def grid(
+    setup: Setup, trained: Sequence[str] = ARRANGEMENTS, tested: Sequence[str] = ARRANGEMENTS
+) -> dict[str, Cell]:
+    """Every training set with every test set: ``"cmu1 on h36m"``; classical estimators where the
+    two are the same.
+    """
     models = {data: setup.trained(data) for data in trained}
     return {
         f"{train} on {test}": setup.tested(models[train], test, baselines=train == test)
@@ -28,18 +32,32 @@ def grid(setup: Setup, trained: Sequence[str] = ARRANGEMENTS, tested: Sequence[s
 
 
 def _generalization(results: Results) -> Section:
-    rows, compared = [], []
+    rows = []
+    compared = []
     for test in ARRANGEMENTS:
         numbers = [
-            Compared(f"{a.upper()} on {test.upper()}", GENERALIZATION[a, test], results.relative(f"{a} on {test}"))
+            Compared(
+                f"{a.upper()} on {test.upper()}",
+                GENERALIZATION[a, test],
+                results.relative(f"{a} on {test}"),
+            )
             for a in ARRANGEMENTS
         ]
-        last = [f"{GENERALIZATION_MAX_DIFFERENCE[test]:.1f} %", f"{_difference(results, test).text()} %", ""]
+        last = [
+            f"{GENERALIZATION_MAX_DIFFERENCE[test]:.1f} %",
+            f"{_difference(results, test).text()} %",
+            "",
+        ]
         columns = zip(*(number.cells() for number in numbers), strict=True)
         for kind, cells, end in zip(("paper", "ours", "difference"), columns, last, strict=True):
             rows.append([f"{test.upper()}, {kind}", *cells, end])
-        rows.append([f"{test.upper()}, average of the pool",
-                     *(results.relative(f"{a} on {test}", "average").text() for a in ARRANGEMENTS), ""])  # fmt: skip
+        rows.append(
+            [
+                f"{test.upper()}, average of the pool",
+                *(results.relative(f"{a} on {test}", "average").text() for a in ARRANGEMENTS),
+                "",
+            ]
+        )
         compared += numbers
     header = ["test, mm \\ train", *(name.upper() for name in ARRANGEMENTS), "max. diff."]
     text = (
@@ -49,10 +67,19 @@ def _generalization(results: Results) -> Section:
     intra = max(_difference(results, test).mean for test in PANOPTIC)
     inter = _difference(results, "h36m").mean
     claims = [
-        Claim("intra-dataset: performance on Panoptic within 5 %, whatever the training set", "4.1", intra < 5,
-              f"largest difference {intra:.1f} % (4.4 %)"),
-        Claim("inter-dataset, to Human3.6M: at most 15.1 % apart", "4.1", inter <= 15.15, f"{inter:.1f} % (15.1 %)"),
-    ]  # fmt: skip
+        Claim(
+            "intra-dataset: performance on Panoptic within 5 %, whatever the training set",
+            "4.1",
+            intra < 5,
+            f"largest difference {intra:.1f} % (4.4 %)",
+        ),
+        Claim(
+            "inter-dataset, to Human3.6M: at most 15.1 % apart",
+            "4.1",
+            inter <= 15.15,
+            f"{inter:.1f} % (15.1 %)",
+        ),
+    ]
     averages = [results.relative(f"{test} on {test}", "average").mean for test in PANOPTIC]
     weights = [results.relative(f"{a} on {b}").mean for a, b in product(ARRANGEMENTS, PANOPTIC)]
     explained = (
@@ -70,9 +97,18 @@ def four(results: Results) -> str:
 
 
 def _difference(results: Results, test: str) -> Spread:
-    return over_seeds(lambda *row: max_difference(row), *(results.relative(f"{a} on {test}") for a in ARRANGEMENTS))
+    return over_seeds(
+        lambda *row: max_difference(row),
+        *(results.relative(f"{a} on {test}") for a in ARRANGEMENTS),
+    )
 
 
 ITEMS = (
-    Item("generalization-evaluation", "table", "Generalisation between camera arrangements", grid, _generalization),
+    Item(
+        "generalization-evaluation",
+        "table",
+        "Generalisation between camera arrangements",
+        grid,
+        _generalization,
+    ),
 )

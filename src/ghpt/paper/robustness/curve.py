@@ -45,16 +45,31 @@ class Curve:
         sizes = setup.sizes["robustness"]
         more = {name: sizes[f"{self.name}_{name}"] for name in self.more}
         target = f"{PERTURBATIONS}.{self.perturbation}"
-        perturbations = [{"_target_": target, self.setting: level, **more} for level in self.levels(setup) if level]
+        perturbations = [
+            {"_target_": target, self.setting: level, **more}
+            for level in self.levels(setup)
+            if level
+        ]
         return measured(setup, self.name, self.data, perturbations)
 
 
-def measured(setup: Setup, name: str, data: str, perturbations: Sequence[dict[str, Any] | None]) -> Cell:
+def measured(
+    setup: Setup, name: str, data: str, perturbations: Sequence[dict[str, Any] | None]
+) -> Cell:
     """Everybody under each of the perturbations."""
     sizes = setup.sizes["robustness"]
-    whole = setup.composed("test", data, *setup.overrides["test"], f"data.stride={sizes['stride'][data]}")
-    config = {key: whole[key] for key in ("data", "view_weights", "baselines", "seed", "files") if key in whole}
-    config |= {"perturbations": list(perturbations), "code of perturbations": code_digest(PERTURBATIONS)}
+    whole = setup.composed(
+        "test", data, *setup.overrides["test"], f"data.stride={sizes['stride'][data]}"
+    )
+    config = {
+        key: whole[key]
+        for key in ("data", "view_weights", "baselines", "seed", "files")
+        if key in whole
+    }
+    config |= {
+        "perturbations": list(perturbations),
+        "code of perturbations": code_digest(PERTURBATIONS),
+    }
     needs = {"model": setup.trained(sizes["trained_on"]), "data": setup.prepared(data, "test")}
     seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
     name = f"robustness-{name}-seed{setup.seed}"
@@ -112,10 +127,17 @@ def found(results: Results, curve: Curve) -> Found:
         values = (own[i][name][kind] for own in seeds)
         return Spread(tuple(float("nan") if value is None else value for value in values))
 
-    errors = {kind: {name: [spread(kind, name, i) for i in range(len(levels))] for name in names}
-              for kind in ("relative", "absolute")}  # fmt: skip
-    shares = [[own[i][name]["coverage"]["relative"] for own in seeds for name in names] for i in range(len(levels))]
+    errors = {
+        kind: {name: [spread(kind, name, i) for i in range(len(levels))] for name in names}
+        for kind in ("relative", "absolute")
+    }
+    shares = [
+        [own[i][name]["coverage"]["relative"] for own in seeds for name in names]
+        for i in range(len(levels))
+    ]
     return Found(
-        [f"{curve.times * level:g}" for level in levels], [curve.times * level for level in levels], errors,
+        [f"{curve.times * level:g}" for level in levels],
+        [curve.times * level for level in levels],
+        errors,
         [(min(s), max(s)) for s in shares],
-    )  # fmt: skip
+    )

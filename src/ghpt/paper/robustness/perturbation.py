@@ -1,8 +1,10 @@
-"""What can be wrong with detections and cameras, put on top of what a data set has: pure functions of a batch.
+"""What can be wrong with detections and cameras, put on top of what a data set has: pure functions
+of a batch.
 
-Each is called as ``perturbation(batch, seed)``. A draw is a function of the seed, its purpose, the sample and the
-camera's place in the rig, and not of the level: levels are nested (the outliers at 10 % are among those at 20 %, noise
-and rotations only grow), and everybody who is tested at a level gets the same key points. The truth stays as it is.
+Each is called as ``perturbation(batch, seed)``. A draw is a function of the seed, its purpose, the
+sample and the camera's place in the rig, and not of the level: levels are nested (the outliers at
+10 % are among those at 20 %, noise and rotations only grow), and everybody who is tested at a level
+gets the same key points. The truth stays as it is.
 """
 
 from collections.abc import Callable
@@ -24,8 +26,10 @@ Perturbation = Callable[[KeyPointBatch, int], KeyPointBatch]
 
 @dataclass(frozen=True)
 class Outliers:
-    """A share ``rate`` of the seen detections is found elsewhere: moved in a random direction, by a length between
-    ``shortest`` and ``longest`` fractions of the person's size in the image. The confidence does not know."""
+    """A share ``rate`` of the seen detections is found elsewhere: moved in a random direction, by a
+    length between ``shortest`` and ``longest`` fractions of the person's size in the image. The
+    confidence does not know.
+    """
 
     rate: float
     shortest: float
@@ -36,14 +40,20 @@ class Outliers:
 
     def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
         draw = uniform(_keys(batch, seed, "outliers"), (batch.seen.shape[-1], 3))
-        length = torch.where(draw[..., 0] < self.rate, self.shortest + (self.longest - self.shortest) * draw[..., 1], 0)
+        length = torch.where(
+            draw[..., 0] < self.rate,
+            self.shortest + (self.longest - self.shortest) * draw[..., 1],
+            0,
+        )
         turn = 2 * torch.pi * draw[..., 2]
         return _moved(batch, length[..., None] * torch.stack((turn.cos(), turn.sin()), dim=-1))
 
 
 @dataclass(frozen=True)
 class Noise:
-    """Gaussian noise on every seen detection, in each coordinate of deviation ``deviation`` x the person's size."""
+    """Gaussian noise on every seen detection, in each coordinate of deviation ``deviation`` x the
+    person's size.
+    """
 
     deviation: float
 
@@ -86,20 +96,26 @@ class FewerCameras:
     def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
         chosen = _order(batch, seed, "cameras")[:, : self.count]
         row = torch.arange(len(batch), device=chosen.device)[:, None]
-        kept = {name: getattr(batch, name)[row, chosen] for name in ("key_points", "confidence", "seen")}
+        kept = {
+            name: getattr(batch, name)[row, chosen] for name in ("key_points", "confidence", "seen")
+        }
         return replace(batch, cameras=batch.cameras.index((row, chosen)), **kept)
 
 
 @dataclass(frozen=True)
 class RotatedCameras:
-    """Each camera of each frame is thought to be turned by ``degrees`` about a random axis through its centre."""
+    """Each camera of each frame is thought to be turned by ``degrees`` about a random axis through
+    its centre.
+    """
 
     degrees: float
 
     def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
         axis = _directions(_keys(batch, seed, "rotated cameras"))
         turn = vector_to_matrix(torch.deg2rad(torch.tensor(self.degrees, dtype=axis.dtype)) * axis)
-        K, R, t = batch.cameras.K, batch.cameras.R, batch.cameras.t
+        K = batch.cameras.K
+        R = batch.cameras.R
+        t = batch.cameras.t
         return replace(batch, cameras=Cameras(K, turn @ R, (turn @ t[..., None])[..., 0]))
 
 
@@ -111,7 +127,9 @@ class ShiftedCameras:
 
     def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
         shift = self.millimetres * _directions(_keys(batch, seed, "shifted cameras"))
-        K, R, t = batch.cameras.K, batch.cameras.R, batch.cameras.t
+        K = batch.cameras.K
+        R = batch.cameras.R
+        t = batch.cameras.t
         return replace(batch, cameras=Cameras(K, R, t - (R @ shift[..., None])[..., 0]))
 
 
@@ -122,7 +140,9 @@ def _check_share(rate: float) -> None:
 def _keys(batch: KeyPointBatch, seed: int, purpose: str) -> Int[Tensor, "B V"]:
     device = batch.sample.device
     camera = torch.arange(batch.seen.shape[1], device=device)
-    return key(seed, purpose, *torch.broadcast_tensors(batch.sample[:, None], camera), device=device)
+    return key(
+        seed, purpose, *torch.broadcast_tensors(batch.sample[:, None], camera), device=device
+    )
 
 
 def _order(batch: KeyPointBatch, seed: int, purpose: str) -> Int[Tensor, "B V"]:

@@ -1,4 +1,6 @@
-"""The work of the robustness curves: estimators on one data set under each of several perturbations."""
+"""The work of the robustness curves: estimators on one data set under each of several
+perturbations.
+"""
 
 import math
 from collections.abc import Callable, Mapping
@@ -29,11 +31,11 @@ Estimator = Callable[[KeyPointBatch], PoseEstimate]
 
 @torch.no_grad()
 def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Estimate ``config["data"]`` under each of ``config["perturbations"]`` (None: as it is) with the model of
-    ``needs["model"]``, ``config["view_weights"]`` and ``config["baselines"]``.
+    """Estimate ``config["data"]`` under each of ``config["perturbations"]`` (None: as it is) with
+    the model of ``needs["model"]``, ``config["view_weights"]`` and ``config["baselines"]``.
 
-    result.json: for each perturbation, estimator -> MPJPE (mm) ``relative`` and ``absolute``, and the ``coverage`` of
-    each: the share of the joints with a truth that were counted.
+    result.json: for each perturbation, estimator -> MPJPE (mm) ``relative`` and ``absolute``, and
+    the ``coverage`` of each: the share of the joints with a truth that were counted.
     """
     data = build(config["data"], "data")
     data.setup("test")
@@ -45,11 +47,17 @@ def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
     for first in range(0, len(frames), data.batch_size):
         batch = frames[range(first, min(first + data.batch_size, len(frames)))]
         for errors, perturbation in zip(levels, perturbations, strict=True):
-            found = everybody(batch if perturbation is None else perturbation(batch, config["seed"]))
+            found = everybody(
+                batch if perturbation is None else perturbation(batch, config["seed"])
+            )
             for name, estimate in found.items():
-                metrics = errors.setdefault(name, {kind: MPJPE(kind, 1, len(JOINTS)) for kind in KINDS})
+                metrics = errors.setdefault(
+                    name, {kind: MPJPE(kind, 1, len(JOINTS)) for kind in KINDS}
+                )
                 for metric in metrics.values():
-                    metric.update(estimate, batch.truth, batch.truth_seen, torch.zeros_like(batch.sample))
+                    metric.update(
+                        estimate, batch.truth, batch.truth_seen, torch.zeros_like(batch.sample)
+                    )
     content = [{name: _numbers(metrics) for name, metrics in errors.items()} for errors in levels]
     write_json(folder / "result.json", {"frames": len(frames), "levels": content})
 
@@ -62,7 +70,10 @@ def together(
     def estimate(batch: KeyPointBatch) -> dict[str, PoseEstimate]:
         keys = model.keys("test", batch)
         pool = model.pool(batch, keys)
-        weights = {n: selection_weights(n, pool.logits, pool.errors, model.temperature, keys) for n in OF_POOL}
+        weights = {
+            n: selection_weights(n, pool.logits, pool.errors, model.temperature, keys)
+            for n in OF_POOL
+        }
         of_pool = {name: model.problem.combine(pool.hypotheses, w) for name, w in weights.items()}
         return of_pool | {name: estimator(batch) for name, estimator in others.items()}
 
