@@ -1,7 +1,7 @@
 """Peak memory of training and of testing, each a process of its own: ``python
 benchmarks/memory.py`` (Linux).
 
-Training is ``train.py data=cmu2 model=pose`` as typed: once with the preparation of the embedded
+Training is ``train.py data=cmu2 model=pose`` as typed: once with the preparation of the synthetic
 data, once from the cache. Testing runs that checkpoint with all baselines on synthetic recordings
 of growing length; the slope says what a frame more costs. ``private`` is what the process itself
 holds; the whole also counts the pages of the memory-mapped recordings that were touched, which the

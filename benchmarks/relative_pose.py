@@ -6,7 +6,7 @@ conf/camera_baselines. Only their own calls are timed, not how their input is pr
 that too. They take turns in one run, so that a busy machine slows both; the ratio is the median
 over the rounds. The second: calibration of rigs of 4 and of 31 cameras.
 
-The correspondences are of the embedded (synthetic) Human3.6M and Panoptic (test splits; the first
+The correspondences are of the synthetic Human3.6M and Panoptic (test splits; the first
 run prepares them).
 
 Settings: ``frames=80`` ``batch=12`` (pairs; two draws of a rig of four cameras) ``rounds=15``
@@ -30,7 +30,7 @@ THEIRS = ("usac_accurate", "poselib")
 
 
 def draws(data: str, frames: int, count: int) -> Pairs:
-    """``count`` draws of M frames for each rig of the embedded test split."""
+    """``count`` draws of M frames for each rig of the synthetic test split."""
     module = build(configuration("test", f"data={data}")["data"], "data")
     module.setup("test")
     return Pairs(module.frames["test"].recordings, PairSettings(frames, count, points=1), seed=0)
@@ -59,7 +59,7 @@ def race(frames: int, size: int, rounds: int) -> list[list[str]]:
         batch = pairs[range(first, first + size)]
         keys = randomness.key(0, "benchmark", batch.sample)
         start = time.perf_counter()
-        model.problem.describe(model.problem.generate(batch, model.hypotheses, keys))
+        model.problem.featurize(model.problem.generate(batch, model.hypotheses, keys))
         taken = time.perf_counter() - start
         solved = {name: sum(solve(baselines[name], batch)) for name in THEIRS}
         if number >= 0:  # the first warms up
@@ -92,7 +92,7 @@ def rigs(data: str, frames: int, count: int) -> list[str]:
     for draw in range(count):
         batch = pairs[[draw * len(pairs.pairs)]]
         names = list(pairs.rigs[0].names)
-        arrays = (x[0].transpose(0, 1) for x in (batch.key_points, batch.confidence, batch.seen))
+        arrays = (x[0].transpose(0, 1) for x in (batch.key_points, batch.confidence, batch.valid))
         start = time.perf_counter()
         estimate = calibration(names, batch.cameras.K[0], *arrays, None, 0)
         taken.append(time.perf_counter() - start)

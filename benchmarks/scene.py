@@ -62,9 +62,9 @@ def take(name: str, frames: int, cameras: Cameras, rng: np.random.Generator) -> 
         cameras=cameras,
         key_points=(pixels.numpy() + rng.normal(0, NOISE, pixels.shape)).astype(np.float32),
         confidence=rng.random((frames, views, 17), dtype=np.float32),
-        seen=rng.random((frames, views, 17)) >= 0.02,
+        valid=rng.random((frames, views, 17)) >= 0.02,
         truth=truth.astype(np.float32),
-        truth_seen=np.ones((frames, 17), bool),
+        truth_valid=np.ones((frames, 17), bool),
         frame=np.arange(frames),
     )
 
@@ -76,10 +76,10 @@ class SceneData(KeyPointDataModule):
         super().__init__(**settings)
         self.views, self.lengths = views, frames
 
-    def key(self, split: str) -> dict[str, Any]:
+    def cache_key(self, split: str) -> dict[str, Any]:
         return {"name": f"scene-{split}", "views": self.views, "frames": self.lengths[split]}
 
-    def make(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[Recording]:
         rng, cameras = np.random.default_rng(len(split)), ring(self.views)
         for first in range(0, self.lengths[split], _TAKE):
             yield take(f"{split}-{first}", min(_TAKE, self.lengths[split] - first), cameras, rng)

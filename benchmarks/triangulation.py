@@ -28,44 +28,44 @@ from ghpt.config import build
 from ghpt.data.datasets.frames import Frames
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.estimators.classical import person_size
+from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.lo_ransac import pycolmap_cameras
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
 HYPOTHESES = 200
 
 
-def batch(views: int, frames: int) -> KeyPointBatch:
+def batch(views: int, frames: int) -> Observations:
     recording = scene.take("bench", frames, scene.ring(views), np.random.default_rng(views))
     return Frames([recording], np.arange(frames))[range(frames)]
 
 
-def with_outliers(data: KeyPointBatch) -> KeyPointBatch:
+def with_outliers(data: Observations) -> Observations:
     """One detection in ten moved by 100 pixels in a random direction."""
     generator = torch.Generator().manual_seed(0)
-    shape = data.seen.shape
+    shape = data.valid.shape
     angle = 2 * torch.pi * torch.rand(shape, generator=generator)
     hit = torch.rand(shape, generator=generator) < 0.1
     offset = 100 * torch.stack((angle.cos(), angle.sin()), dim=-1) * hit[..., None]
     return replace(data, key_points=data.key_points + offset)
 
 
-def svd_loop(data: KeyPointBatch) -> Tensor:
+def svd_loop(data: Observations) -> Tensor:
     """The textbook: for each point the two rows of each view in homogeneous coordinates, and a 4x4
     SVD in NumPy.
     """
     P = (data.cameras.K @ torch.cat((data.cameras.R, data.cameras.t[..., None]), dim=-1)).numpy()
-    key_points, seen = data.key_points.double().numpy(), data.seen.numpy()
+    key_points, valid = data.key_points.double().numpy(), data.valid.numpy()
     points = np.zeros(data.truth.shape)
     for frame, joint in np.ndindex(points.shape[:2]):
-        views = seen[frame, :, joint]
+        views = valid[frame, :, joint]
         rows = key_points[frame, views, joint, :, None] * P[frame, views, 2:] - P[frame, views, :2]
         solution = np.linalg.svd(rows.reshape(-1, 4))[2][-1]
         points[frame, joint] = solution[:3] / solution[3]
     return torch.from_numpy(points)
 
 
-def pycolmap_alone(data: KeyPointBatch, threshold: float) -> Callable[[], None]:
+def pycolmap_alone(data: Observations, threshold: float) -> Callable[[], None]:
     """Its LO-RANSAC over all points, everything prepared; ``threshold`` in pixels."""
     options = pycolmap.EstimateTriangulationOptions()
     options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
@@ -75,8 +75,8 @@ def pycolmap_alone(data: KeyPointBatch, threshold: float) -> Callable[[], None]:
     for frame in range(len(data)):
         K, R, t = (x[frame].numpy() for x in (data.cameras.K, data.cameras.R, data.cameras.t))
         found = pycolmap_cameras(K, R, t, np.ones(len(K), dtype=bool))
-        for joint in range(data.seen.shape[-1]):
-            views = np.flatnonzero(data.seen[frame, :, joint])
+        for joint in range(data.valid.shape[-1]):
+            views = np.flatnonzero(data.valid[frame, :, joint])
             pixels = data.key_points[frame, views, joint].double().numpy()
             tasks.append(
                 (pixels, [found[1][v] for v in views], [found[0][v] for v in views], options)
@@ -90,7 +90,7 @@ def pycolmap_alone(data: KeyPointBatch, threshold: float) -> Callable[[], None]:
 
 
 def linearity(
-    views: int, frames: int, least: float, methods: dict[str, Callable[[KeyPointBatch], Any]]
+    views: int, frames: int, least: float, methods: dict[str, Callable[[Observations], Any]]
 ) -> list[Any]:
     rows = []
     for name, estimate in methods.items():
@@ -102,8 +102,8 @@ def linearity(
     return rows
 
 
-def error(estimate: Callable[[KeyPointBatch], Tensor], data: KeyPointBatch) -> float:
-    enough = data.seen.sum(1) >= 2
+def error(estimate: Callable[[Observations], Tensor], data: Observations) -> float:
+    enough = data.valid.sum(1) >= 2
     return (estimate(data) - data.truth).norm(dim=-1)[enough].mean().item()
 
 
@@ -122,10 +122,10 @@ def main() -> None:
     for views in map(int, wanted["views"].split(",")):
         many, few = batch(views, wanted["frames"]), batch(views, wanted["loop_frames"])
         one = batch(views, 16)
-        subsets = random_subsets(one.seen, HYPOTHESES, randomness.key(0, "benchmark", one.sample))
+        subsets = random_subsets(one.valid, HYPOTHESES, randomness.key(0, "benchmark", one.sample))
         taken = seconds(
             lambda one=one, s=subsets: triangulate_subsets(
-                one.cameras, one.key_points, one.seen, s
+                one.cameras, one.key_points, one.valid, s
             ),
             wanted["least"],
         )
@@ -138,7 +138,7 @@ def main() -> None:
                 "",
             ]
         )
-        size = person_size(few.key_points, few.seen).mean().item()
+        size = person_scale(few.key_points, few.valid).mean().item()
         taken = seconds(
             pycolmap_alone(few, baselines["lo_ransac"].threshold * size), wanted["least"]
         )

@@ -1,7 +1,7 @@
 """The camera doctor's confusion table: good rigs, each spoilt in each way; what was broken against
 what was said.
 
-``python scripts/doctor_table.py`` takes the embedded recordings; ``--real FOLDER`` adds Pose2Sim's
+``python scripts/doctor_table.py`` takes the synthetic recordings; ``--real FOLDER`` adds Pose2Sim's
 example and caliscope's recording from a folder with ``pose2sim_single`` and ``caliscope``.
 """
 
@@ -36,7 +36,7 @@ def compose(overrides: list[str]) -> dict:
         return plain(hydra.compose("cameras", [*overrides, "output=unused"]))
 
 
-def embedded(
+def synthetic(
     doctor: Doctor, names: list[str], frames: int, take: int
 ) -> Iterator[tuple[str, Case]]:
     """The middle ``frames`` frames of ``take`` recordings of each arrangement, over all of its
@@ -47,7 +47,10 @@ def embedded(
             data = build(compose([f"data={name}", f"data.evaluate={split}"])["data"], "data")
             made = {"source": data.source, "split": split}
             stored = prepared(
-                data.cache, data.key(split), lambda data=data, split=split: data.make(split), made
+                data.cache,
+                data.cache_key(split),
+                lambda data=data, split=split: data.generate(split),
+                made,
             )
             subjects = defaultdict(list)
             for recording in stored:
@@ -87,7 +90,7 @@ def main() -> None:
     parser.add_argument("--real", type=Path, help="folder with pose2sim_single and caliscope")
     options = parser.parse_args()
     doctor = build(compose([])["doctor"], "doctor")
-    cases = list(embedded(doctor, options.data, options.frames, options.take))[: options.limit]
+    cases = list(synthetic(doctor, options.data, options.frames, options.take))[: options.limit]
     if options.real:
         cases += real(doctor, options.real)
     table: dict[str, Counter] = defaultdict(Counter)
@@ -123,7 +126,7 @@ def first_views(case: Case, count: int) -> Case:
             evidence,
             names=evidence.names[:count],
             pixels=evidence.pixels[:count],
-            seen=evidence.seen[:count],
+            valid=evidence.valid[:count],
         ),
         replace(setup, **tensors),
     )

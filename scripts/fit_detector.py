@@ -1,4 +1,4 @@
-"""Fit the embedded detector's free numbers to the learning-free rows of the paper's
+"""Fit the synthetic detector's free numbers to the learning-free rows of the paper's
 tab:quantitative-hypotheses.
 
     python scripts/fit_detector.py            fit, print, write conf/detector/*.yaml
@@ -36,7 +36,7 @@ from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
 from ghpt.models.estimators.ransac import Ransac
 from ghpt.randomness import key
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 from ghpt.skeleton import PELVIS
 
 CONF = Path(__file__).resolve().parents[1] / "conf" / "detector"
@@ -51,7 +51,7 @@ FREE = {
 }
 """The outliers' size on Human3.6M and the noise on Panoptic are held: with them free too, rarer and
 larger outliers, or less noise and more outliers, fit as well, and those are unlike real detectors
-(docs/embedded.md).
+(docs/synthetic.md).
 """
 TIED = {"drift": ("bias", 0.3), "outlier_rate_occluded": ("outlier_rate", 4.0)}
 """Numbers that are kept in proportion to a free one."""
@@ -67,7 +67,7 @@ class Draw:
     body_error: tuple[np.ndarray, np.ndarray]
     processes: list[Processes]
 
-    def batch(self, detector: Detector) -> KeyPointBatch:
+    def batch(self, detector: Detector) -> Observations:
         """The detections in all views by these numbers."""
         take, count, views = self.take, len(self.points), range(len(self.processes))
         shown = detector.shown(self.points, self.body_error, take.familiar)
@@ -75,19 +75,19 @@ class Draw:
             detector.view(self.points, shown, take.rig, view, self.processes[view], take.familiar)
             for view in views
         ]
-        key_points, confidence, seen = (
+        key_points, confidence, valid = (
             torch.from_numpy(np.stack(x, axis=1)) for x in zip(*found, strict=True)
         )
         rig = take.rig.cameras
-        return KeyPointBatch(
+        return Observations(
             sample=torch.arange(count),
             recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
             key_points=key_points,
             confidence=confidence,
-            seen=seen,
+            valid=valid,
             truth=torch.from_numpy(self.points).float(),
-            truth_seen=torch.ones(self.points.shape[:2], dtype=torch.bool),
+            truth_valid=torch.ones(self.points.shape[:2], dtype=torch.bool),
         )
 
 
@@ -138,8 +138,8 @@ def views_of(data: str, rig_names: tuple[str, ...]) -> dict[str, list[int]]:
     }
 
 
-def some_views(batch: KeyPointBatch, views: list[int]) -> KeyPointBatch:
-    parts = {name: getattr(batch, name)[:, views] for name in ("key_points", "confidence", "seen")}
+def some_views(batch: Observations, views: list[int]) -> Observations:
+    parts = {name: getattr(batch, name)[:, views] for name in ("key_points", "confidence", "valid")}
     return replace(batch, cameras=batch.cameras.index((slice(None), views)), **parts)
 
 
@@ -150,10 +150,10 @@ def relative_error(points: torch.Tensor, ok: torch.Tensor, truth: torch.Tensor) 
     return (error * ok).sum(dim=-1) / ok.sum(dim=-1).clamp(min=1)
 
 
-def rows(batch: KeyPointBatch, threshold: float, seed: int) -> dict[str, torch.Tensor]:
+def rows(batch: Observations, threshold: float, seed: int) -> dict[str, torch.Tensor]:
     """The learning-free rows for each frame of a batch, mm."""
-    subsets = random_subsets(batch.seen, HYPOTHESES, key(seed, "fit", batch.sample))
-    points, ok = triangulate_subsets(batch.cameras, batch.key_points, batch.seen, subsets)
+    subsets = random_subsets(batch.valid, HYPOTHESES, key(seed, "fit", batch.sample))
+    points, ok = triangulate_subsets(batch.cameras, batch.key_points, batch.valid, subsets)
     truth = batch.truth.double()
     errors = relative_error(points, ok, truth[:, None])
     counted = ok[..., None].sum(dim=1).clamp(min=1)
@@ -264,7 +264,7 @@ def write(path: Path, detector: Detector, data: str) -> None:
     free = ", ".join((*FREE[data], *(name for name, (of, _) in TIED.items() if of in FREE[data])))
     with atomic_write(path, "w") as handle:
         handle.write(
-            f"# The embedded detector on {data}. Written by scripts/fit_detector.py, which fitted\n"
+            f"# The synthetic detector on {data}. Written by scripts/fit_detector.py, which fitted\n"
         )
         handle.write(
             f"# {free}\n# to the learning-free rows of the paper's tab:quantitative-hypotheses.\n"

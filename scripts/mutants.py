@@ -47,9 +47,9 @@ TESTS = {
     "src/ghpt/metrics/pose_prior.py": ["test_pose_prior.py"],
     "src/ghpt/metrics/relative_pose.py": ["test_relative_pose.py"],
     "src/ghpt/models/loss.py": ["test_loss.py"],
-    "src/ghpt/models/estimators/uncertainty.py": ["test_quality.py"],
+    "src/ghpt/models/estimators/uncertainty.py": ["test_uncertainty.py"],
     "src/ghpt/models/relative_pose/scale.py": ["test_scale.py"],
-    "src/ghpt/models/selection.py": ["test_selection.py"],
+    "src/ghpt/models/aggregation.py": ["test_aggregation.py"],
     "src/ghpt/calibration/observations.py": [
         "test_calibration.py::test_frames_cover_time_and_place",
         "test_calibration.py::test_noise_of_views_and_joints_is_found",

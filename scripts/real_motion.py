@@ -54,7 +54,7 @@ def main() -> None:
 
     def detect(rig: Rig, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         found = detector(poses, rig, RATE_HZ, arguments.seed, NAME, NAME)
-        return found.key_points, found.confidence, found.seen
+        return found.key_points, found.confidence, found.valid
 
     with atomic_folder(arguments.folder) as folder:
         write_panoptic_layout(

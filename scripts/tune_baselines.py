@@ -2,7 +2,7 @@
 scripts/tune_baselines.py``.
 
 Prints the pelvis-relative MPJPE of each estimator for each threshold (a fraction of the person's
-size in the image) on the embedded validation splits; conf/baselines/default.yaml holds the best on
+size in the image) on the synthetic validation splits; conf/baselines/default.yaml holds the best on
 Human3.6M. Test data are never looked at.
 """
 
@@ -49,7 +49,7 @@ def validation_batches(name: str) -> list:
 def error(estimator, batches: list) -> float:
     total = count = 0.0
     for batch in batches:
-        errors, counted = joint_errors(estimator(batch), batch.truth, batch.truth_seen, "relative")
+        errors, counted = joint_errors(estimator(batch), batch.truth, batch.truth_valid, "relative")
         total, count = total + errors.sum().item(), count + counted.sum().item()
     return total / count
 
@@ -61,7 +61,7 @@ def main() -> None:
         table = Table(
             "estimator",
             *map(str, GRID),
-            title=f"validation split of embedded {name}: relative MPJPE, mm",
+            title=f"validation split of synthetic {name}: relative MPJPE, mm",
         )
         cells = {
             (e, x): error(ESTIMATORS[e](x), batches)

@@ -2,7 +2,7 @@
 scripts/tune_camera_baselines.py``.
 
 Prints the median E_3D (mm, with the known length of t) of each estimator for each setting, for
-every pair of cameras, over random draws of 80 frames of the embedded Human3.6M's validation split
+every pair of cameras, over random draws of 80 frames of the synthetic Human3.6M's validation split
 (S8), and the time for a pair. The geometric mean over the pairs decides, so that every pair counts
 the same: conf/camera_baselines/default.yaml holds the best. Arguments, if any, are the estimators
 to tune. Test data are never looked at.

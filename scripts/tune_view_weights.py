@@ -2,7 +2,7 @@
 
     python scripts/tune_view_weights.py runs/cmu2/last.ckpt
 
-Prints the pelvis-relative MPJPE of adaptive RANSAC and of the view weights on the embedded
+Prints the pelvis-relative MPJPE of adaptive RANSAC and of the view weights on the synthetic
 validation splits, as they are and perturbed, and the geometric mean over all, by which
 conf/view_weights and conf/baselines are chosen. Test data are never looked at.
 """
@@ -71,7 +71,7 @@ def error(estimator, batches: list, condition) -> float:
     total = count = 0.0
     for batch in batches:
         errors, counted = joint_errors(
-            estimator(condition(batch, 0)), batch.truth, batch.truth_seen, "relative"
+            estimator(condition(batch, 0)), batch.truth, batch.truth_valid, "relative"
         )
         total, count = total + errors.sum().item(), count + counted.sum().item()
     return total / count

@@ -112,15 +112,15 @@ def workplace(folder: Path) -> Path:
     pixels = pixels + np.random.default_rng(0).normal(0, 1, pixels.shape)
     for name in ("pose", "walk", "run"):
         write_openpose(folder / name, rig, pixels)
-    seen = np.ones(pixels.shape[:-1], bool)
+    valid = np.ones(pixels.shape[:-1], bool)
     given = KeyPoints(
         "",
         rig.names,
         JOINTS,
         np.arange(FRAMES),
         pixels,
-        seen.astype(float),
-        seen,
+        valid.astype(float),
+        valid,
         50.0,
         (0,) * len(rig),
     )

@@ -17,7 +17,7 @@ from scenes import look_at
 
 META = {
     "data": "h36m",
-    "source": "embedded",
+    "source": "synthetic",
     "split": "test",
     "seed": 7,
     "hypotheses": 5,
@@ -25,7 +25,7 @@ META = {
     "provenance": {
         "commit": "abc",
         "checkpoint": "last.ckpt",
-        "training": {"data": "h36m", "source": "embedded"},
+        "training": {"data": "h36m", "source": "synthetic"},
     },
 }
 NAMES = ("weight", "average", "worst", "eight_point", "poselib", "rig")

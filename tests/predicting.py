@@ -49,14 +49,14 @@ def frames_of(count: int, noise: float = 1.0, gaps: float = 0.1) -> Frames:
         ) % 65521
         random = phase / 65521
         values = pixels[rows % len(pixels)] + noise * np.sin(40 * random)[..., None]
-        seen = random >= gaps
+        valid = random >= gaps
         return (
-            np.where(seen[..., None], values, 0).astype(np.float32),
-            seen.astype(np.float32),
-            seen,
+            np.where(valid[..., None], values, 0).astype(np.float32),
+            valid.astype(np.float32),
+            valid,
         )
 
-    return Frames("walk", "embedded", rig.names, rig.cameras, np.arange(count), 50.0, read)
+    return Frames("walk", "synthetic", rig.names, rig.cameras, np.arange(count), 50.0, read)
 
 
 def cameras_file(folder: Path) -> Path:

@@ -146,7 +146,7 @@ def write_panoptic_layout(
         path = folder / "hdPose3d_stage1_coco19" / f"body3DScene_{frame:08d}.json"
         path.write_text(json.dumps(scene))
     body, _ = joints17(np.nan_to_num(poses) * 10, there)
-    pixels, confidence, seen = detect(rig, body.astype(np.float64))
+    pixels, confidence, valid = detect(rig, body.astype(np.float64))
     shown = through_lens(rig, pixels.astype(np.float64))
     for view, camera in enumerate(rig.names):
         np.savez(
@@ -154,7 +154,7 @@ def write_panoptic_layout(
             frame=np.asarray(frames),
             key_points=shown[:, view].astype(np.float32),
             confidence=confidence[:, view].astype(np.float32),
-            seen=seen[:, view],
+            valid=valid[:, view],
         )
 
 

@@ -11,7 +11,7 @@ from toys import recording
 def about(joints=JOINTS, cameras=("cam_1", "cam_2", "cam_3"), rate_hz=29.97):
     return About(
         name="S1/Walking-1",
-        source="embedded",
+        source="synthetic",
         estimator="huber",
         joints=tuple(joints),
         camera_names=tuple(cameras),
@@ -39,7 +39,7 @@ def random_reconstruction(frames, joints=17, views=3, seed=0, missing=0.3, first
         views=(torch.rand(frames, views, joints, generator=g) < 0.7) & observed[:, None],
         covariance=covariance,
         score=torch.randn(frames, generator=g),
-        swapped=torch.rand(frames, views, generator=g) < 0.1,
+        flipped=torch.rand(frames, views, generator=g) < 0.1,
     )
 
 

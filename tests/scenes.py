@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
 _STANDING = {
     "right_ankle": (-120, 0, 80),
@@ -44,21 +44,21 @@ class Scene:
     points: Tensor
     key_points: Tensor
 
-    def batch(self, seen: Tensor | None = None, confidence: Tensor | None = None) -> KeyPointBatch:
+    def batch(self, valid: Tensor | None = None, confidence: Tensor | None = None) -> Observations:
         """The frames as a batch; everything seen with confidence 1 unless told."""
         shape = self.key_points.shape[:-1]
-        seen = torch.ones(shape, dtype=torch.bool) if seen is None else seen
-        return KeyPointBatch(
+        valid = torch.ones(shape, dtype=torch.bool) if valid is None else valid
+        return Observations(
             sample=torch.arange(shape[0]),
             recording=torch.zeros(shape[0], dtype=torch.int64),
             cameras=self.cameras,
             key_points=self.key_points,
-            seen=seen,
+            valid=valid,
             confidence=torch.ones(shape, dtype=self.points.dtype)
             if confidence is None
             else confidence,
             truth=self.points,
-            truth_seen=torch.ones(self.points.shape[:-1], dtype=torch.bool),
+            truth_valid=torch.ones(self.points.shape[:-1], dtype=torch.bool),
         )
 
     def noisy(self, sigma: float, seed: int) -> Scene:

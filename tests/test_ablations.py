@@ -66,7 +66,7 @@ def test_the_beginning_of_a_pool_is_the_pool_of_so_many_hypotheses(toy, tmp_path
         for name, error in errors.items():
             metric = MPJPE("relative", 1, 17)
             metric.update(
-                estimates[name], batch.truth, batch.truth_seen, torch.zeros_like(batch.sample)
+                estimates[name], batch.truth, batch.truth_valid, torch.zeros_like(batch.sample)
             )
             assert error == pytest.approx(metric.compute().mean.item(), rel=1e-5)
     assert ours[0]["best"] > ours[1]["best"] > ours[2]["best"]
@@ -157,7 +157,7 @@ def test_a_table_says_what_validation_chooses_and_what_that_is_worth(tmp_path: P
     assert "without: -19.6 %, +24.4 %, +24.4 %." in found.body
     assert "20.5 ± 0.7" in found.body
     assert "| average of the same pool " in found.body
-    assert found.data == "embedded (synthetic) Human3.6M"
+    assert found.data == "synthetic Human3.6M"
     equal = section(
         "ablation-gumbel", lambda seed, cell, split, i: 20.0 + 0.1 * ("default" in cell), tmp_path
     )
@@ -197,7 +197,7 @@ def test_a_figure_has_validation_and_test_on_logarithmic_axes(
     found = section(f"ablation-{label}", lambda seed, cell, split, i: 30.0 + i, tmp_path)
     ((name, figure),) = found.figures.items()
     assert f"]({name}.svg)" in found.body
-    assert "embedded (synthetic) Human3.6M" in figure.get_suptitle()
+    assert "synthetic Human3.6M" in figure.get_suptitle()
     assert len(figure.axes) == 2
     for axes in figure.axes:
         assert axes.get_xscale() == "log"

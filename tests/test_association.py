@@ -14,9 +14,9 @@ from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import read_people
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.people.association import associate
-from ghpt.data.people.people import KeyPoints, People, everyone
+from ghpt.data.people.people import Detections, KeyPoints, as_people
 from ghpt.data.people.tracks import tracks
-from ghpt.data.people.views import look_through, who
+from ghpt.data.people.views import undistort_and_match, who
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import motion
 from ghpt.data.synthetic.rigs import Rig, human36m_rig
@@ -50,7 +50,7 @@ def camera_file(rig: Rig, calibrated: bool = True) -> CameraFile:
     )
 
 
-def scene(detector: Detector, rig: Rig, seed: int = 1) -> tuple[People, np.ndarray]:
+def scene(detector: Detector, rig: Rig, seed: int = 1) -> tuple[Detections, np.ndarray]:
     """One who walks and one who greets, each out of each view for a while, listed in any order;
     whose each is.
     """
@@ -60,22 +60,22 @@ def scene(detector: Detector, rig: Rig, seed: int = 1) -> tuple[People, np.ndarr
         name = f"{person}-{seed}"
         points = motion(seed, name, name, action, FRAMES, 50.0)
         found = detector(points, rig, 50.0, seed, name, name)
-        there = found.seen.any(-1)
+        there = found.valid.any(-1)
         for view in range(len(rig)):
             start = rng.integers(0, FRAMES)
             there[start : start + 40, view] = False
         row, view = np.nonzero(there)
         parts.append(
-            (row, view, *(x[row, view] for x in (found.key_points, found.confidence, found.seen)))
+            (row, view, *(x[row, view] for x in (found.key_points, found.confidence, found.valid)))
         )
         owner.append(np.full(len(row), person))
-    row, view, points, sure, seen = (np.concatenate(part) for part in zip(*parts, strict=True))
+    row, view, points, sure, valid = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.lexsort((rng.random(len(row)), row, view))
     arrays = (
         x[order]
-        for x in (row, view, np.full(len(row), -1), points.astype(float), sure.astype(float), seen)
+        for x in (row, view, np.full(len(row), -1), points.astype(float), sure.astype(float), valid)
     )
-    return People(
+    return Detections(
         "pose", rig.names, SKELETONS["human36m"], np.arange(FRAMES), *arrays, 50.0
     ), np.concatenate(owner)[order]
 
@@ -104,11 +104,11 @@ def test_the_order_of_the_detections_does_not_matter(detector):
     people, _ = scene(detector, rig)
     order = np.random.default_rng(5).permutation(len(people.row))
     order = order[np.argsort(people.view[order] * FRAMES + people.row[order], kind="stable")]
-    fields = ("row", "view", "identity", "key_points", "confidence", "seen")
+    fields = ("row", "view", "identity", "key_points", "confidence", "valid")
     other = replace(people, **{name: getattr(people, name)[order] for name in fields})
-    one, again = (look_through(p, camera_file(rig)) for p in (people, other))
+    one, again = (undistort_and_match(p, camera_file(rig)) for p in (people, other))
     np.testing.assert_array_equal(one.key_points, again.key_points)
-    np.testing.assert_array_equal(one.seen, again.seen)
+    np.testing.assert_array_equal(one.valid, again.valid)
 
 
 def test_millimetres_or_metres_do_not_matter(detector):
@@ -138,8 +138,11 @@ def test_whoever_is_alone_is_taken_as_they_are(detector):
     people, owner = scene(detector, rig)
     points = people.pick(people.of(np.flatnonzero(owner == 0)))
     assert isinstance(points, KeyPoints)
-    alone = everyone(points)
-    one, other = look_through(alone, camera_file(rig)), look_through(points, camera_file(rig))
+    alone = as_people(points)
+    one, other = (
+        undistort_and_match(alone, camera_file(rig)),
+        undistort_and_match(points, camera_file(rig)),
+    )
     np.testing.assert_array_equal(one.key_points, other.key_points)
 
 
@@ -165,7 +168,7 @@ def test_identities_in_the_files_are_taken_as_they_are(tmp_path):
     for person, number in enumerate((7, 3)):
         points = people.pick(who(people, cameras, (0, 1), person))
         there = np.array([number == 7 or frame != 2 for frame in range(4)])
-        assert (points.seen.any(-1) == there[:, None]).all()
+        assert (points.valid.any(-1) == there[:, None]).all()
         expected = np.broadcast_to(
             (bodies[number][:, 0] + np.arange(4)[:, None])[:, None], (4, 2, 25)
         )

@@ -32,9 +32,9 @@ def test_the_crop_is_undone(tmp_path):
         found = read_key_points(path)
         assert (found.views, found.joints) == (("c", "a", "b"), SKELETONS["human36m"])
         assert found.frame.tolist() == [0, 5, 10, 15, 20, 25]
-        assert not found.seen[2, 1].any()
-        assert found.seen.sum() == found.seen.size - 17
-        np.testing.assert_allclose(found.key_points[found.seen], PIXELS[found.seen], atol=1e-3)
+        assert not found.valid[2, 1].any()
+        assert found.valid.sum() == found.valid.size - 17
+        np.testing.assert_allclose(found.key_points[found.valid], PIXELS[found.valid], atol=1e-3)
 
 
 def test_chunks_follow_one_another_by_number(tmp_path):
@@ -42,7 +42,7 @@ def test_chunks_follow_one_another_by_number(tmp_path):
         layout(tmp_path, frames, number)
     found = read_key_points(tmp_path)
     assert found.views == ("cam_0", "cam_1", "cam_2")
-    np.testing.assert_allclose(found.key_points[found.seen], PIXELS[found.seen], atol=1e-3)
+    np.testing.assert_allclose(found.key_points[found.valid], PIXELS[found.valid], atol=1e-3)
     (tmp_path / "all_2d_preds1.npy").unlink()
     with pytest.raises(GhptDataError, match=r"all_2d_preds1\.npy: there is no such file"):
         read_key_points(tmp_path)

@@ -104,12 +104,12 @@ def test_a_truncated_labels_file(tmp_path):
 
 
 def test_an_empty_split(tmp_path, monkeypatch):
-    make = toys.ToyData.make
+    make = toys.ToyData.generate
     monkeypatch.setattr(
-        toys.ToyData, "make", lambda self, split: [] if split == "train" else make(self, split)
+        toys.ToyData, "generate", lambda self, split: [] if split == "train" else make(self, split)
     )
     check_refused(
-        toy(), tmp_path, GhptDataError, r"embedded: train: there are no frames to prepare"
+        toy(), tmp_path, GhptDataError, r"synthetic: train: there are no frames to prepare"
     )
 
 
@@ -126,7 +126,7 @@ def test_no_frame_with_enough_joints(tmp_path):
 @pytest.mark.parametrize("place", ["key_points", "truth", "K", "R", "t"])
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_source_that_gives_what_is_not_finite(tmp_path, monkeypatch, place, value):
-    make = toys.ToyData.make
+    make = toys.ToyData.generate
 
     def broken(self, split):
         for recording in make(self, split):
@@ -137,7 +137,7 @@ def test_a_source_that_gives_what_is_not_finite(tmp_path, monkeypatch, place, va
             array[(0,) * array.ndim] = value
             yield recording
 
-    monkeypatch.setattr(toys.ToyData, "make", broken)
+    monkeypatch.setattr(toys.ToyData, "generate", broken)
     check_refused(toy(), tmp_path, GhptDataError, rf"S0/Walking-1: {place}: .*not finite")
 
 

@@ -6,10 +6,10 @@ import torch
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import Status
-from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_size
+from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_scale
 from ghpt.models.estimators.lo_ransac import LoRansac
 from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 from scenes import random_scene
 
 ROBUST = {
@@ -60,7 +60,7 @@ def test_confidence_0_is_as_good_as_not_seen():
     scene, wrong = spoilt()
     confidence = torch.where(wrong, 0.0, 0.7).double()
     weighted = WeightedLinear(power=2.0)(scene.batch(confidence=confidence))
-    masked = Linear()(scene.batch(seen=~wrong))
+    masked = Linear()(scene.batch(valid=~wrong))
     torch.testing.assert_close(weighted.points, masked.points, rtol=0, atol=1e-7)
     torch.testing.assert_close(weighted.points, scene.points, rtol=0, atol=8)
 
@@ -68,11 +68,13 @@ def test_confidence_0_is_as_good_as_not_seen():
 @each
 def test_all_cover_what_linear_covers(baseline):
     scene = random_scene(5, frames=6, views=4).noisy(3, 0)
-    seen = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.5
-    confidence = torch.zeros(seen.shape, dtype=torch.float64)
-    estimate = baseline(scene.batch(seen, confidence))
-    assert torch.equal(estimate.estimated, Linear()(scene.batch(seen)).estimated)
-    assert torch.equal(estimate.estimated, seen.sum(1) >= 2)
+    valid = (
+        torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.5
+    )
+    confidence = torch.zeros(valid.shape, dtype=torch.float64)
+    estimate = baseline(scene.batch(valid, confidence))
+    assert torch.equal(estimate.estimated, Linear()(scene.batch(valid)).estimated)
+    assert torch.equal(estimate.estimated, valid.sum(1) >= 2)
     assert torch.isfinite(estimate.points).all()
 
 
@@ -83,7 +85,15 @@ def test_a_frame_s_estimate_depends_on_no_other_frame(baseline):
     together = baseline(batch)
     parts = {
         f: getattr(batch, f)
-        for f in ("sample", "recording", "key_points", "confidence", "seen", "truth", "truth_seen")
+        for f in (
+            "sample",
+            "recording",
+            "key_points",
+            "confidence",
+            "valid",
+            "truth",
+            "truth_valid",
+        )
     }
     alone = replace(
         batch, cameras=batch.cameras.index(slice(3, 4)), **{f: x[3:4] for f, x in parts.items()}
@@ -118,17 +128,19 @@ def test_the_resolution_and_the_unit_are_nothing(baseline):
 def test_ransac_takes_the_inliers_of_the_best_pair():
     scene, wrong = spoilt(frames=2, views=5)
     estimate = ROBUST["ransac"](scene.batch())
-    expected = Linear()(scene.batch(seen=~wrong))
+    expected = Linear()(scene.batch(valid=~wrong))
     torch.testing.assert_close(estimate.points, expected.points, rtol=0, atol=1e-7)
 
 
 def test_random_pairs_are_pairs_of_seen_views():
     scene = random_scene(1, frames=4, views=9)
-    seen = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.4
-    pairs = Ransac(threshold=0.02, pairs=20, seed=0)._pairs(scene.batch(seen))
+    valid = (
+        torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.4
+    )
+    pairs = Ransac(threshold=0.02, pairs=20, seed=0)._pairs(scene.batch(valid))
     assert pairs.shape == (4, 20, 17, 9)
-    assert not (pairs & ~seen.mT[:, None]).any()
-    enough = (seen.sum(1) >= 2)[:, None].expand(-1, 20, -1)
+    assert not (pairs & ~valid.mT[:, None]).any()
+    enough = (valid.sum(1) >= 2)[:, None].expand(-1, 20, -1)
     assert (pairs.sum(-1)[enough] == 2).all()
 
 
@@ -164,10 +176,10 @@ def test_the_m_estimator_minimises_pixels_and_says_when_it_has_not_finished():
 
 def test_the_size_of_a_person_is_the_diagonal_of_what_is_seen():
     key_points = torch.tensor([[[0.0, 0], [3, 4], [100, 100]]])
-    seen = torch.tensor([[True, True, False]])
-    assert person_size(key_points, seen).tolist() == [5.0]
-    assert person_size(key_points, ~seen).tolist() == [0.0]
-    assert person_size(key_points, seen & False).tolist() == [0.0]
+    valid = torch.tensor([[True, True, False]])
+    assert person_scale(key_points, valid).tolist() == [5.0]
+    assert person_scale(key_points, ~valid).tolist() == [0.0]
+    assert person_scale(key_points, valid & False).tolist() == [0.0]
 
 
 @each
@@ -176,7 +188,7 @@ def test_a_batch_of_no_frames_gives_no_points(baseline):
     empty = {
         k: v[:0] if isinstance(v, torch.Tensor) else v.index(slice(0, 0)) for k, v in whole.items()
     }
-    estimate = baseline(KeyPointBatch(**empty))
+    estimate = baseline(Observations(**empty))
     assert estimate.points.shape == (0, 17, 3)
 
 

@@ -117,7 +117,7 @@ def test_uncertainty_is_the_size_of_the_error():
 
 def problem(views=3, seed=0):
     scene = people(frames=3, seed=seed).views(list(range(views)))
-    seen_by = observe(scene.K, scene.key_points, scene.seen, 0.01)
+    seen_by = observe(scene.K, scene.key_points, scene.valid, 0.01)
     cameras = scene.cameras
     points = scene.points.flatten(0, 1)
     rig = Rig(
@@ -125,7 +125,7 @@ def problem(views=3, seed=0):
         cameras.t / 1000,
         torch.ones(views, dtype=torch.bool),
         points / 1000,
-        seen_by.seen,
+        seen_by.valid,
     )
     return seen_by, rig
 
@@ -192,21 +192,21 @@ def test_frames_cover_time_and_place():
     scene = people(frames=80, noise=0.0)
     still = scene.key_points[:1].expand(400, -1, -1, -1)
     key_points = torch.cat((still, scene.key_points))
-    seen = torch.cat((scene.seen[:1].expand(400, -1, -1), scene.seen))
-    confidence = torch.ones(seen.shape)
-    chosen = choose_frames(key_points, confidence, seen, 40)
+    valid = torch.cat((scene.valid[:1].expand(400, -1, -1), scene.valid))
+    confidence = torch.ones(valid.shape)
+    chosen = choose_frames(key_points, confidence, valid, 40)
     assert len(chosen) == 40
     assert (chosen.diff() > 0).all()
     assert (chosen >= 400).sum() > 20  # a fifth of the time, most of the places
-    assert torch.equal(choose_frames(key_points, confidence, seen, 1000), torch.arange(480))
+    assert torch.equal(choose_frames(key_points, confidence, valid, 1000), torch.arange(480))
     confidence[400:440] = 0.1
-    assert (choose_frames(key_points, confidence, seen, 40) >= 440).sum() > (chosen >= 440).sum()
+    assert (choose_frames(key_points, confidence, valid, 40) >= 440).sum() > (chosen >= 440).sum()
 
 
 def test_noise_of_views_and_joints_is_found():
     generator = torch.Generator().manual_seed(0)
     scene = people(frames=80, noise=0.0)
-    seen_by = observe(scene.K, scene.key_points, torch.ones_like(scene.seen), 0.01)
+    seen_by = observe(scene.K, scene.key_points, torch.ones_like(scene.valid), 0.01)
     view, joint = torch.tensor([1.0, 2.0, 0.5, 1.0]), torch.ones(17)
     joint[[0, 5]] = 1.7
     sigma = (view[:, None] * joint[seen_by.joint]).double()
@@ -214,7 +214,7 @@ def test_noise_of_views_and_joints_is_found():
         sigma[..., None] * torch.randn(*sigma.shape, 2, generator=generator, dtype=torch.float64)
     ).norm(dim=-1)
     # of 2 x 4 numbers a point takes 3
-    found = reweighted(seen_by, error * (5 / 8) ** 0.5, seen_by.seen).noise / seen_by.noise
+    found = reweighted(seen_by, error * (5 / 8) ** 0.5, seen_by.valid).noise / seen_by.noise
     assert (found / sigma - 1).abs().max() < 0.12
 
 
@@ -224,7 +224,7 @@ def batch_of_pairs():
     stack = lambda f: torch.stack([f(scenes[d]) for d, _ in pairs])  # noqa: E731
     cameras = Cameras(*(stack(lambda s, n=n: getattr(s.cameras, n)) for n in ("K", "R", "t")))
     count = torch.arange(3)
-    seen = stack(lambda s: s.seen.transpose(0, 1))
+    valid = stack(lambda s: s.valid.transpose(0, 1))
     return PairBatch(
         sample=count,
         rig=torch.zeros(3, dtype=torch.int64),
@@ -232,8 +232,8 @@ def batch_of_pairs():
         pair=torch.tensor([p for _, p in pairs]),
         cameras=cameras,
         key_points=stack(lambda s: s.key_points.transpose(0, 1)),
-        confidence=torch.ones(seen.shape),
-        seen=seen,
+        confidence=torch.ones(valid.shape),
+        valid=valid,
         points=torch.zeros(3, 1, 3, dtype=torch.float64),
     )
 
@@ -264,9 +264,9 @@ def test_baseline_calibrates_a_draw_once_and_gives_its_pairs():
 
 def test_baseline_masks_a_camera_that_sees_nobody():
     batch = batch_of_pairs()
-    seen = batch.seen.clone()
-    seen[:2, 1] = False  # of the first draw
-    found = RigBaseline(CALIBRATE, remembered=4, seed=0)(replace(batch, seen=seen))
+    valid = batch.valid.clone()
+    valid[:2, 1] = False  # of the first draw
+    found = RigBaseline(CALIBRATE, remembered=4, seed=0)(replace(batch, valid=valid))
     assert found.estimated.tolist() == [False, True, True]
     assert torch.equal(found.R[0], torch.eye(3, dtype=torch.float64))
     assert not found.t[0].any()
@@ -296,7 +296,7 @@ def test_broken_numbers_of_one_camera_leave_the_others(value):
 
 def test_nobody_seen_is_said():
     scene = people(frames=5)
-    estimate = replace(scene, seen=torch.zeros_like(scene.seen)).calibrate(CALIBRATE)
+    estimate = replace(scene, valid=torch.zeros_like(scene.valid)).calibrate(CALIBRATE)
     assert not estimate.calibrated.any()
     assert not estimate.converged
     assert {"few_frames", "unlinked"} <= {d.code for d in estimate.diagnoses}

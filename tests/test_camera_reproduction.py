@@ -32,7 +32,7 @@ BY_LABEL = {item.label: item for item in ITEMS}
 PAIRS = ("1-2", "1-3", "1-4", "2-3", "2-4", "3-4")
 
 
-def embedded(seed: int = 0) -> Setup:
+def synthetic(seed: int = 0) -> Setup:
     return Setup(CONF, {"human36m": None, "panoptic": None}, NONE, SIZES, seed)
 
 
@@ -157,7 +157,7 @@ def sweep_cells(seed: int, name: str) -> dict[str, Any]:
 
 
 def test_sweep_claims_count_the_numbers_of_frames(tmp_path):
-    section = made_up([embedded()], BY_LABEL["comparison-to-8-point"], tmp_path, sweep_cells)
+    section = made_up([synthetic()], BY_LABEL["comparison-to-8-point"], tmp_path, sweep_cells)
     better, steadier = section.claims
     assert not better.holds
     assert "lower mean for 1 of 2" in better.by
@@ -167,12 +167,9 @@ def test_sweep_claims_count_the_numbers_of_frames(tmp_path):
         "below 8-point in 11 of 12, below RANSAC in 12 of 12, below PoseLib in 0 of 12 cells"
         in section.body
     )
-    assert (
-        "embedded (synthetic) Human3.6M"
-        in section.figures["comparison-to-8-point"].axes[0].get_title()
-    )
+    assert "synthetic Human3.6M" in section.figures["comparison-to-8-point"].axes[0].get_title()
     several = made_up(
-        [embedded(1), embedded(2)], BY_LABEL["comparison-to-8-point"], tmp_path, sweep_cells
+        [synthetic(1), synthetic(2)], BY_LABEL["comparison-to-8-point"], tmp_path, sweep_cells
     )
     assert [claim.holds for claim in several.claims] == [True, True]
     assert "4 draws" in several.body
@@ -218,7 +215,7 @@ def test_claims_of_the_tables(tmp_path, monkeypatch, e3d, alone, evaluated, diss
     content = metrics(dict(zip(PAIRS, e3d, strict=True)), alone)
     sections = [
         made_up(
-            [embedded()],
+            [synthetic()],
             BY_LABEL[f"fundamental-{name}"],
             tmp_path,
             lambda *_: content,
@@ -249,7 +246,7 @@ def poses(known: float, R: float, t: float, both: float) -> dict[str, dict[str, 
 def test_claims_on_unknown_extrinsics(tmp_path, base, inter, held):
     item = BY_LABEL["unknown-extrinsics-evaluation"]
     section = made_up(
-        [embedded(0), embedded(1)],
+        [synthetic(0), synthetic(1)],
         item,
         tmp_path,
         lambda _, name: base if "h36m" in name else inter,

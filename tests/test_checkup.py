@@ -43,7 +43,7 @@ def doctor(**changed):
 
 @cache
 def case(
-    views: int = 4, reach: int = 2, noise: float = 0.006, frames: int = 90
+    views: int = 4, max_shift: int = 2, noise: float = 0.006, frames: int = 90
 ) -> tuple[Evidence, Setup]:
     """A person walking before Panoptic's cameras, through their lenses; noise in sizes of the
     person, about.
@@ -54,7 +54,7 @@ def case(
     pixels, depth = project(rig.cameras.index(None), points)
     bent = distort(pixels.transpose(0, 1).flatten(1, 2), rig.cameras.K, rig.distortion)
     bent = bent.unflatten(1, points.shape[:2]).transpose(0, 1)
-    seen = (depth > 0) & (bent >= 0).all(-1) & (bent <= rig.size[:, None] - 1).all(-1)
+    valid = (depth > 0) & (bent >= 0).all(-1) & (bent <= rig.size[:, None] - 1).all(-1)
     random = torch.randn(
         bent.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )
@@ -72,10 +72,10 @@ def case(
     found = choose(
         rig.names,
         (bent + 500 * noise * random).numpy(),
-        seen.numpy(),
+        valid.numpy(),
         np.arange(frames),
         20,
-        reach,
+        max_shift,
         "",
     )
     return found, as_filed(file)
@@ -91,7 +91,7 @@ def test_a_good_rig_has_nothing_wrong(views):
 
 @cache
 def checked(kind):
-    return doctor()(*BREAKAGES[kind].spoil(case(reach=12 if kind in ("late", "early") else 2)))
+    return doctor()(*BREAKAGES[kind].spoil(case(max_shift=12 if kind in ("late", "early") else 2)))
 
 
 PUSHED = (
@@ -151,7 +151,7 @@ def test_mended_poses_are_the_true_ones():
 
 
 def test_two_mistakes_in_one_recording_are_both_found():
-    spoilt = BREAKAGES["late"].spoil(BREAKAGES["camera_to_world"].spoil(case(reach=12)))
+    spoilt = BREAKAGES["late"].spoil(BREAKAGES["camera_to_world"].spoil(case(max_shift=12)))
     checkup = doctor()(*spoilt)
     assert [finding.code for finding in checkup.findings] == ["camera_to_world", "out_of_sync"]
 
@@ -202,7 +202,7 @@ def test_frames_that_are_left_out_are_gaps():
     frame = np.delete(np.arange(21), 7)
     found = choose(("a", "b"), pixels, np.ones(pixels.shape[:-1], bool), frame, 100, 2, "")
     at = int(torch.nonzero(found.frame == 8))
-    assert found.seen[0, :, at].any(-1).tolist() == [True, False, True, True, True]
+    assert found.valid[0, :, at].any(-1).tolist() == [True, False, True, True, True]
     torch.testing.assert_close(found.pixels[1, 0, at], torch.from_numpy(pixels[6, 1]).double())
 
 
@@ -293,7 +293,7 @@ def test_cameras_without_extrinsics_are_refused():
         np.arange(30),
         values,
         np.ones(values.shape[:-1]),
-        crowd.seen.numpy(),
+        crowd.valid.numpy(),
         None,
         (0,) * 4,
     )

@@ -21,7 +21,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import ghpt.commands.test as testing
 import toys
-from ghpt.commands.train import COMMAND, train, typed
+from ghpt.commands.train import COMMAND, shell_override, train
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
@@ -80,7 +80,7 @@ def test_train_then_test_as_typed(command, tmp_path):
         "train.log",
     ]
     assert re.search(
-        r"Validation on embedded \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
+        r"Validation on synthetic \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
         said,
     )
     assert said.replace("\n", "") in re.sub(
@@ -140,7 +140,7 @@ def test_a_frame_with_too_few_views_is_missing_in_the_file_and_never_invented(co
     data.setup("test")
     enough = torch.from_numpy(
         np.concatenate(
-            [recording.seen[::3].sum(axis=1) >= 2 for recording in data.frames["test"].recordings]
+            [recording.valid[::3].sum(axis=1) >= 2 for recording in data.frames["test"].recordings]
         )
     ).numpy()
     assert 0.2 < enough.mean() < 0.9
@@ -175,7 +175,7 @@ TYPOS = {
     "data=cmu9": r"data: there is no 'cmu9'\. Did you mean 'cmu4'\? Existing: cmu1, cmu2, cmu3, cmu4, h36m, ",
     "dat=cmu1": r"dat: no such setting\. Did you mean 'data'\? ",
     "data.strid=1": r"data\.strid: no such setting in data\. Did you mean 'stride'\? ",
-    "data.embedded.detector.nois=1": r"data\.embedded\.detector\.nois: .* Did you mean 'noise'\? ",
+    "data.synthetic.detector.nois=1": r"data\.synthetic\.detector\.nois: .* Did you mean 'noise'\? ",
     "model=posee": r"model: there is no 'posee'\. Did you mean 'pose'\? ",
     "model.hypothesis=3": r"model\.hypothesis: no such setting in model\. Did you mean 'hypotheses'\? ",
     "model.scorer.layer=3": r"model\.scorer\.layer: .* Did you mean 'layers'\? ",
@@ -271,8 +271,8 @@ def test_the_trace_is_shown_to_who_asks_for_it(conf, tmp_path):
 
 
 def test_values_are_typed_as_shell_and_hydra_take_them():
-    assert typed("ckpt", "runs/1_a-2.0/last.ckpt") == "ckpt=runs/1_a-2.0/last.ckpt"
-    assert typed("ckpt", "a b/[1],x=2") == "\"ckpt='a b/[1],x=2'\""
+    assert shell_override("ckpt", "runs/1_a-2.0/last.ckpt") == "ckpt=runs/1_a-2.0/last.ckpt"
+    assert shell_override("ckpt", "a b/[1],x=2") == "\"ckpt='a b/[1],x=2'\""
 
 
 @contextmanager

@@ -63,7 +63,7 @@ def test_the_camera_problem_builds_on_every_arrangement(data):
     config = compose("train", f"data={data}", "model=camera", "model.scorer.layers=[2]")
     served = build(config["data"], "data")
     problem = build(config["model"], "model").problem
-    served.serve(problem)
+    served.bind(problem)
     assert served.pairs == problem.pairs
     assert problem.feature_size == config["model"]["problem"]["features"]
 
@@ -116,7 +116,7 @@ def test_the_adaptive_ransac_of_the_tables_is_everyone_s():
     config = compose("predict")
     users = (
         config["view_weights"]["consensus"],
-        *(config["estimator"][kind]["swaps"]["estimator"] for kind in ("classical", "learned")),
+        *(config["estimator"][kind]["flips"]["estimator"] for kind in ("classical", "learned")),
     )
     assert all(settings == config["baselines"]["adaptive_ransac"] for settings in users)
 

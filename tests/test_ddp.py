@@ -178,7 +178,7 @@ def test_an_error_in_both_processes_is_said_once(typed_for_two, tmp_path):
     child = typed_for_two("train", "data.missing=1.0", f"output={tmp_path}")
     out, errors = child.communicate(timeout=300)
     assert (child.returncode, out) == (1, "")
-    assert errors.startswith("error: embedded: toy train: no frame has a true pelvis")
+    assert errors.startswith("error: synthetic: toy train: no frame has a true pelvis")
     assert errors.count("\n") == 1
 
 

@@ -59,7 +59,7 @@ def residual(points: np.ndarray, found) -> np.ndarray:
     """Pixel error relative to the person's size in the image, T V J 2; NaN where not seen."""
     ideal, depth = project(RIG.cameras, torch.from_numpy(points))
     size = 1145.0 * stature(points) / depth[:, :, JOINT["pelvis"], None, None].numpy()
-    return np.where(found.seen[..., None], (found.key_points - ideal.numpy()) / size, np.nan)
+    return np.where(found.valid[..., None], (found.key_points - ideal.numpy()) / size, np.nan)
 
 
 def test_a_perfect_detector_sees_the_ideal_projection():
@@ -69,16 +69,16 @@ def test_a_perfect_detector_sees_the_ideal_projection():
     raw = lens.distort(ideal.transpose(0, 1).flatten(1, 2), RIG.cameras.K, RIG.distortion)
     raw = raw.unflatten(1, (len(points), len(JOINTS))).transpose(0, 1)
     inside = ((raw >= 0) & (raw <= RIG.size[:, None] - 1)).all(dim=-1).numpy()
-    assert found.seen[inside].all()
-    np.testing.assert_allclose(found.key_points[found.seen], ideal.numpy()[found.seen], atol=0.02)
+    assert found.valid[inside].all()
+    np.testing.assert_allclose(found.key_points[found.valid], ideal.numpy()[found.valid], atol=0.02)
 
 
 def test_what_is_outside_the_image_is_missed():
     found = detect(take() + np.array([0.0, 0.0, 2500.0]))
-    assert not found.seen[:, :, JOINT["head_top"]].any()
-    assert (found.key_points[~found.seen] == 0).all()
-    assert (found.confidence[~found.seen] == 0).all()
-    assert not detect(take() + np.array([0.0, 0.0, 30_000.0])).seen.any()
+    assert not found.valid[:, :, JOINT["head_top"]].any()
+    assert (found.key_points[~found.valid] == 0).all()
+    assert (found.confidence[~found.valid] == 0).all()
+    assert not detect(take() + np.array([0.0, 0.0, 30_000.0])).valid.any()
 
 
 def test_noise_has_the_size_asked_for_in_statures():
@@ -115,7 +115,7 @@ def test_bias_turns_with_the_body_and_is_the_same_in_all_views():
         np.ptp((offset[:, JOINT["left_wrist"]] * limb).sum(axis=-1) / np.linalg.norm(limb, axis=-1))
         < 40
     )
-    seen = residual(points, detect(points, bias=0.01))
+    valid = residual(points, detect(points, bias=0.01))
     expected, _ = project(
         RIG.cameras,
         torch.from_numpy(
@@ -126,7 +126,7 @@ def test_bias_turns_with_the_body_and_is_the_same_in_all_views():
     )
     ideal, depth = project(RIG.cameras, torch.from_numpy(points))
     size = 1145.0 * stature(points) / depth[:, :, JOINT["pelvis"], None, None]
-    difference = seen - ((expected - ideal) / size).numpy()
+    difference = valid - ((expected - ideal) / size).numpy()
     assert np.nanmax(np.abs(difference)) < 1e-4
 
 
@@ -187,10 +187,10 @@ def test_swaps_exchange_the_sides_of_legs_or_arms():
         JOINT[f"{side}_{part}"] for side in ("right", "left") for part in ("hip", "knee", "ankle")
     ]
     mirrored = np.linalg.norm(found.key_points - ideal[:, :, list(MIRROR)], axis=-1) < 0.5
-    swapped = wrong[..., legs].any(axis=-1) & found.seen[..., legs].all(axis=-1)
-    assert 0.005 < swapped.mean() < 0.15
-    assert mirrored[swapped][:, legs].all()
-    assert not wrong[..., JOINT["nose"]][found.seen[..., JOINT["nose"]]].any()
+    flipped = wrong[..., legs].any(axis=-1) & found.valid[..., legs].all(axis=-1)
+    assert 0.005 < flipped.mean() < 0.15
+    assert mirrored[flipped][:, legs].all()
+    assert not wrong[..., JOINT["nose"]][found.valid[..., JOINT["nose"]]].any()
 
 
 def test_confidence_knows_something_of_the_error_and_not_everything():
@@ -200,9 +200,9 @@ def test_confidence_knows_something_of_the_error_and_not_everything():
     correlation = []
     for knowledge in (0.3, 0.9):
         found = detect(points, noise=0.005, confidence_knowledge=knowledge)
-        error = np.linalg.norm(residual(points, found), axis=-1)[found.seen]
+        error = np.linalg.norm(residual(points, found), axis=-1)[found.valid]
         assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
-        correlation.append(-spearmanr(error, found.confidence[found.seen]).statistic)
+        correlation.append(-spearmanr(error, found.confidence[found.valid]).statistic)
     assert 0.15 < correlation[0] < 0.45
     assert 0.75 < correlation[1] < 0.97
 
@@ -241,9 +241,9 @@ def test_processes_are_stationary_unit_gaussians(persistence):
 def test_the_fitted_numbers_make_a_detector(name):
     detector = Detector(**yaml.safe_load((CONF / f"{name}.yaml").read_text()))
     found = detector(take(), RIG, 50.0, 0, "S9", "S9/Greeting-1")
-    assert 0.9 < found.seen.mean() <= 1.0
+    assert 0.9 < found.valid.mean() <= 1.0
     assert np.isfinite(found.key_points).all()
-    assert 0.4 < found.confidence[found.seen].mean() < 0.95
+    assert 0.4 < found.confidence[found.valid].mean() < 0.95
     assert replace(detector, bias=0.0) != detector
 
 

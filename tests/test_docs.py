@@ -20,7 +20,7 @@ from documented import PAGES, ROOT, Block, Command
 from ghpt.commands import calibrate, predict, train
 from ghpt.commands import cameras as doctor
 from ghpt.commands.overrides import check_overrides
-from ghpt.data.synthetic import recordings as embedded
+from ghpt.data.synthetic import recordings as synthetic
 from ghpt.models import registry
 
 MAINS = {
@@ -70,13 +70,13 @@ def models(tmp_path_factory):
 
 @pytest.fixture
 def small(tmp_path_factory, monkeypatch):
-    """Little embedded data, in a cache of its own, and a wide terminal."""
-    monkeypatch.setattr(embedded, "HUMAN36M_FRAMES", {"train": 16, "validation": 16, "test": 80})
+    """Little synthetic data, in a cache of its own, and a wide terminal."""
+    monkeypatch.setattr(synthetic, "HUMAN36M_FRAMES", {"train": 16, "validation": 16, "test": 80})
     monkeypatch.setattr(
-        embedded, "HUMAN36M_SUBJECTS", {"train": ("S1",), "validation": ("S8",), "test": ("S9",)}
+        synthetic, "HUMAN36M_SUBJECTS", {"train": ("S1",), "validation": ("S8",), "test": ("S9",)}
     )
-    monkeypatch.setattr(embedded, "PANOPTIC_FRAMES", 400)
-    monkeypatch.setattr(embedded, "PANOPTIC_SUBJECTS", ("P1",))
+    monkeypatch.setattr(synthetic, "PANOPTIC_FRAMES", 400)
+    monkeypatch.setattr(synthetic, "PANOPTIC_SUBJECTS", ("P1",))
     monkeypatch.setenv("GHPT_CACHE", str(tmp_path_factory.getbasetemp() / "small"))
     monkeypatch.setenv("COLUMNS", "120")
 

@@ -83,7 +83,7 @@ def test_the_page_loads_nothing_and_tells_what_it_shows(tmp_path):
     assert not re.search(r"https?://|//cdn|src=|@import|fetch\(|XMLHttp", text)
     assert "default-src 'none'" in text
     data = data_of(text)
-    assert data["title"] == "S1/Walking-1: 3D poses from embedded (synthetic) data"
+    assert data["title"] == "S1/Walking-1: 3D poses from synthetic data"
     assert [camera["name"] for camera in data["cameras"]] == ["cam_1", "cam_2", "cam_3"]
     assert "20 frames" in data["about"]
 

@@ -70,25 +70,25 @@ def test_opposite_and_collinear_cases_give_a_rotation():
 
 @pytest.mark.parametrize("missing", ["pelvis", "left_shoulder", "nose"])
 def test_a_missing_joint_is_zero_and_its_value_does_not_matter(missing):
-    x, seen = poses(), ALL.clone()
-    seen[:, JOINT[missing]] = False
+    x, valid = poses(), ALL.clone()
+    valid[:, JOINT[missing]] = False
     other = x.clone()
     other[:, JOINT[missing]] = 1e9
-    for describe in (normalised_coordinates, body_part_lengths):
-        torch.testing.assert_close(describe(x, seen), describe(other, seen))
-        assert torch.isfinite(describe(x, seen)).all()
+    for featurize in (normalised_coordinates, body_part_lengths):
+        torch.testing.assert_close(featurize(x, valid), featurize(other, valid))
+        assert torch.isfinite(featurize(x, valid)).all()
     assert torch.equal(
-        normalised_coordinates(x, seen).reshape(5, 17, 3)[:, JOINT[missing]],
+        normalised_coordinates(x, valid).reshape(5, 17, 3)[:, JOINT[missing]],
         torch.zeros(5, 3).double(),
     )
     touching = [i for i, bone in enumerate(BONES) if JOINT[missing] in bone]
     assert torch.equal(
-        body_part_lengths(x, seen)[:, touching], torch.zeros(5, len(touching)).double()
+        body_part_lengths(x, valid)[:, touching], torch.zeros(5, len(touching)).double()
     )
 
 
 def test_without_a_pelvis_the_mean_of_the_others_is_the_origin():
-    x, seen = poses(), ALL.clone()
-    seen[:, PELVIS] = False
-    centred = centre_on_pelvis(x, seen)
+    x, valid = poses(), ALL.clone()
+    valid[:, PELVIS] = False
+    centred = centre_on_pelvis(x, valid)
     torch.testing.assert_close(centred.sum(1), torch.zeros(5, 3).double(), atol=1e-9, rtol=0)

@@ -37,7 +37,7 @@ STANDING = {
 }
 PERSON = np.array([STANDING[joint] for joint in JOINTS], float)
 """Faces -y; z is up."""
-META = {"data": "h36m", "source": "embedded", "split": "test", "seed": 0, "provenance": {}}
+META = {"data": "h36m", "source": "synthetic", "split": "test", "seed": 0, "provenance": {}}
 
 
 def run(tmp_path, with_truth: bool = True):
@@ -67,10 +67,10 @@ def run(tmp_path, with_truth: bool = True):
         )
         for name in SHOWN
     }
-    seen = torch.full((40, 17), with_truth)
+    valid = torch.full((40, 17), with_truth)
     weights = {summary: torch.rand(40, generator=g) for summary in WEIGHTS}
     rows = torch.arange(40)
-    writer.write(rows, estimates, truth, seen, 0 * rows, rows, weights)
+    writer.write(rows, estimates, truth, valid, 0 * rows, rows, weights)
     writer.finish(tmp_path / "predictions.npz", [take], META)
     predictions = open_predictions(tmp_path / "predictions.npz")
     return predictions, evaluate(predictions)

@@ -23,9 +23,9 @@ def recording(name, frames, offset, views=3):
         ),
         key_points=rng.random((frames, views, 17, 2), dtype=np.float32),
         confidence=np.ones((frames, views, 17), np.float32),
-        seen=rng.random((frames, views, 17)) > 0.2,
+        valid=rng.random((frames, views, 17)) > 0.2,
         truth=rng.random((frames, 17, 3), dtype=np.float32),
-        truth_seen=np.ones((frames, 17), bool),
+        truth_valid=np.ones((frames, 17), bool),
         frame=np.arange(frames) * 10 + offset,
     )
 
@@ -41,7 +41,7 @@ def test_a_batch_is_its_frames(recordings):
     places = [(2, 6), (0, 0), (1, 0), (2, 0), (0, 4)]
     for row, (r, t) in enumerate(places):
         assert batch.recording[row] == r
-        for field in ("key_points", "confidence", "seen", "truth", "truth_seen"):
+        for field in ("key_points", "confidence", "valid", "truth", "truth_valid"):
             np.testing.assert_array_equal(
                 getattr(batch, field)[row], getattr(recordings[r], field)[t]
             )
@@ -55,10 +55,10 @@ def test_a_batch_is_its_frames(recordings):
 
 def test_trainable_needs_the_pelvis_and_enough_joints(recordings):
     first = recordings[0]
-    first.seen[:] = True
-    first.seen[1, 1:] = False  # one view only
-    first.seen[2, 1:, PELVIS] = False
-    first.truth_seen[3, :6] = False
+    first.valid[:] = True
+    first.valid[1, 1:] = False  # one view only
+    first.valid[2, 1:, PELVIS] = False
+    first.truth_valid[3, :6] = False
     frames = np.arange(5)
     assert trainable(recordings, frames, 12).tolist() == [True, False, False, False, True]
     assert trainable(recordings, frames, 11).tolist() == [True, False, False, True, True]

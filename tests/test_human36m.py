@@ -69,8 +69,8 @@ def test_round_trip_through_crop_chunks_and_lens(
         )
         assert recording.camera_names == rig.names
         assert np.abs(recording.cameras.centre.numpy() - rig.cameras.centre.numpy()).max() < 0.01
-        assert recording.seen.all()
-        assert recording.truth_seen.all()
+        assert recording.valid.all()
+        assert recording.truth_valid.all()
         assert (recording.confidence == 1).all()
         assert np.array_equal(recording.truth, poses.astype(np.float32))
         assert recording.frame.tolist() == list(range(0, 5 * len(poses), 5))
@@ -101,9 +101,9 @@ def test_a_zero_box_a_zero_height_and_nan_are_not_seen(root: Path) -> None:
     crop[0, 1, 4, 0], crop[0, 1, 5, 1] = np.nan, np.inf
     np.save(root / "S8" / "all_2d_preds0.npy", crop)
     (recording,) = read(root, "validation")
-    expected = np.ones_like(recording.seen)
+    expected = np.ones_like(recording.valid)
     expected[1, 2] = expected[3, 0] = expected[0, 1, 4] = expected[0, 1, 5] = False
-    assert np.array_equal(recording.seen, expected)
+    assert np.array_equal(recording.valid, expected)
     assert np.isfinite(recording.key_points).all()
 
 
@@ -112,7 +112,7 @@ def test_missing_truth_is_masked(root: Path) -> None:
     truth[2, 7] = np.nan
     np.save(root / "S8" / "all_3d_gt0.npy", truth)
     (recording,) = read(root, "validation")
-    assert np.argwhere(~recording.truth_seen).tolist() == [[2, 7]]
+    assert np.argwhere(~recording.truth_valid).tolist() == [[2, 7]]
     assert np.isfinite(recording.truth).all()
 
 
@@ -157,10 +157,10 @@ def test_scale_is_the_boxes_height_and_the_corner_is_x_y() -> None:
 def test_a_point_beyond_the_lens_is_not_seen() -> None:
     rig = human36m_rig("S1")
     K, distortion = rig.cameras.K[0].numpy(), rig.distortion[0].numpy()
-    pixels, seen = undistorted(
+    pixels, valid = undistorted(
         np.full((1, 2, 2), [[600.0, 600.0], [1e7, 0]]), np.ones((1, 2), bool), K, distortion
     )
-    assert seen.tolist() == [[True, False]]
+    assert valid.tolist() == [[True, False]]
     assert pixels[0, 1].tolist() == [0, 0]
 
 

@@ -245,8 +245,8 @@ def test_each_of_the_17_joints_comes_from_its_documented_places(name):
     """Points at random, so that no two means are alike."""
     points = np.random.default_rng(0).uniform(0, 1000, (1, 1, len(SKELETONS[name]), 2))
     one = np.ones(points.shape[:3])
-    found, _, seen = joints17("x", SKELETONS[name], points, one, one > 0)
-    assert seen.all()
+    found, _, valid = joints17("x", SKELETONS[name], points, one, one > 0)
+    assert valid.all()
     for joint, places in enumerate(SOURCES[name]):
         expected = points[0, 0, places].mean(0)
         np.testing.assert_allclose(found[0, 0, joint], expected, rtol=1e-6, err_msg=JOINTS[joint])
@@ -359,7 +359,7 @@ def test_a_real_standing_person_is_in_order_from_head_to_foot(name, shared_data)
         height = {}
         for part in ("eye", "shoulder", "hip", "knee", "ankle"):
             at = [place[f"{side}_{part}"] for side in ("left", "right")]
-            height[part] = np.median(found.key_points[:, view, at, 1][found.seen[:, view, at]])
+            height[part] = np.median(found.key_points[:, view, at, 1][found.valid[:, view, at]])
         assert list(height) == sorted(height, key=height.__getitem__)
 
 
@@ -383,7 +383,7 @@ def real_people(name: str, data) -> np.ndarray:
         with np.load(data / "panoptic" / "171026_pose3_joints19.npz") as stored:
             return stored["poses"][::50]
     found = read_key_points(data / RECORDINGS[name])
-    points = np.where(found.seen[..., None], found.key_points, np.nan)
+    points = np.where(found.valid[..., None], found.key_points, np.nan)
     return points.reshape(-1, *points.shape[2:])
 
 

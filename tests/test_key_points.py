@@ -14,7 +14,7 @@ from ghpt.commands.prediction.stored import open_stored
 from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import KeyPoints, read_key_points, read_people, write_key_points
 from ghpt.data.formats.skeletons import SKELETONS
-from ghpt.data.people.views import look_through, matched, normal
+from ghpt.data.people.views import matched, normal, undistort_and_match
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import project
 from ghpt.geometry.lens import distort
@@ -43,17 +43,17 @@ def camera_file(names, other=None, lens: float = 0.0) -> CameraFile:
 def key_points(views=("a", "b"), frames: int = 5, joints=SKELETONS["coco_17"]) -> KeyPoints:
     rng = np.random.default_rng(0)
     shape = (frames, len(views), len(joints))
-    seen = rng.random(shape) < 0.8
-    seen[0] = True
-    values = np.where(seen[..., None], rng.uniform(0, 1000, (*shape, 2)), 0)
+    valid = rng.random(shape) < 0.8
+    valid[0] = True
+    values = np.where(valid[..., None], rng.uniform(0, 1000, (*shape, 2)), 0)
     return KeyPoints(
         "pose",
         tuple(views),
         tuple(joints),
         np.arange(frames) * 2 + 3,
         values,
-        np.where(seen, rng.random(shape), 0),
-        seen,
+        np.where(valid, rng.random(shape), 0),
+        valid,
         60.0,
         (0,) * len(views),
     )
@@ -105,7 +105,7 @@ def test_a_rate_that_is_not_a_number_is_unknown(tmp_path):
 
 def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):
     points = key_points()
-    values = np.where(points.seen[..., None], points.key_points, np.nan)
+    values = np.where(points.valid[..., None], points.key_points, np.nan)
     np.savez(
         tmp_path / "p.npz",
         key_points=values,
@@ -113,11 +113,11 @@ def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):
         skeleton=np.array("COCO-17"),
     )
     found = read_key_points(tmp_path / "p.npz")
-    np.testing.assert_array_equal(found.seen, points.seen)
+    np.testing.assert_array_equal(found.valid, points.valid)
     assert np.isfinite(found.key_points).all()
     assert found.joints == SKELETONS["coco_17"]
     assert found.frame.tolist() == [0, 1, 2, 3, 4]
-    assert (found.confidence == points.seen).all()
+    assert (found.confidence == points.valid).all()
 
 
 @pytest.mark.parametrize(
@@ -230,13 +230,13 @@ def test_the_lens_is_undone_before_means_are_taken():
     points = replace(
         key_points(joints=joints, frames=1),
         key_points=seen_by_lens.numpy()[None],
-        seen=np.ones((1, 2, 17), bool),
+        valid=np.ones((1, 2, 17), bool),
     )
-    views = look_through(points, cameras)
+    views = undistort_and_match(points, cameras)
     mean = pixels[0, :, [joints.index("left_shoulder"), joints.index("right_shoulder")]].mean(1)
     np.testing.assert_allclose(views.key_points[0, :, 8], mean, atol=1e-3)
-    assert views.seen.all()
-    assert views.recording("x", scene.cameras.index(0)).truth_seen.sum() == 0
+    assert views.valid.all()
+    assert views.recording("x", scene.cameras.index(0)).truth_valid.sum() == 0
 
 
 def test_a_damaged_npz_is_read_or_named(tmp_path):

@@ -32,17 +32,17 @@ def test_rows_become_an_array_whatever_their_order(tmp_path):
     assert found.views == ("cam_0", "cam_2", "cam_10")
     assert found.frame.tolist() == frames
     assert found.joints == SKELETONS["mediapipe_33"]
-    np.testing.assert_array_equal(found.seen, there)
+    np.testing.assert_array_equal(found.valid, there)
     np.testing.assert_array_equal(found.key_points[there], pixels[there])
     assert (found.confidence == there).all()
 
 
 def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):
-    _, _, points, seen = read_caliscope(
+    _, _, points, valid = read_caliscope(
         table(tmp_path, "0,0,0,1.5,0,10,20,,", "0,1,0,1.5,0,,,,", "0,1,0,1.5,1,3,4,,")
     )
-    assert seen[0, :, :2].tolist() == [[True, False], [False, True]]
-    assert (points[~seen] == 0).all()
+    assert valid[0, :, :2].tolist() == [[True, False], [False, True]]
+    assert (points[~valid] == 0).all()
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_the_real_recording(shared_data):
     assert found.views == ("cam_0", "cam_1", "cam_2", "cam_3")
     rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
     body = [row for row in rows if int(row[4]) < 33]
-    assert found.seen.sum() == len(body)
+    assert found.valid.sum() == len(body)
     for row in body[:: len(body) // 50]:
         t, v, k = found.frame.tolist().index(int(row[0])), int(row[1]), int(row[4])
         assert found.key_points[t, v, k].tolist() == [float(row[5]), float(row[6])]

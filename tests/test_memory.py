@@ -40,14 +40,14 @@ def child(folder: str, frames: int) -> None:
     from ghpt.commands.test import test
 
     class Longer(toys.ToyData):
-        def make(self, split):
+        def generate(self, split):
             rng = np.random.default_rng(0)
             for take in range(frames // FRAMES):
                 yield toys.recording(
                     f"S{take}/Walking-1", f"S{take % 2}", FRAMES, self.views, self.missing, rng
                 )
 
-        def key(self, split):
+        def cache_key(self, split):
             return super().key(split) | {"frames": frames}
 
     toys.Longer = Longer

@@ -10,11 +10,11 @@ from torch.utils.data import DataLoader
 
 from ghpt import randomness
 from ghpt.errors import GhptConfigError, GhptError
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.problem import Problem
 from ghpt.models.scorer import Scorer
-from ghpt.models.selection import SELECTIONS
 
 
 @dataclass
@@ -39,13 +39,13 @@ class GuessTheNumber:
     def generate(self, batch, count, keys):
         return batch.truth[:, None] + 10 * (randomness.uniform(keys, (count,)).float() - 0.3)
 
-    def describe(self, hypotheses):
+    def featurize(self, hypotheses):
         return (hypotheses - hypotheses.round(decimals=-3))[..., None]
 
-    def combine(self, hypotheses, weights):
+    def aggregate(self, hypotheses, weights):
         return (weights * hypotheses).sum(-1)
 
-    def expand(self, hypotheses):
+    def as_estimates(self, hypotheses):
         return hypotheses
 
     def error(self, estimate, batch):
@@ -76,7 +76,7 @@ def module(**changes):
         "hypotheses": 20,
         "temperature": 1.5,
         "gumbel": True,
-        "spread": 1.5,
+        "logit_std_cap": 1.5,
         "selection": "weight",
         "seed": 0,
     }
@@ -113,7 +113,7 @@ def test_test_step_gives_every_selection_and_a_summary(tmp_path):
     batch = NumbersData().batches()[0]
     with torch.no_grad():
         estimates, summary = model.test_step(batch, 0)
-    assert tuple(estimates) == SELECTIONS
+    assert tuple(estimates) == AGGREGATIONS
     errors = {name: model.problem.error(e, batch)[0] for name, e in estimates.items()}
     for name in ("most", "least", "stochastic", "random"):
         assert (errors["best"] <= errors[name]).all()
@@ -130,7 +130,7 @@ def test_draws_do_not_depend_on_batch_mates():
     half = Numbers(batch.sample[3:7], batch.truth[3:7])
     with torch.no_grad():
         whole, part = model.test_step(batch, 0)[0], model.test_step(half, 0)[0]
-    for name in SELECTIONS:
+    for name in AGGREGATIONS:
         torch.testing.assert_close(whole[name][3:7], part[name])
 
 
@@ -146,7 +146,7 @@ def test_test_has_no_gumbel_noise_and_training_has():
 
 def test_a_loss_that_is_not_finite_stops_with_the_samples(tmp_path):
     class Broken(GuessTheNumber):
-        def describe(self, hypotheses):
+        def featurize(self, hypotheses):
             return torch.full((*hypotheses.shape, 1), torch.nan)
 
     with pytest.raises(GhptError, match=r"the loss is nan.*\[0, 1, 2"):

@@ -41,8 +41,8 @@ def test_frames_keep_their_numbers_and_gaps_stay_gaps(tmp_path):
     )
     found = read_key_points(tmp_path, **JOINTS)
     assert found.frame.tolist() == [0, 1, 2, 3, 4, 5, 7]
-    assert found.seen[:, 0, 0].tolist() == [True] * 6 + [False]
-    assert found.seen[:, 1, 0].tolist() == [True, False, True, True, False, False, True]
+    assert found.valid[:, 0, 0].tolist() == [True] * 6 + [False]
+    assert found.valid[:, 1, 0].tolist() == [True, False, True, True, False, False, True]
     np.testing.assert_allclose(
         found.key_points[[0, 2, 3, 6], 1, :, 0] - BODY[:, 0],
         np.array([[100], [102], [103], [107]]) + np.zeros(25),
@@ -56,9 +56,9 @@ def test_zeros_are_missing_and_confidence_stays_in_its_range(tmp_path):
     write(tmp_path / "cam1", [[one], []])
     write(tmp_path / "cam2", [[person()], [person()]])
     found = read_key_points(tmp_path, **JOINTS)
-    assert not found.seen[0, 0, 3]
-    assert found.seen[0, 0].sum() == 24
-    assert not found.seen[1, 0].any()
+    assert not found.valid[0, 0, 3]
+    assert found.valid[0, 0].sum() == 24
+    assert not found.valid[1, 0].any()
     assert found.confidence.max() == 1
 
 
@@ -114,7 +114,7 @@ def test_a_confidence_of_nothing_is_not_seen_wherever_the_point_is(tmp_path):
     write(tmp_path / "cam1", [[one]])
     write(tmp_path / "cam2", [[person()]])
     found = read_key_points(tmp_path, **JOINTS)
-    assert found.seen[0, 0, 2:6].tolist() == [True, False, False, True]
+    assert found.valid[0, 0, 2:6].tolist() == [True, False, False, True]
 
 
 def test_missing_joints_make_nobody_large():
@@ -242,8 +242,8 @@ def test_the_real_recording(shared_data):
     assert found.frame.tolist() == list(range(100))
     assert found.several == (100, 100, 0, 0)
     size = (
-        np.where(found.seen[..., None], found.key_points, np.inf).min(2),
-        np.where(found.seen[..., None], found.key_points, -np.inf).max(2),
+        np.where(found.valid[..., None], found.key_points, np.inf).min(2),
+        np.where(found.valid[..., None], found.key_points, -np.inf).max(2),
     )
     # of the other person, at the edge of two views, less than 500 pixels are seen
     assert (np.linalg.norm(size[1] - size[0], axis=-1) > 500).all()

@@ -50,9 +50,9 @@ def pairs(
         noise = torch.randn(
             frames, views, 17, 2, generator=torch.Generator().manual_seed(seed), dtype=torch.float64
         )
-        everyone = Cameras(*(x.expand(frames, *x.shape) for x in (rig.K, rig.R, rig.t)))
+        as_people = Cameras(*(x.expand(frames, *x.shape) for x in (rig.K, rig.R, rig.t)))
         rigs.append(rig)
-        key_points.append((project(everyone, points)[0] + sigma * noise).transpose(0, 1))
+        key_points.append((project(as_people, points)[0] + sigma * noise).transpose(0, 1))
     count = len(rigs)
     shape = (count, views, frames, 17)
     return PairBatch(
@@ -63,7 +63,7 @@ def pairs(
         cameras=Cameras(*(torch.stack([getattr(r, n) for r in rigs]) for n in ("K", "R", "t"))),
         key_points=torch.stack(key_points),
         confidence=torch.ones(shape, dtype=torch.float64),
-        seen=torch.ones(shape, dtype=torch.bool),
+        valid=torch.ones(shape, dtype=torch.bool),
         points=torch.zeros(count, 1, 3, dtype=torch.float64),
     )
 
@@ -78,7 +78,7 @@ def part(batch: PairBatch, index) -> PairBatch:
 def with_outliers(batch: PairBatch, share=0.2) -> PairBatch:
     """That share of the joints of the reference view is far off."""
     generator = torch.Generator().manual_seed(1)
-    wrong = torch.rand(batch.seen.shape, generator=generator) < share
+    wrong = torch.rand(batch.valid.shape, generator=generator) < share
     wrong[:, [0, 1]] = False
     shift = 300 * torch.randn(batch.key_points.shape, generator=generator, dtype=torch.float64)
     return replace(batch, key_points=batch.key_points + wrong[..., None] * shift)
@@ -142,12 +142,12 @@ def test_a_pair_s_estimate_depends_on_no_other_pair_and_is_the_same_again(baseli
 @each
 def test_joints_that_a_view_does_not_see_are_not_used(baseline):
     batch = pairs(sigma=1)
-    seen = torch.rand(batch.seen.shape, generator=torch.Generator().manual_seed(0)) < 0.7
-    expected = baseline(replace(batch, seen=seen))
+    valid = torch.rand(batch.valid.shape, generator=torch.Generator().manual_seed(0)) < 0.7
+    expected = baseline(replace(batch, valid=valid))
     moved = torch.where(
-        seen[..., None], batch.key_points, torch.tensor([torch.nan, 1e6], dtype=torch.float64)
+        valid[..., None], batch.key_points, torch.tensor([torch.nan, 1e6], dtype=torch.float64)
     )
-    assert equal(baseline(replace(batch, key_points=moved, seen=seen)), expected)
+    assert equal(baseline(replace(batch, key_points=moved, valid=valid)), expected)
     assert all((error < 3).all() for error in degrees(expected, batch))
 
 
@@ -214,17 +214,17 @@ DEGENERATE = {
     "all NaN": lambda: replace(
         pairs([0, 1]), key_points=torch.full((2, 3, 20, 17, 2), torch.nan).double()
     ),
-    "not seen": lambda: replace(pairs([0, 1]), seen=torch.zeros(2, 3, 20, 17, dtype=torch.bool)),
+    "not seen": lambda: replace(pairs([0, 1]), valid=torch.zeros(2, 3, 20, 17, dtype=torch.bool)),
     "never together": lambda: replace(
         pairs([0, 1]),
-        seen=torch.tensor([True, True, False])[None, :, None, None].expand(2, 3, 20, 17),
+        valid=torch.tensor([True, True, False])[None, :, None, None].expand(2, 3, 20, 17),
     ),
     "seven": lambda: replace(
-        pairs([0, 1]), seen=(torch.arange(340) < 7).reshape(20, 17).expand(2, 3, 20, 17)
+        pairs([0, 1]), valid=(torch.arange(340) < 7).reshape(20, 17).expand(2, 3, 20, 17)
     ),
     "no frames": lambda: replace(
         pairs([0, 1]),
-        seen=torch.zeros(2, 3, 0, 17, dtype=torch.bool),
+        valid=torch.zeros(2, 3, 0, 17, dtype=torch.bool),
         key_points=torch.zeros(2, 3, 0, 17, 2, dtype=torch.float64),
         confidence=torch.zeros(2, 3, 0, 17).double(),
     ),
@@ -243,7 +243,7 @@ def test_what_determines_no_pose_is_said_and_never_raises(baseline, name):
 @each
 def test_few_correspondences_are_enough(baseline):
     batch = pairs()
-    batch = replace(batch, seen=(torch.arange(340) % 20 == 0).reshape(20, 17).expand(3, 3, 20, 17))
+    batch = replace(batch, valid=(torch.arange(340) % 20 == 0).reshape(20, 17).expand(3, 3, 20, 17))
     estimate = baseline(batch)
     assert estimate.estimated.all()
     assert degrees(estimate, batch)[0].max() < 0.5
@@ -275,9 +275,9 @@ def test_the_size_in_the_image_is_the_median_over_frames_and_views():
     cameras = Cameras(K, batch.cameras.R, batch.cameras.t)
     same = replace(batch, key_points=key_points, cameras=cameras)
     torch.testing.assert_close(size_in_image(same), torch.full((3,), 10 / 200, dtype=torch.float64))
-    unseen = same.seen.clone()
+    unseen = same.valid.clone()
     unseen[1] = False
-    assert size_in_image(replace(same, seen=unseen)).tolist() == pytest.approx([0.05, 0, 0.05])
+    assert size_in_image(replace(same, valid=unseen)).tolist() == pytest.approx([0.05, 0, 0.05])
 
 
 def test_minimal_samples_are_distinct_and_fair():

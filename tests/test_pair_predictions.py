@@ -58,7 +58,7 @@ def test_numpy_alone_reads_it_and_missing_is_nan(path):
         np.testing.assert_array_equal(np.isnan(arrays["R_poselib"]).all((1, 2)), missing)
         np.testing.assert_array_equal(np.isnan(arrays["t_poselib"]).any(1), missing)
         assert arrays["t_weight"].dtype == np.float64
-        assert json.loads(str(arrays["meta"]))["source"] == "embedded"
+        assert json.loads(str(arrays["meta"]))["source"] == "synthetic"
 
 
 def test_bytes_depend_on_the_content_alone_not_on_the_order_or_the_processes(tmp_path, path):

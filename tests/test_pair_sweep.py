@@ -10,7 +10,7 @@ def test_sweep_shows_means_bands_and_the_cut():
         "weight": {m: [10.0, 12.0, 14.0] for m in (10, 20, 40)},
         "eight_point": {10: [70.0, 90.0, 200.0], 20: [20.0, 30.0, 40.0], 40: [np.inf, 1.0, 1.0]},
     }
-    figure = frames_sweep(results, "pair (2, 3) on embedded (synthetic) Human3.6M")
+    figure = frames_sweep(results, "pair (2, 3) on synthetic Human3.6M")
     (axes,) = figure.axes
     weight, eight = axes.lines
     np.testing.assert_allclose(weight.get_ydata(), 12)

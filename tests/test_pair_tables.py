@@ -12,7 +12,7 @@ from ghpt.report.pair_tables import comparison, dissection, of_paper, pair_repor
 
 
 def metrics(
-    data="h36m", source="embedded", split="test", trained="h36m", views=4, frames=80
+    data="h36m", source="synthetic", split="test", trained="h36m", views=4, frames=80
 ) -> dict:
     """A run whose errors are 1000 times the place of the pair; one pair has no median."""
     pairs = {}
@@ -86,7 +86,7 @@ def test_terminal_tables_fit_80_columns(views):
     assert max(map(len, lines)) <= 80
     assert not any("…" in line for line in lines)
     text = " ".join(" ".join(lines).split())
-    assert "embedded (synthetic) Human3.6M" in text
+    assert "synthetic Human3.6M" in text
     for name in ("weight", "8-point", "USAC_ACCURATE", "PoseLib", "rig (all views)"):
         assert any(name in line for line in lines)
 
@@ -111,7 +111,7 @@ def test_many_pairs_are_summed_up():
 def test_report_has_every_number_of_every_name():
     text = pair_report(metrics())
     assert text.startswith(
-        "# Relative camera poses on embedded (synthetic) Human3.6M, test split, trained on embedded"
+        "# Relative camera poses on synthetic Human3.6M, test split, trained on synthetic"
     )
     blocks = [block for block in text.split("\n\n") if block.startswith("|")]
     for block in blocks:

@@ -15,8 +15,8 @@ from ghpt.commands.test import summary, test
 from ghpt.commands.train import train
 from ghpt.config import plain
 from ghpt.errors import GhptConfigError
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.relative_pose.predictions import open_pairs
-from ghpt.models.selection import SELECTIONS
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SMALL = [
@@ -61,7 +61,7 @@ def test_files_table_and_events(checkpoint, tmp_path, capsys):
     metrics = test(settings(checkpoint), tmp_path)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert (metrics["problem"], metrics["frames"], metrics["draws"]) == ("camera", 8, 2)
-    assert list(metrics["selections"]) == [*SELECTIONS, "eight_point"]
+    assert list(metrics["selections"]) == [*AGGREGATIONS, "eight_point"]
     assert metrics["provenance"]["training"]["data"] == "toy"
     assert set(metrics["selections"]["weight"]["pairs"]) == {
         "1-2",
@@ -74,7 +74,7 @@ def test_files_table_and_events(checkpoint, tmp_path, capsys):
     shown = capsys.readouterr().out
     assert max(map(len, shown.splitlines())) <= 80
     assert "8-point" in shown
-    assert "embedded (synthetic) toy" in " ".join((tmp_path / "report.md").read_text().split())
+    assert "synthetic toy" in " ".join((tmp_path / "report.md").read_text().split())
     assert f"{metrics['selections']['weight']['E_3D']:.1f} mm" in summary(metrics)
     tags = EventAccumulator(str(tmp_path), size_guidance={"images": 0}).Reload().Tags()
     assert "rig" in tags["images"]

@@ -53,9 +53,9 @@ def test_a_batch_holds_the_recordings_values_of_its_frames(samples):
         assert all(len(set(positions)) == len(positions) for _, positions in frames)
         expected = np.concatenate([data[r].key_points[positions] for r, positions in frames])
         np.testing.assert_array_equal(batch.key_points[0].transpose(0, 1).numpy(), expected)
-        seen = np.concatenate([data[r].seen[positions] for r, positions in frames])
+        valid = np.concatenate([data[r].valid[positions] for r, positions in frames])
         np.testing.assert_array_equal(
-            batch.of_pair(batch.seen)[0].numpy(), seen[:, list(pair)].swapaxes(0, 1)
+            batch.of_pair(batch.valid)[0].numpy(), valid[:, list(pair)].swapaxes(0, 1)
         )
         assert torch.equal(batch.pair_cameras().t[0], data[frames[0][0]].cameras.t[list(pair)])
 
@@ -88,8 +88,8 @@ def test_frames_are_drawn_evenly():
 
 def test_a_rig_with_few_frames_fills_up_with_unseen_ones():
     batch = Pairs(recordings()[2:], PairSettings(40, 1, 5), seed=0)[[0]]
-    assert batch.seen[0, :, :30].any(-1).all()
-    assert not batch.seen[0, :, 30:].any()
+    assert batch.valid[0, :, :30].any(-1).all()
+    assert not batch.valid[0, :, 30:].any()
 
 
 def test_points_fill_the_box_of_the_true_joints():
@@ -103,7 +103,7 @@ def test_points_fill_the_box_of_the_true_joints():
 
 
 def test_without_any_true_pose_there_is_a_named_error():
-    blind = [replace(r, truth_seen=np.zeros_like(r.truth_seen)) for r in recordings()]
+    blind = [replace(r, truth_valid=np.zeros_like(r.truth_valid)) for r in recordings()]
     with pytest.raises(GhptDataError, match=r"no true pose.*calibrate\.py"):
         Pairs(blind, SETTINGS, seed=0)
 

@@ -59,8 +59,8 @@ def test_round_trip(root: Path, poses: np.ndarray, split: str, part: slice) -> N
     assert recording.camera_names == ("00_10", "00_03")
     assert np.abs(recording.cameras.t.numpy() - rig.cameras.t.numpy()).max() < 1e-9
     assert recording.frame.tolist() == FRAMES[part]
-    assert recording.seen.all()
-    assert recording.truth_seen.all()
+    assert recording.valid.all()
+    assert recording.truth_valid.all()
     assert (recording.confidence == 1).all()
     truth = expected(poses)[part]
     assert np.abs(recording.truth - truth).max() < 1e-3
@@ -68,8 +68,8 @@ def test_round_trip(root: Path, poses: np.ndarray, split: str, part: slice) -> N
 
 
 def test_left_and_right_by_name() -> None:
-    person, seen = joints17(layout.upright19()[None], np.ones((1, 19), bool))
-    assert seen.all()
+    person, valid = joints17(layout.upright19()[None], np.ones((1, 19), bool))
+    assert valid.all()
     for name, point in zip(JOINTS, person[0], strict=True):
         assert point[0] == {"l": 20, "r": -20}.get(
             name[0] if "_" in name and name != "head_top" else "", 0
@@ -120,15 +120,15 @@ def test_reads_the_real_calibration_and_bodies(shared_data: Path, tmp_path: Path
             frame=frames,
             key_points=np.full((*count, 2), 500.0),
             confidence=np.ones(count),
-            seen=np.ones(count, bool),
+            valid=np.ones(count, bool),
         )
     recording, rig = read(tmp_path, "train", ALL), panoptic_rig(ALL)
     for name in ("K", "R", "t"):
         assert np.allclose(
             getattr(recording.cameras, name), getattr(rig.cameras, name), rtol=1e-9, atol=1e-9
         )
-    assert recording.truth_seen.any(1).all()
-    assert 0 < recording.truth_seen.mean() < 1
+    assert recording.truth_valid.any(1).all()
+    assert 0 < recording.truth_valid.mean() < 1
     neck_to_pelvis = np.linalg.norm(
         recording.truth[:, JOINT["thorax"]] - recording.truth[:, JOINT["pelvis"]], axis=-1
     )
@@ -143,8 +143,8 @@ def test_missing_joints_and_what_is_made_of_them(tmp_path: Path, poses: np.ndarr
     layout.write_panoptic_layout(
         tmp_path, NAME, layout.panoptic_calibration(rig), rig, range(5), poses, layout.perfect
     )
-    truth_seen = read(tmp_path, "train", (3, 6)).truth_seen
-    missing = [{JOINTS[j] for j in np.flatnonzero(~frame)} for frame in truth_seen]
+    truth_valid = read(tmp_path, "train", (3, 6)).truth_valid
+    missing = [{JOINTS[j] for j in np.flatnonzero(~frame)} for frame in truth_valid]
     assert missing == [set(), {"head_top"}, {"thorax", "spine"}]
 
 
@@ -163,22 +163,22 @@ def test_detections_are_matched_by_frame_number(root: Path, poses: np.ndarray) -
         arrays[name] = np.concatenate([arrays[name], arrays[name][:1]])
     np.savez(path, **arrays)
     recording = read(root, "train", (3, 6))
-    assert np.flatnonzero(recording.seen[:, 0].all(1)).tolist() == [0, 3, 9]
-    assert not recording.seen[[1, 2, 4, 5, 6, 7, 8, 10, 11], 0].any()
-    assert recording.seen[:, 1].all()
+    assert np.flatnonzero(recording.valid[:, 0].all(1)).tolist() == [0, 3, 9]
+    assert not recording.valid[[1, 2, 4, 5, 6, 7, 8, 10, 11], 0].any()
+    assert recording.valid[:, 1].all()
     ideal = layout.ideal(panoptic_rig((3, 6)), expected(poses).astype(float))
     assert np.abs(recording.key_points[[0, 3, 9], 0] - ideal[[0, 3, 9], 0]).max() < 0.02
 
 
 def test_unseen_has_no_confidence_and_no_number(root: Path) -> None:
-    seen = np.ones((20, 17), bool)
-    seen[4, 5] = False
+    valid = np.ones((20, 17), bool)
+    valid[4, 5] = False
     points = np.load(root / NAME / "keypoints" / "00_03.npz")["key_points"]
     points[4, 5], points[6, 7] = np.nan, np.inf
-    rewrite(root, "00_03", seen=seen, key_points=points)
+    rewrite(root, "00_03", valid=valid, key_points=points)
     recording = read(root, "train", (3, 6))
-    assert np.argwhere(~recording.seen).tolist() == [[4, 0, 5], [6, 0, 7]]
-    assert not recording.confidence[~recording.seen].any()
+    assert np.argwhere(~recording.valid).tolist() == [[4, 0, 5], [6, 0, 7]]
+    assert not recording.confidence[~recording.valid].any()
     assert np.isfinite(recording.key_points).all()
 
 
@@ -195,7 +195,7 @@ def test_the_body_that_persists(root: Path) -> None:
         path.write_text(json.dumps(scene))
     recording = read(root, "train")
     assert not (recording.truth == 10).all(-1).any()
-    assert np.flatnonzero(~recording.truth_seen.any(1)).tolist() == [7]
+    assert np.flatnonzero(~recording.truth_valid.any(1)).tolist() == [7]
 
 
 def test_the_authors_array_gives_the_same(root: Path, poses: np.ndarray) -> None:
@@ -343,7 +343,7 @@ BAD = {
         detections(confidence=np.full((20, 17), np.nan)),
         "confidence: is not between 0 and 1",
     ),
-    "seen as number": (detections(seen=np.ones((20, 17))), "seen: holds float64, not booleans"),
+    "seen as number": (detections(valid=np.ones((20, 17))), "seen: holds float64, not booleans"),
 }
 
 

@@ -7,7 +7,7 @@ import torch
 
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.rotations import is_rotation, matrix_to_vector
-from ghpt.models.estimators.classical import person_size
+from ghpt.models.estimators.classical import person_scale
 from ghpt.paper.robustness.perturbation import (
     FewerCameras,
     MissingDetections,
@@ -18,7 +18,7 @@ from ghpt.paper.robustness.perturbation import (
     RotatedCameras,
     ShiftedCameras,
 )
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 from scenes import random_scene
 
 SEED = 3
@@ -41,23 +41,25 @@ SOMETHING = {
 }
 
 
-def a_batch(frames: int = 40, views: int = 5) -> KeyPointBatch:
+def a_batch(frames: int = 40, views: int = 5) -> Observations:
     """A tenth of the detections not seen, and nonsense in their place."""
     scene = random_scene(0, frames, views)
-    seen = torch.rand(frames, views, 17, generator=torch.Generator().manual_seed(1)) > 0.1
-    batch = scene.batch(seen)
-    return replace(batch, key_points=torch.where(seen[..., None], batch.key_points, -7.0))
+    valid = torch.rand(frames, views, 17, generator=torch.Generator().manual_seed(1)) > 0.1
+    batch = scene.batch(valid)
+    return replace(batch, key_points=torch.where(valid[..., None], batch.key_points, -7.0))
 
 
-def tensors(batch: KeyPointBatch) -> dict[str, torch.Tensor]:
+def tensors(batch: Observations) -> dict[str, torch.Tensor]:
     own = {f.name: getattr(batch, f.name) for f in fields(batch) if f.name != "cameras"}
     return own | {name: getattr(batch.cameras, name) for name in ("K", "R", "t")}
 
 
-def moved(before: KeyPointBatch, after: KeyPointBatch) -> torch.Tensor:
+def moved(before: Observations, after: Observations) -> torch.Tensor:
     """How far each seen key point went, in the person's size."""
-    size = person_size(before.key_points, before.seen)[..., None]
-    return torch.where(before.seen, (after.key_points - before.key_points).norm(dim=-1) / size, 0.0)
+    size = person_scale(before.key_points, before.valid)[..., None]
+    return torch.where(
+        before.valid, (after.key_points - before.key_points).norm(dim=-1) / size, 0.0
+    )
 
 
 @pytest.mark.parametrize("perturbation", NOTHING.values(), ids=NOTHING)
@@ -73,7 +75,7 @@ def test_a_frame_is_the_same_in_any_batch_and_differs_from_others(
 ) -> None:
     batch = a_batch()
     rows = torch.tensor([31, 4, 17])
-    few = KeyPointBatch(
+    few = Observations(
         cameras=batch.cameras.index(rows),
         **{f.name: getattr(batch, f.name)[rows] for f in fields(batch) if f.name != "cameras"},
     )
@@ -86,9 +88,9 @@ def test_a_frame_is_the_same_in_any_batch_and_differs_from_others(
 @pytest.mark.parametrize("perturbation", SOMETHING.values(), ids=SOMETHING)
 def test_the_truth_stays_and_what_is_unseen_stays_unseen(perturbation: Perturbation) -> None:
     batch = a_batch()
-    batch = replace(batch, seen=torch.zeros_like(batch.seen))
+    batch = replace(batch, valid=torch.zeros_like(batch.valid))
     after = perturbation(batch, SEED)
-    assert not after.seen.any()
+    assert not after.valid.any()
     assert torch.isin(after.key_points, batch.key_points).all()
     assert torch.equal(after.truth, batch.truth)
 
@@ -97,20 +99,20 @@ def test_outliers_are_as_many_and_as_far_as_asked_and_nested() -> None:
     batch = a_batch(frames=200)
     off = {rate: moved(batch, Outliers(rate, 0.1, 0.5)(batch, SEED)) for rate in (0.1, 0.2)}
     for rate, distance in off.items():
-        hit = distance[batch.seen] > 0
+        hit = distance[batch.valid] > 0
         assert hit.double().mean().item() == pytest.approx(rate, abs=0.01)
-        assert distance[batch.seen][hit].min() >= 0.1 - 1e-9
+        assert distance[batch.valid][hit].min() >= 0.1 - 1e-9
         assert distance.max() <= 0.5 + 1e-9
-        assert distance[batch.seen][hit].mean().item() == pytest.approx(0.3, abs=0.01)
+        assert distance[batch.valid][hit].mean().item() == pytest.approx(0.3, abs=0.01)
     less = off[0.1] > 0
     assert torch.equal(off[0.2][less], off[0.1][less])
 
 
 def test_noise_has_the_deviation_asked_in_each_coordinate_and_only_grows() -> None:
     batch = a_batch(frames=200)
-    size = person_size(batch.key_points, batch.seen)[..., None, None]
+    size = person_scale(batch.key_points, batch.valid)[..., None, None]
     small, large = (
-        ((Noise(s)(batch, SEED).key_points - batch.key_points) / size)[batch.seen]
+        ((Noise(s)(batch, SEED).key_points - batch.key_points) / size)[batch.valid]
         for s in (0.01, 0.03)
     )
     assert small.std(dim=0).tolist() == pytest.approx([0.01, 0.01], rel=0.03)
@@ -121,23 +123,23 @@ def test_noise_has_the_deviation_asked_in_each_coordinate_and_only_grows() -> No
 
 def test_missing_detections_are_as_many_as_asked_and_nested() -> None:
     batch = a_batch(frames=200)
-    left = {rate: MissingDetections(rate)(batch, SEED).seen for rate in (0.2, 0.4, 1.0)}
-    for rate, seen in left.items():
-        assert (seen.sum() / batch.seen.sum()).item() == pytest.approx(1 - rate, abs=0.01)
-        assert not (seen & ~batch.seen).any()
+    left = {rate: MissingDetections(rate)(batch, SEED).valid for rate in (0.2, 0.4, 1.0)}
+    for rate, valid in left.items():
+        assert (valid.sum() / batch.valid.sum()).item() == pytest.approx(1 - rate, abs=0.01)
+        assert not (valid & ~batch.valid).any()
     assert not (left[0.4] & ~left[0.2]).any()
 
 
 def test_whole_views_are_missing_any_of_them_and_nested() -> None:
-    batch = replace(a_batch(frames=400), seen=torch.ones(400, 5, 17, dtype=torch.bool))
-    one, two = (MissingViews(n)(batch, SEED).seen for n in (1, 2))
-    for count, seen in ((1, one), (2, two)):
-        views = seen.any(-1)
-        assert torch.equal(views, seen.all(-1))
+    batch = replace(a_batch(frames=400), valid=torch.ones(400, 5, 17, dtype=torch.bool))
+    one, two = (MissingViews(n)(batch, SEED).valid for n in (1, 2))
+    for count, valid in ((1, one), (2, two)):
+        views = valid.any(-1)
+        assert torch.equal(views, valid.all(-1))
         assert (views.sum(-1) == 5 - count).all()
         assert views.double().mean(0).tolist() == pytest.approx([1 - count / 5] * 5, abs=0.08)
     assert not (two & ~one).any()
-    assert not MissingViews(5)(batch, SEED).seen.any()
+    assert not MissingViews(5)(batch, SEED).valid.any()
 
 
 def test_fewer_cameras_come_with_their_own_key_points_and_are_nested() -> None:
@@ -145,7 +147,7 @@ def test_fewer_cameras_come_with_their_own_key_points_and_are_nested() -> None:
     all_of_them, three, two = (FewerCameras(n)(batch, SEED) for n in (5, 3, 2))
     assert three.key_points.shape == (40, 3, 17, 2)
     for name, value in tensors(two).items():
-        if name in ("key_points", "confidence", "seen", "K", "R", "t"):
+        if name in ("key_points", "confidence", "valid", "K", "R", "t"):
             assert torch.equal(value, tensors(three)[name][:, :2])
     place = (
         (batch.cameras.t[:, None] == all_of_them.cameras.t[:, :, None]).all(-1).long().argmax(-1)
@@ -153,7 +155,7 @@ def test_fewer_cameras_come_with_their_own_key_points_and_are_nested() -> None:
     assert (place.sort(-1).values == torch.arange(5)).all()
     rows = torch.arange(40)[:, None]
     assert torch.equal(batch.key_points[rows, place], all_of_them.key_points)
-    assert torch.equal(batch.seen[rows, place], all_of_them.seen)
+    assert torch.equal(batch.valid[rows, place], all_of_them.valid)
 
 
 def test_cameras_turn_by_the_angle_asked_about_their_own_centre() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ghpt.metrics.pose_prior import PARTS
-from ghpt.models.selection import SELECTIONS
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.paper.engine.item import Compared, Results, Spread
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
@@ -31,7 +31,7 @@ ITEMS = {
     for part in (generalization, other_systems, base_dataset, pose_figures, view_weights)
     for i in part.ITEMS
 }
-ESTIMATORS = (*SELECTIONS, "view_weights", *base_dataset.BASELINES)
+ESTIMATORS = (*AGGREGATIONS, "view_weights", *base_dataset.BASELINES)
 PRIOR = {"weight": 1e-3, "best": 1.1e-3, "average": 2e-3}
 
 
@@ -50,7 +50,7 @@ def papers(name):
             errors["weight"] = QUANTITATIVE_HYPOTHESES["panoptic"]["weight"]
     return {
         "data": "h36m",
-        "source": "embedded",
+        "source": "synthetic",
         "split": "test",
         "provenance": {},
         "selections": {
@@ -113,11 +113,11 @@ def test_the_papers_own_numbers_have_no_miss_and_all_of_its_claims(label):
     for number in section.compared:
         assert abs(number.difference) <= rounding.get(label, 1e-9), number
     assert "miss" not in section.body
-    assert "embedded" not in section.data
-    embedded = ITEMS[label].section(Fake(same))
-    assert "embedded (synthetic)" in embedded.data
+    assert "synthetic" not in section.data
+    synthetic = ITEMS[label].section(Fake(same))
+    assert "synthetic" in synthetic.data
     published = label in ("iskakov-comparison", "sota-comparison", "quantitative")
-    assert (None in [claim.holds for claim in embedded.claims]) == published
+    assert (None in [claim.holds for claim in synthetic.claims]) == published
 
 
 def worse(name, metrics):

@@ -48,15 +48,15 @@ def command(monkeypatch, typed):
 def points_file(folder: Path, values=None, name="points.npz", frames=40, **changed) -> Path:
     """The walk in Human3.6M's cameras as an npz file of ours."""
     values = PIXELS[:frames].astype(np.float64) if values is None else values
-    seen = np.isfinite(values).all(-1)
+    valid = np.isfinite(values).all(-1)
     points = KeyPoints(
         "",
         tuple(f"cam{i}_json" for i in range(values.shape[1])),
         JOINTS,
         np.arange(len(values)),
-        np.where(seen[..., None], values, 0),
-        seen.astype(float),
-        seen,
+        np.where(valid[..., None], values, 0),
+        valid.astype(float),
+        valid,
         50.0,
         (0,) * values.shape[1],
     )
@@ -426,7 +426,7 @@ def test_a_full_disk_is_named_and_the_next_run_goes_on(tmp_path, limit, file):
 def test_a_recording_of_a_data_set_is_a_demonstration(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_from_data", lambda _: frames_of(30))
     numbers = predict(config("compare=[linear,ransac]", "evaluated_frames=10"), tmp_path / "out")
-    assert numbers["source"] == "embedded"
+    assert numbers["source"] == "synthetic"
     assert set(numbers["evaluation"]["estimators"]) >= {"linear", "ransac"}
     for found in numbers["evaluation"]["estimators"].values():
         assert 0 < found["held_out"]["median"] < 5

@@ -15,7 +15,7 @@ from ghpt.recording import PoseEstimate, Recording
 NAMES = ("weight", "average", "linear")
 META = {
     "data": "h36m",
-    "source": "embedded",
+    "source": "synthetic",
     "split": "test",
     "seed": 0,
     "provenance": {"commit": "abc"},
@@ -80,9 +80,9 @@ def test_round_trip(tmp_path):
     assert {**META, "unit": "mm"}.items() <= predictions.meta.items()
     chunks, expected = list(predictions.chunks(6)), rows(torch.arange(20))
     assert [len(chunk.frame) for chunk in chunks] == [6, 6, 6, 2]
-    seen = expected["truth_seen"]
-    assert torch.equal(torch.cat([c.truth_seen for c in chunks]), seen)
-    assert torch.equal(torch.cat([c.truth for c in chunks]), expected["truth"] * seen[..., None])
+    valid = expected["truth_seen"]
+    assert torch.equal(torch.cat([c.truth_valid for c in chunks]), valid)
+    assert torch.equal(torch.cat([c.truth for c in chunks]), expected["truth"] * valid[..., None])
     assert torch.equal(torch.cat([c.frame for c in chunks]), expected["frame"])
     assert torch.equal(torch.cat([c.recording for c in chunks]), expected["recording"])
     for name, estimate in expected["estimates"].items():
@@ -106,7 +106,7 @@ def test_numpy_alone_reads_it_and_missing_is_nan(tmp_path):
         )
         np.testing.assert_array_equal(np.isnan(arrays["truth"]).any(-1), ~arrays["truth_seen"])
         assert arrays["joint_name"][6] == "pelvis"
-        assert json.loads(str(arrays["meta"]))["source"] == "embedded"
+        assert json.loads(str(arrays["meta"]))["source"] == "synthetic"
 
 
 def test_bytes_depend_on_the_content_alone(tmp_path):

@@ -8,12 +8,12 @@ import yaml
 
 from ghpt.config import build
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_size
+from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_scale
 from ghpt.models.estimators.lo_ransac import LoRansac
 from ghpt.models.estimators.predictors import Classical, Learned
 from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
 from ghpt.models.estimators.rejection import Rejection
-from ghpt.models.estimators.uncertainty import Quality
+from ghpt.models.estimators.uncertainty import UncertaintyModel
 from ghpt.models.estimators.view_weights import ViewWeights
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
@@ -23,7 +23,7 @@ from ghpt.paper.robustness.perturbation import Outliers
 from ghpt.reconstruction import Reconstruction, State
 from scenes import random_scene
 
-QUALITY = Quality(noise=0.003, prior=4.0, shared=0.0)
+QUALITY = UncertaintyModel(noise=0.003, prior=4.0, shared=0.0)
 ESTIMATORS = {
     "linear": Linear(),
     "weighted_linear": WeightedLinear(power=0.5),
@@ -65,7 +65,7 @@ def single(batch):
 
 def sound(result, batch):
     """What any reconstruction keeps to."""
-    frames, _, joints = batch.seen.shape
+    frames, _, joints = batch.valid.shape
     assert result.points.shape == (frames, joints, 3)
     for field in ("points", "error", "covariance", "score"):
         assert torch.isfinite(getattr(result, field)).all(), field
@@ -77,7 +77,7 @@ def sound(result, batch):
         assert (getattr(result, field)[missing] == 0).all()
     assert not result.views.mT[missing].any()
     assert (result.views.sum(1)[result.placed] >= 2).all()
-    assert not (result.views & ~batch.seen).any()
+    assert not (result.views & ~batch.valid).any()
     return result
 
 
@@ -132,8 +132,10 @@ def test_displaced_key_points_spoil_the_average_of_the_hypotheses_and_not_the_le
 
 def test_no_joint_is_lost_that_two_seen_views_determine():
     scene = random_scene(11, frames=20, views=4).noisy(3, 0)
-    seen = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.6
-    batch = Outliers(0.3, 0.1, 0.5)(scene.batch(seen), 0)
+    valid = (
+        torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.6
+    )
+    batch = Outliers(0.3, 0.1, 0.5)(scene.batch(valid), 0)
     result = sound(learned()(batch), batch)
     placed = Linear()(batch).estimated
     assert not placed.all()
@@ -163,8 +165,8 @@ def test_a_value_that_no_detector_means_costs_its_own_view_alone(make, value):
 @pytest.mark.parametrize("make", [classical, learned])
 def test_each_reason_for_a_missing_joint_is_said(make):
     scene = random_scene(4, frames=3, views=3).noisy(1, 0)
-    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
-    seen[0, 1:, 2] = False
+    valid = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    valid[0, 1:, 2] = False
     cameras = scene.cameras
     K, R, t = (x.clone() for x in (cameras.K, cameras.R, cameras.t))
     for x in (K, R, t):
@@ -172,7 +174,7 @@ def test_each_reason_for_a_missing_joint_is_said(make):
     K[2, 0] = torch.nan
     key_points = scene.key_points.clone()
     key_points[1, 1:] = key_points[1, :1]
-    batch = replace(scene, cameras=Cameras(K, R, t), key_points=key_points).batch(seen)
+    batch = replace(scene, cameras=Cameras(K, R, t), key_points=key_points).batch(valid)
     result = sound(make()(single(batch)), batch)
     assert result.state[0, 2] == State.FEW_VIEWS
     assert (result.state[1] == State.PARALLEL).all()
@@ -213,14 +215,14 @@ def test_without_rejection_a_joint_is_kept_with_what_speaks_against_it():
 def test_a_joint_of_two_noisy_views_stays_observed_though_little_else_is_seen():
     # nothing but one arm: the box around it is a fifth of the person's
     scene = random_scene(7, frames=8, views=4)
-    size = person_size(scene.key_points, torch.ones(scene.key_points.shape[:-1], dtype=torch.bool))
+    size = person_scale(scene.key_points, torch.ones(scene.key_points.shape[:-1], dtype=torch.bool))
     key_points = scene.key_points.clone()
     key_points[0, 0, 10] += 0.06 * size[0, 0]
-    seen = torch.ones(key_points.shape[:-1], dtype=torch.bool)
-    seen[0, 2:] = False
-    seen[0, :2, :10] = False
-    seen[0, :2, 12:] = False
-    batch = replace(scene, key_points=key_points).batch(seen)
+    valid = torch.ones(key_points.shape[:-1], dtype=torch.bool)
+    valid[0, 2:] = False
+    valid[0, :2, :10] = False
+    valid[0, :2, 12:] = False
+    batch = replace(scene, key_points=key_points).batch(valid)
     result = classical(reject=Rejection(0.1)).fitted(batch)(batch)
     assert result.state[0, 10] == State.OBSERVED
 
@@ -228,7 +230,7 @@ def test_a_joint_of_two_noisy_views_stays_observed_though_little_else_is_seen():
 def test_two_views_that_disagree_by_much_make_no_joint():
     scene = random_scene(8, frames=8, views=2)
     key_points = scene.key_points.clone()
-    size = person_size(key_points, torch.ones(key_points.shape[:-1], dtype=torch.bool))
+    size = person_scale(key_points, torch.ones(key_points.shape[:-1], dtype=torch.bool))
     line = key_points[0, 0, 5] - key_points[0, 0].mean(0)
     across = torch.stack((-line[1], line[0])) / line.norm()
     for sign in (-1, 1):
@@ -272,7 +274,7 @@ def part(batch, rows):
 def test_no_frames_and_no_seen_joints_are_no_error(make):
     batch = random_scene(8, frames=2).batch()
     assert len(make()(part(batch, slice(0, 0)))) == 0
-    result = make()(replace(batch, seen=torch.zeros_like(batch.seen)))
+    result = make()(replace(batch, valid=torch.zeros_like(batch.valid)))
     assert isinstance(result, Reconstruction)
     assert (result.state == State.FEW_VIEWS).all()
 
@@ -288,10 +290,10 @@ def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
     off = scene.key_points.clone()
     off[:, 2, ::2] += 200  # a view that agrees with no other is no noise
     batch = replace(scene, key_points=off).batch()
-    size = person_size(scene.key_points, batch.seen).mean()
+    size = person_scale(scene.key_points, batch.valid).mean()
     for made in (
         build(config["classical"], "estimator.classical")(estimator=estimator),
         build(config["learned"], "estimator.learned")(view_weights=learned().view_weights),
     ):
         assert made(batch).placed.all()
-        assert made.fitted(batch).quality.noise == pytest.approx(float(2 / size), rel=0.3)
+        assert made.fitted(batch).uncertainty.noise == pytest.approx(float(2 / size), rel=0.3)

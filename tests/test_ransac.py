@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ghpt.errors import GhptConfigError
-from ghpt.models.estimators.classical import Linear, person_size
+from ghpt.models.estimators.classical import Linear, person_scale
 from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
 from ghpt.paper.robustness.perturbation import RotatedCameras
 from scenes import random_scene
@@ -32,9 +32,9 @@ def test_much_noise_widens_it_in_the_frames_that_have_it():
     mixed = replace(loud, key_points=torch.cat([loud.key_points[:3], quiet.key_points[3:]]))
     batch = mixed.batch()
     found = ADAPTIVE.triangulate(batch)
-    reach = ADAPTIVE.reach(batch, found.points)
-    assert (reach[:3] > 0.01).all()
-    assert (reach[3:] == 0.005).all()
+    inlier_threshold = ADAPTIVE.inlier_threshold(batch, found.points)
+    assert (inlier_threshold[:3] > 0.01).all()
+    assert (inlier_threshold[3:] == 0.005).all()
     assert torch.equal(found.points[3:], FIXED(batch).points[3:])
     linear = error(Linear(), loud, loud.batch())
     assert error(ADAPTIVE, loud, loud.batch()) < 1.1 * linear < error(FIXED, loud, loud.batch())
@@ -55,23 +55,23 @@ def test_outliers_do_not_widen_it():
     wrong = (
         torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.2
     )
-    size = person_size(scene.key_points, torch.ones_like(wrong))[..., None, None]
+    size = person_scale(scene.key_points, torch.ones_like(wrong))[..., None, None]
     far = replace(scene, key_points=scene.key_points + 0.3 * size * wrong[..., None])
     batch = far.batch()
     found = ADAPTIVE.triangulate(batch)
-    assert (ADAPTIVE.reach(batch, found.points) == 0.005).all()
-    views, agreed = ADAPTIVE.agreeing(batch, found.points, found.ok)
+    assert (ADAPTIVE.inlier_threshold(batch, found.points) == 0.005).all()
+    views, agreed = ADAPTIVE.inlier_views(batch, found.points, found.ok)
     assert not (views & wrong)[agreed[:, None].expand_as(wrong)].any()
 
 
 def test_a_frame_in_which_nothing_is_seen_keeps_the_threshold():
     scene = random_scene(2, frames=3, views=4).noisy(15, 0)
-    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
-    seen[1] = False
-    batch = scene.batch(seen)
+    valid = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    valid[1] = False
+    batch = scene.batch(valid)
     found = ADAPTIVE.triangulate(batch)
     assert not found.ok[1].any()
-    assert ADAPTIVE.reach(batch, found.points)[1] == 0.005
+    assert ADAPTIVE.inlier_threshold(batch, found.points)[1] == 0.005
 
 
 @pytest.mark.parametrize(

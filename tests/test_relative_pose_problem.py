@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.metrics.relative_pose import error_3d, rotation_deg
+from ghpt.models.aggregation import AGGREGATIONS, aggregation_weights
 from ghpt.models.relative_pose.problem import (
     RelativePose,
     RelativePoseHypotheses,
@@ -16,7 +17,6 @@ from ghpt.models.relative_pose.problem import (
     random_subsets,
 )
 from ghpt.models.relative_pose.scale import KnownScale
-from ghpt.models.selection import SELECTIONS, selection_weights
 from ghpt.recording import PairBatch, RelativePoseEstimate
 from scenes import random_scene
 
@@ -51,7 +51,7 @@ def batch_of(seeds: list[int], noise: float = 0.0, views: int = 3) -> PairBatch:
         cameras=Cameras(torch.stack(K), torch.stack(R), torch.stack(t)),
         key_points=torch.stack(key_points).float(),
         confidence=torch.ones(shape),
-        seen=torch.ones(shape, dtype=torch.bool),
+        valid=torch.ones(shape, dtype=torch.bool),
         points=torch.stack(points),
     )
 
@@ -88,36 +88,36 @@ def test_exact_key_points_give_the_true_pose_in_every_hypothesis(refine):
     assert h.estimated.all()
     assert rotation_deg(h.R, R[:, None].expand_as(h.R)).max() < 0.02  # the key points are float32
     assert ((h.t - t[:, None]).norm(dim=-1) / t.norm(dim=-1)[:, None]).max() < 1e-3
-    assert cameras.describe(h).abs().max() < 1
+    assert cameras.featurize(h).abs().max() < 1
     assert cameras.error(cameras.expand(h), batch)[0].max() < 2
 
 
 def test_features_are_sorted_and_say_nothing_of_the_order_of_frames_and_joints():
     batch, cameras = batch_of([3, 4], noise=5.0), problem()
     h = cameras.generate(batch, 10, keys(batch))
-    features = cameras.describe(h)
+    features = cameras.featurize(h)
     assert (features.diff(dim=-1) >= 0).all()
     order = torch.randperm(h.a.shape[1], generator=torch.Generator().manual_seed(0))
     permuted = RelativePoseHypotheses(
         h.R, h.t, h.estimated, h.a[:, order], h.b[:, order], h.both[:, order]
     )
-    torch.testing.assert_close(cameras.describe(permuted), features)
+    torch.testing.assert_close(cameras.featurize(permuted), features)
 
 
 def test_features_have_one_length_for_any_number_of_frames_and_ignore_what_is_not_seen():
     batch, cameras = batch_of([3], noise=5.0), problem()
     h = cameras.generate(batch, 10, keys(batch))
-    seen = batch.seen.clone()
-    seen[:, 1, ::3, 4:9] = False
+    valid = batch.valid.clone()
+    valid[:, 1, ::3, 4:9] = False
     partly = replace(
-        batch, seen=seen, key_points=torch.where(seen[..., None], batch.key_points, 1e6)
+        batch, valid=valid, key_points=torch.where(valid[..., None], batch.key_points, 1e6)
     )
     a, b, both = partly.correspondences()
-    hidden = cameras.describe(RelativePoseHypotheses(h.R, h.t, h.estimated, a, b, both))
+    hidden = cameras.featurize(RelativePoseHypotheses(h.R, h.t, h.estimated, a, b, both))
     kept = RelativePoseHypotheses(
         h.R, h.t, h.estimated, a[:, both[0]], b[:, both[0]], both[:, both[0]]
     )
-    torch.testing.assert_close(hidden, cameras.describe(kept))
+    torch.testing.assert_close(hidden, cameras.featurize(kept))
     assert hidden.shape == (1, 10, 16)
 
 
@@ -175,18 +175,18 @@ def test_a_pair_s_hypotheses_do_not_depend_on_its_batch():
 
 def test_what_determines_no_pose_is_said_and_does_not_spoil_its_neighbours():
     batch, cameras = batch_of([0, 1, 2], noise=3.0), problem()
-    seen = batch.seen.clone()
-    seen[0, 1] = False  # all joints missing in a view
-    seen[1, 0, :, 1:] = False
-    seen[1, 0, 7:] = False  # 7 correspondences
-    spoilt = replace(batch, seen=seen)
+    valid = batch.valid.clone()
+    valid[0, 1] = False  # all joints missing in a view
+    valid[1, 0, :, 1:] = False
+    valid[1, 0, 7:] = False  # 7 correspondences
+    spoilt = replace(batch, valid=valid)
     h, whole = cameras.generate(spoilt, 20, keys(batch)), cameras.generate(batch, 20, keys(batch))
     assert h.estimated.tolist() == [False, False, True]
     assert torch.equal(h.R[2], whole.R[2])
     error, counted = cameras.error(cameras.expand(h), spoilt)
     assert counted.tolist() == [False, False, True]
     assert torch.isfinite(error).all()
-    assert torch.isfinite(cameras.describe(h)).all()
+    assert torch.isfinite(cameras.featurize(h)).all()
     same = replace(batch, pair=torch.tensor([[1, 1], [0, 2], [1, 2]]))  # identical cameras
     assert cameras.generate(same, 20, keys(batch)).estimated.tolist() == [False, True, True]
 
@@ -201,15 +201,15 @@ def test_an_empty_share_of_a_batch_goes_through():
     )
     cameras = problem()
     h = cameras.generate(empty, 10, keys(empty))
-    assert cameras.describe(h).shape == (0, 10, 16)
+    assert cameras.featurize(h).shape == (0, 10, 16)
     assert cameras.error(cameras.expand(h), empty)[0].shape == (0, 10)
-    assert cameras.combine(h, torch.zeros(0, 10)).R.shape == (0, 3, 3)
+    assert cameras.aggregate(h, torch.zeros(0, 10)).R.shape == (0, 3, 3)
 
 
 def test_one_weight_selects_and_equal_weights_average_whatever_the_quaternions_signs():
     batch, cameras = batch_of([8], noise=5.0), problem()
     h = cameras.generate(batch, 3, keys(batch))
-    chosen = cameras.combine(h, torch.tensor([[0.0, 1.0, 0.0]]))
+    chosen = cameras.aggregate(h, torch.tensor([[0.0, 1.0, 0.0]]))
     torch.testing.assert_close(chosen.R[0], h.R[0, 1])
     torch.testing.assert_close(chosen.t[0], h.t[0, 1])
     # rotations by almost 180 degrees, on both sides of it: their quaternions with w >= 0 are nearly
@@ -218,7 +218,7 @@ def test_one_weight_selects_and_equal_weights_average_whatever_the_quaternions_s
         Rotation.from_rotvec([[0, 0, np.pi - 0.02], [0, 0, -np.pi + 0.04]]).as_matrix()
     )[None]
     two = RelativePoseHypotheses(R, torch.ones(1, 2, 3).double(), h.estimated, h.a, h.b, h.both)
-    mean = cameras.combine(two, torch.tensor([[0.5, 0.5]]))
+    mean = cameras.aggregate(two, torch.tensor([[0.5, 0.5]]))
     expected = torch.from_numpy(Rotation.from_rotvec([0, 0, np.pi + 0.01]).as_matrix())
     assert rotation_deg(mean.R[0], expected) < 1e-6
 
@@ -226,7 +226,7 @@ def test_one_weight_selects_and_equal_weights_average_whatever_the_quaternions_s
 def test_the_average_translation_keeps_the_known_length():
     batch, cameras = batch_of([9, 10], noise=15.0), problem()
     h = cameras.generate(batch, 50, keys(batch))
-    estimate = cameras.combine(h, torch.full((2, 50), 1 / 50))
+    estimate = cameras.aggregate(h, torch.full((2, 50), 1 / 50))
     torch.testing.assert_close(estimate.t.norm(dim=-1), truth_of(batch)[1].norm(dim=-1))
 
 
@@ -234,7 +234,7 @@ def test_the_average_is_differentiable_in_the_weights():
     batch, cameras = batch_of([8], noise=5.0), problem()
     h = cameras.generate(batch, 5, keys(batch))
     weights = torch.full((1, 5), 0.2, requires_grad=True)
-    error, _ = cameras.error(cameras.combine(h, weights), batch)
+    error, _ = cameras.error(cameras.aggregate(h, weights), batch)
     error.sum().backward()
     assert torch.isfinite(weights.grad).all()
     assert (weights.grad != 0).any()
@@ -266,12 +266,12 @@ def test_best_is_below_every_selection_and_worst_above():
     batch, cameras = batch_of([14, 15, 16], noise=8.0), problem()
     h = cameras.generate(batch, 40, keys(batch))
     errors, _ = cameras.error(cameras.expand(h), batch)
-    logits = -cameras.describe(h)[..., 8]
+    logits = -cameras.featurize(h)[..., 8]
     found = {
         name: cameras.error(
-            cameras.combine(h, selection_weights(name, logits, errors, 1.2, keys(batch))), batch
+            cameras.aggregate(h, aggregation_weights(name, logits, errors, 1.2, keys(batch))), batch
         )[0]
-        for name in SELECTIONS
+        for name in AGGREGATIONS
     }
     for name in ("most", "least", "stochastic", "random"):
         assert (found["best"] <= found[name]).all()

@@ -33,7 +33,7 @@ def page():
         Entry(
             Item("first", "table", "A table", dict, dict),
             Section(
-                "embedded (synthetic) Human3.6M",
+                "synthetic Human3.6M",
                 "A table of *x*:\n\n| a | b |\n|---|---|\n| 1 | 2 |",
                 {},
                 [good, bad],
@@ -48,9 +48,7 @@ def page():
             [],
         ),
     ]
-    return Page(
-        entries, {"data": "embedded (synthetic)", "seeds": "2 (0, 1)"}, "seed: 0\nonly: null\n"
-    )
+    return Page(entries, {"data": "synthetic", "seeds": "2 (0, 1)"}, "seed: 0\nonly: null\n")
 
 
 class Tags(HTMLParser):
@@ -90,7 +88,7 @@ def test_every_entry_says_its_data_its_claims_and_its_command(page, tmp_path):
         (tmp_path / "report.md").read_text(),
         Tags((tmp_path / "report.html").read_text()).text,
     ):
-        assert "tab:first: A table · embedded (synthetic) Human3.6M" in text
+        assert "tab:first: A table · synthetic Human3.6M" in text
         assert "fig:second: A figure · Human3.6M from /data" in text
         assert "python reproduce.py only=[first]" in text
         assert "python train.py data=h36m" in text
@@ -105,9 +103,7 @@ def test_a_table_that_the_paper_lacks_has_no_label_of_its(page):
     entry = page.entries[0]
     own = Entry(replace(entry.item, of_paper=False), entry.section, [])
     assert (
-        own.heading
-        == entry.heading.removeprefix("tab:")
-        == "first: A table · embedded (synthetic) Human3.6M"
+        own.heading == entry.heading.removeprefix("tab:") == "first: A table · synthetic Human3.6M"
     )
 
 

@@ -57,7 +57,7 @@ def test_one_table_then_nothing_to_do_then_another_seed(command, tmp_path):
     assert "claims hold" in said
     text = (tmp_path / "report" / "report.md").read_text()
     assert (
-        "tab:iskakov-comparison: From Panoptic to Human3.6M, beside Iskakov et al. · embedded (synthetic)"
+        "tab:iskakov-comparison: From Panoptic to Human3.6M, beside Iskakov et al. · synthetic"
         in text
     )
     assert (

@@ -17,12 +17,12 @@ def scene_with_outliers(frames=3, views=5):
     return scene
 
 
-def robustly(scene, loss, iterations, seen=None, tolerance=TOLERANCE):
-    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool) if seen is None else seen
-    scale = torch.full(seen.shape[:2], SCALE, dtype=torch.float64)
+def robustly(scene, loss, iterations, valid=None, tolerance=TOLERANCE):
+    valid = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool) if valid is None else valid
+    scale = torch.full(valid.shape[:2], SCALE, dtype=torch.float64)
     scale[:, 1] = 2 * SCALE
     result = triangulate_robustly(
-        scene.cameras, scene.key_points, seen, scale, WEIGHTS[loss], iterations, tolerance
+        scene.cameras, scene.key_points, valid, scale, WEIGHTS[loss], iterations, tolerance
     )
     return result, scale
 
@@ -91,16 +91,16 @@ def test_a_resting_joint_stays_though_others_move():
 
 def test_what_is_not_seen_is_not_used_and_what_is_broken_is_said():
     scene = scene_with_outliers()
-    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
-    seen[:, 2:, 3] = False
-    seen[:, 1:, 4] = False
-    expected = robustly(scene, "cauchy", 50, seen)[0]
+    valid = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    valid[:, 2:, 3] = False
+    valid[:, 1:, 4] = False
+    expected = robustly(scene, "cauchy", 50, valid)[0]
     spoilt = scene_with_outliers()
     spoilt.key_points[:, 2:, 3] = 1e5
-    found = robustly(spoilt, "cauchy", 50, seen)[0]
+    found = robustly(spoilt, "cauchy", 50, valid)[0]
     assert torch.equal(found.points, expected.points)
     assert (found.status[:, 4] == Status.FEW_VIEWS).all()
     spoilt.key_points[0, 0, 0] = torch.nan
-    status = robustly(spoilt, "cauchy", 50, seen)[0].status
+    status = robustly(spoilt, "cauchy", 50, valid)[0].status
     assert status[0, 0] == Status.NONFINITE_INPUT
     assert (status == Status.NONFINITE_INPUT).sum() == 1

@@ -112,10 +112,10 @@ def test_two_views_have_no_held_out_view():
 
 def test_unseen_joints_are_not_measured():
     made = take()
-    seen = made.seen.copy()
-    seen[:, 1, 4] = False
-    seen[3, [0, 1, 3], 6] = False
-    _, measured = held_out_errors(replace(made, seen=seen), Linear())
+    valid = made.valid.copy()
+    valid[:, 1, 4] = False
+    valid[3, [0, 1, 3], 6] = False
+    _, measured = held_out_errors(replace(made, valid=valid), Linear())
     assert not measured[:, 1, 4].any()
     assert measured[:, 0, 4].all()
     assert not measured[3, :, 6].any()
@@ -143,7 +143,7 @@ def test_chunks_of_frames_change_nothing():
     whole, _ = triangulate_recording(made, Linear())
     rows = {
         name: getattr(made, name)[280:]
-        for name in ("key_points", "seen", "confidence", "frame", "truth", "truth_seen")
+        for name in ("key_points", "valid", "confidence", "frame", "truth", "truth_valid")
     }
     last, _ = triangulate_recording(replace(made, **rows), Linear())
     torch.testing.assert_close(whole[280:], last)
@@ -151,10 +151,10 @@ def test_chunks_of_frames_change_nothing():
 
 def test_up_is_up_in_any_world():
     scene = random_scene(5, frames=6, views=3)
-    seen = torch.ones(6, 17, dtype=torch.bool)
+    valid = torch.ones(6, 17, dtype=torch.bool)
     cameras = scene.cameras.index(0)
     for world in (SIMILARITY, Similarity(torch.eye(3).double(), 1.0, torch.zeros(3).double())):
-        gauge = upright(world.points(scene.points), seen, world.cameras(cameras))
+        gauge = upright(world.points(scene.points), valid, world.cameras(cameras))
         there = gauge.points(world.points(scene.points)) / world.scale
         trunk = (there[:, JOINT["thorax"]] - there[:, JOINT["pelvis"]]).mean(0)
         assert float(trunk[2] / trunk.norm()) > 0.99

@@ -222,7 +222,7 @@ def test_equal_errors_are_called_equal_and_coverage_is_told(tmp_path: Path):
         in found.body
     )
     assert "90.0 %" in found.body
-    assert found.data == "embedded (synthetic) Panoptic"
+    assert found.data == "synthetic Panoptic"
 
 
 @pytest.mark.parametrize("label", BY_LABEL)
@@ -230,7 +230,7 @@ def test_every_figure_has_every_estimator_and_says_which_data(label: str, tmp_pa
     found = section(label, equal, tmp_path)
     ((name, figure),) = found.figures.items()
     assert f"]({name}.svg)" in found.body
-    assert "embedded (synthetic)" in figure.get_suptitle()
+    assert "synthetic" in figure.get_suptitle()
     for axes in figure.axes:
         assert {line.get_label() for line in axes.containers} == {
             "the paper's selection",

@@ -34,7 +34,7 @@ def batch(noise=0.0):
     pairs = torch.tensor([[0, 1], [2, 0]])
     two = lambda x: torch.stack((x, x))  # noqa: E731
     cameras = Cameras(two(scene.cameras.K), two(scene.cameras.R), two(scene.cameras.t))
-    seen = two(scene.seen.transpose(0, 1))
+    valid = two(scene.valid.transpose(0, 1))
     problem = PairBatch(
         sample=torch.arange(2),
         rig=torch.zeros(2, dtype=torch.int64),
@@ -42,8 +42,8 @@ def batch(noise=0.0):
         pair=pairs,
         cameras=cameras,
         key_points=two(scene.key_points.transpose(0, 1)),
-        confidence=torch.ones(seen.shape),
-        seen=seen,
+        confidence=torch.ones(valid.shape),
+        valid=valid,
         points=torch.zeros(2, 1, 3, dtype=torch.float64),
     )
     R, t = (
@@ -80,7 +80,7 @@ def test_a_joint_that_one_of_two_views_sees_measures_nothing():
     estimate = RelativePoseEstimate(R, t / length[:, None], torch.ones(2, dtype=torch.bool))
     segments = SegmentLengths({SEGMENTS[0]: float(bones(scene.points)[0])})
     end = BONES[0][0]
-    problem.seen[:, 0, :15, end] = False
+    problem.valid[:, 0, :15, end] = False
     problem.key_points[:, 0, :15, end] = 0
     torch.testing.assert_close(segments(estimate, problem), length, rtol=1e-6, atol=0)
 
@@ -96,20 +96,20 @@ def test_body_scale_is_robust_and_masks():
     generator = torch.Generator().manual_seed(0)
     points = people(frames=41).points / 1000
     known = bones(points) * 1000
-    seen = torch.ones(points.shape[:-1], dtype=torch.bool)
-    assert body_scale(points, seen, known) == pytest.approx(1000)
+    valid = torch.ones(points.shape[:-1], dtype=torch.bool)
+    assert body_scale(points, valid, known) == pytest.approx(1000)
     spoilt = points.clone()
     spoilt[:15] += torch.randn(15, 17, 3, generator=generator, dtype=torch.float64)
-    masked = seen.clone()
+    masked = valid.clone()
     masked[:15] = False
-    assert body_scale(spoilt, seen, known) == pytest.approx(1000, rel=0.05)
+    assert body_scale(spoilt, valid, known) == pytest.approx(1000, rel=0.05)
     assert body_scale(spoilt, masked, known) == pytest.approx(1000, rel=1e-2)
     unknown = known.clone()
     unknown[3:] = float("nan")
     unknown[2] = 0
-    assert body_scale(points, seen, unknown) == pytest.approx(1000)
-    assert body_scale(points, torch.zeros_like(seen), known) == 0
-    assert body_scale(points, seen, torch.zeros_like(known)) == 0
+    assert body_scale(points, valid, unknown) == pytest.approx(1000)
+    assert body_scale(points, torch.zeros_like(valid), known) == 0
+    assert body_scale(points, valid, torch.zeros_like(known)) == 0
 
 
 def test_average_adult_is_the_median_of_many():

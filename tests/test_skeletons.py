@@ -9,7 +9,7 @@ import torch
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS, joints17, joints_of, parts_of, recognise
-from ghpt.data.people.views import look_through
+from ghpt.data.people.views import undistort_and_match
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import triangulate
@@ -26,14 +26,14 @@ def test_every_joint_comes_from_its_own_parts(name):
     """A point at (k, -k) for the k-th joint: each of the 17 must be the mean of the right k."""
     joints = SKELETONS[name]
     k = np.arange(len(joints), dtype=np.float64)
-    points, sure, seen = joints17(
+    points, sure, valid = joints17(
         "x",
         joints,
         np.stack([k, -k], -1)[None, None],
         k[None, None] / 100,
         np.ones((1, 1, len(k)), bool),
     )
-    assert seen.all()
+    assert valid.all()
     value = dict(zip(JOINTS, points[0, 0, :, 0], strict=True))
     for joint in set(JOINTS) & set(joints):
         assert value[joint] == joints.index(joint)
@@ -51,9 +51,9 @@ def test_every_joint_comes_from_its_own_parts(name):
 
 def test_a_mean_is_seen_where_all_of_its_parts_are():
     joints = SKELETONS["coco_17"]
-    seen = np.ones((1, 1, 17), bool)
-    seen[..., joints.index("left_hip")] = False
-    points, sure, found = joints17("x", joints, np.ones((1, 1, 17, 2)), np.ones((1, 1, 17)), seen)
+    valid = np.ones((1, 1, 17), bool)
+    valid[..., joints.index("left_hip")] = False
+    points, sure, found = joints17("x", joints, np.ones((1, 1, 17, 2)), np.ones((1, 1, 17)), valid)
     assert {JOINTS[i] for i in np.flatnonzero(~found[0, 0])} == {"left_hip", "pelvis", "spine"}
     assert (points[~found] == 0).all()
     assert (sure[~found] == 0).all()
@@ -114,8 +114,8 @@ def test_left_is_left_on_real_people(data, shared_data):
     toes.
     """
     raw = read_key_points(shared_data / data / REAL[data][0])
-    views = look_through(raw, read_cameras(shared_data / data / REAL[data][1]))
-    points, ok = world(views.cameras.cameras, views.key_points, views.seen)
+    views = undistort_and_match(raw, read_cameras(shared_data / data / REAL[data][1]))
+    points, ok = world(views.cameras.cameras, views.key_points, views.valid)
     # the feet are not among the 17: put them where the ankles are
     feet = [
         raw.joints.index(f"{side}_{part}")
@@ -123,7 +123,7 @@ def test_left_is_left_on_real_people(data, shared_data):
         for part in ("big_toe", "heel")
     ]
     foot, foot_ok = world(
-        views.cameras.cameras, raw.key_points[:, :, feet].astype(np.float32), raw.seen[:, :, feet]
+        views.cameras.cameras, raw.key_points[:, :, feet].astype(np.float32), raw.valid[:, :, feet]
     )
     forward = (foot[:, [0, 2]] - foot[:, [1, 3]]).mean(1)
     up = (
@@ -146,24 +146,28 @@ def test_left_is_left_on_real_people(data, shared_data):
 def test_the_views_agree_on_left_and_right(data, shared_data):
     """Swapping left and right in one view makes its reprojection errors larger."""
     raw = read_key_points(shared_data / data / REAL[data][0])
-    views = look_through(raw, read_cameras(shared_data / data / REAL[data][1]))
-    straight = median_error(views.cameras.cameras, views.key_points, views.seen)
+    views = undistort_and_match(raw, read_cameras(shared_data / data / REAL[data][1]))
+    straight = median_error(views.cameras.cameras, views.key_points, views.valid)
     for view in range(4):
-        swapped, seen = views.key_points.copy(), views.seen.copy()
-        swapped[:, view], seen[:, view] = swapped[:, view][:, MIRROR], seen[:, view][:, MIRROR]
-        assert median_error(views.cameras.cameras, swapped, seen) > 1.2 * straight
+        flipped, valid = views.key_points.copy(), views.valid.copy()
+        flipped[:, view], valid[:, view] = flipped[:, view][:, MIRROR], valid[:, view][:, MIRROR]
+        assert median_error(views.cameras.cameras, flipped, valid) > 1.2 * straight
 
 
-def world(cameras, key_points, seen):
-    rig = Cameras(*(x[None].expand(len(seen), *x.shape) for x in (cameras.K, cameras.R, cameras.t)))
+def world(cameras, key_points, valid):
+    rig = Cameras(
+        *(x[None].expand(len(valid), *x.shape) for x in (cameras.K, cameras.R, cameras.t))
+    )
     result = triangulate(
-        rig, torch.from_numpy(key_points).double(), torch.from_numpy(seen).double()
+        rig, torch.from_numpy(key_points).double(), torch.from_numpy(valid).double()
     )
     return result.points, result.ok
 
 
-def median_error(cameras, key_points, seen):
-    points, ok = world(cameras, key_points, seen)
-    rig = Cameras(*(x[None].expand(len(seen), *x.shape) for x in (cameras.K, cameras.R, cameras.t)))
+def median_error(cameras, key_points, valid):
+    points, ok = world(cameras, key_points, valid)
+    rig = Cameras(
+        *(x[None].expand(len(valid), *x.shape) for x in (cameras.K, cameras.R, cameras.t))
+    )
     error = reprojection_error(rig, torch.from_numpy(key_points), points)
-    return float(error[torch.from_numpy(seen) & ok[:, None]].median())
+    return float(error[torch.from_numpy(valid) & ok[:, None]].median())

@@ -31,9 +31,9 @@ def recording(seed: int, frames: int = 7, views: int = 3) -> Recording:
         ),
         key_points=rng.normal(size=(frames, views, 17, 2)).astype(np.float32),
         confidence=rng.random((frames, views, 17), dtype=np.float32),
-        seen=rng.random((frames, views, 17)) < 0.7,
+        valid=rng.random((frames, views, 17)) < 0.7,
         truth=rng.normal(size=(frames, 17, 3)).astype(np.float32),
-        truth_seen=rng.random((frames, 17)) < 0.7,
+        truth_valid=rng.random((frames, 17)) < 0.7,
         frame=rng.permutation(2**40 + np.arange(frames)),
     )
 
@@ -67,7 +67,7 @@ def test_round_trip_is_exact_with_takes_longer_than_a_chunk(
 def test_arrays_are_read_only_maps_of_the_file(tmp_path: Path) -> None:
     store.write_store(tmp_path / "s", [recording(0)], {})
     (take,) = store.open_store(tmp_path / "s")
-    for array in (take.key_points, take.seen, take.truth, take.frame):
+    for array in (take.key_points, take.valid, take.truth, take.frame):
         assert not array.flags.writeable
         assert not array.flags.owndata
     assert (tmp_path / "s" / "key_points.bin").read_bytes() == take.key_points.tobytes()
@@ -82,11 +82,11 @@ def test_prepares_once_per_key(tmp_path: Path) -> None:
 
     for seed in (0, 0, 1, 0):
         (take,) = store.prepared(
-            tmp_path, {"name": "embedded", "seed": seed}, lambda s=seed: make(s), {}
+            tmp_path, {"name": "synthetic", "seed": seed}, lambda s=seed: make(s), {}
         )
         assert_same(take, recording(seed))
     assert made == [0, 1]
-    assert sorted(p.name.rsplit("-", 1)[0] for p in tmp_path.iterdir()) == ["embedded"] * 2
+    assert sorted(p.name.rsplit("-", 1)[0] for p in tmp_path.iterdir()) == ["synthetic"] * 2
 
 
 def test_a_changed_source_file_changes_the_key(tmp_path: Path) -> None:
@@ -155,11 +155,11 @@ def test_processes_that_prepare_the_same_at_once(tmp_path: Path) -> None:
 
 def test_a_folder_that_another_process_made_meanwhile_stays(tmp_path: Path) -> None:
     """Its readers have it mapped; ours goes away."""
-    seen = []
+    valid = []
 
     def make() -> list[Recording]:
-        if not seen:
-            seen.append(store.prepared(tmp_path, {"name": "x"}, make_other, {})[0])
+        if not valid:
+            valid.append(store.prepared(tmp_path, {"name": "x"}, make_other, {})[0])
         return [recording(1)]
 
     def make_other() -> list[Recording]:
@@ -167,7 +167,7 @@ def test_a_folder_that_another_process_made_meanwhile_stays(tmp_path: Path) -> N
 
     (take,) = store.prepared(tmp_path, {"name": "x"}, make, {})
     assert_same(take, recording(0))
-    assert_same(seen[0], recording(0))
+    assert_same(valid[0], recording(0))
     assert len(list(tmp_path.iterdir())) == 1
 
 

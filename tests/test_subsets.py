@@ -7,7 +7,7 @@ from ghpt.geometry.subsets import _pairs_or_more, random_subsets
 from ghpt.randomness import key
 
 
-def seen(*rows):
+def valid(*rows):
     """One frame, one joint: [1, V, 1]."""
     return torch.tensor(rows, dtype=torch.bool)[None, :, None]
 
@@ -15,7 +15,7 @@ def seen(*rows):
 @pytest.mark.parametrize("visible", [(1, 1, 1, 1), (1, 0, 1, 1, 0), (1, 1), (1, 1, 1, 1, 1, 1)])
 def test_every_subset_of_two_or_more_seen_views_is_equally_likely(visible):
     count, n = 100_000, sum(visible)
-    subsets = random_subsets(seen(*visible), count, key(0, "test", torch.tensor([3])))[0, :, 0]
+    subsets = random_subsets(valid(*visible), count, key(0, "test", torch.tensor([3])))[0, :, 0]
     assert not subsets[:, ~torch.tensor(visible, dtype=torch.bool)].any()
     codes, times = (subsets * (1 << torch.arange(len(visible)))).sum(-1).unique(return_counts=True)
     kinds = 2**n - n - 1
@@ -28,7 +28,7 @@ def test_every_subset_of_two_or_more_seen_views_is_equally_likely(visible):
 @pytest.mark.parametrize("views", [31, 100])
 def test_the_sizes_of_many_views_subsets_are_binomial(views):
     count = 40_000
-    subsets = random_subsets(seen(*[1] * views), count, key(1, "test", torch.tensor([0])))[0, :, 0]
+    subsets = random_subsets(valid(*[1] * views), count, key(1, "test", torch.tensor([0])))[0, :, 0]
     sizes = torch.bincount(subsets.sum(-1), minlength=views + 1) / count
     expected = torch.tensor([comb(views, k) / 2**views for k in range(views + 1)])
     assert (sizes - expected).abs().max() < 5 * (0.15 / count) ** 0.5

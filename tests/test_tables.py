@@ -6,12 +6,12 @@ from rich.console import Console
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.pose.evaluation import NAMES
 from ghpt.paper import published as paper
-from ghpt.report.tables import COLUMNS, main_rows, max_difference, print_table, report, words
+from ghpt.report.tables import COLUMNS, display_name, main_rows, max_difference, print_table, report
 
 MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 
 
-def metrics(data="h36m", source="embedded", split="test", trained="h36m", value=30.0) -> dict:
+def metrics(data="h36m", source="synthetic", split="test", trained="h36m", value=30.0) -> dict:
     numbers = {
         "mpjpe_absolute": 1234.56,
         "mpjpe_relative": value,
@@ -90,12 +90,10 @@ def test_paper_values_only_where_the_paper_has_them():
 
 
 def test_embedded_is_never_mistaken_for_real():
-    assert words("h36m", "embedded") == "embedded (synthetic) Human3.6M"
-    assert words("cmu2", "/data/panoptic") == "Panoptic CMU2 from /data/panoptic"
+    assert display_name("h36m", "synthetic") == "synthetic Human3.6M"
+    assert display_name("cmu2", "/data/panoptic") == "Panoptic CMU2 from /data/panoptic"
     text = report(metrics())
-    assert text.startswith(
-        "# Test on embedded (synthetic) Human3.6M, test split, trained on embedded (synthetic) Human"
-    )
+    assert text.startswith("# Test on synthetic Human3.6M, test split, trained on synthetic Human")
     assert "These data are synthetic" in text
     real = report(metrics(source="/data/h36m"))
     assert "synthetic" not in real
@@ -120,7 +118,7 @@ def test_terminal_table_fits_80_columns():
         metrics(data="cmu4", trained="cmu2"), Console(file=buffer, width=80, color_system=None)
     )
     lines = buffer.getvalue().splitlines()
-    assert "embedded (synthetic) Panoptic CMU4" in " ".join(lines)
+    assert "synthetic Panoptic CMU4" in " ".join(lines)
     assert max(map(len, lines)) <= 80
     assert not any("…" in line for line in lines)
     for name in ("weight", "worst", "LO-RANSAC"):

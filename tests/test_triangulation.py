@@ -40,9 +40,9 @@ def least_squares(cameras, key_points, weights):
 
 def test_exact_key_points_give_the_points_back_for_every_subset_of_views():
     scene = random_scene(0, frames=2, views=5)
-    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    valid = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
     subsets = every_subset(5, frames=2)
-    points, ok = triangulate_subsets(scene.cameras, scene.key_points, seen, subsets)
+    points, ok = triangulate_subsets(scene.cameras, scene.key_points, valid, subsets)
     assert ok.all()
     assert (points - scene.points[:, None]).abs().max() < 1e-6
     for h in range(subsets.shape[1]):
@@ -69,9 +69,9 @@ def test_subsets_are_the_same_looked_up_and_solved_one_by_one(hypotheses):
     scene = random_scene(2, frames=2, views=5).noisy(5, 0)
     rng = np.random.default_rng(1)
     subsets = torch.from_numpy(rng.random((2, hypotheses, 17, 5)) < 0.5)
-    seen = torch.from_numpy(rng.random((2, 5, 17)) < 0.8)
-    points, ok = triangulate_subsets(scene.cameras, scene.key_points, seen, subsets)
-    unseen = (subsets & ~seen.mT[:, None]).any(-1)
+    valid = torch.from_numpy(rng.random((2, 5, 17)) < 0.8)
+    points, ok = triangulate_subsets(scene.cameras, scene.key_points, valid, subsets)
+    unseen = (subsets & ~valid.mT[:, None]).any(-1)
     assert not ok[unseen].any()
     assert (points[~ok] == 0).all()
     for h in range(hypotheses):
@@ -208,17 +208,17 @@ def test_too_few_views_are_said_and_no_point_is_made():
 def test_31_views_and_many_subsets_stay_small():
     scene = random_scene(12, frames=2, views=31)
     subsets = torch.rand((2, 300, 17, 31), generator=torch.Generator().manual_seed(0)) < 0.3
-    seen = torch.ones(2, 31, 17, dtype=torch.bool)
-    points, ok = triangulate_subsets(scene.cameras, scene.key_points, seen, subsets)
+    valid = torch.ones(2, 31, 17, dtype=torch.bool)
+    points, ok = triangulate_subsets(scene.cameras, scene.key_points, valid, subsets)
     assert torch.equal(ok, subsets.sum(-1) >= 2)
     assert (points - scene.points[:, None]).abs().amax(-1)[ok].max() < 1e-5
 
 
 def test_far_from_the_world_s_origin_no_digits_are_lost_but_those_of_t():
     scene = random_scene(13, frames=20, views=3, place=1e10)
-    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    valid = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
     points, ok = triangulate_subsets(
-        scene.cameras, scene.key_points, seen, every_subset(3, frames=20)
+        scene.cameras, scene.key_points, valid, every_subset(3, frames=20)
     )
     assert ok.all()
     rounding = scene.cameras.t.abs().max() * torch.finfo(torch.float64).eps
@@ -365,9 +365,9 @@ def test_a_subset_s_point_is_in_front_of_every_camera_of_it():
     points = scene.points.clone()
     points[:, 3] = 2 * scene.cameras.centre[:, 0]  # behind the first camera
     key_points = project(scene.cameras, points)[0]
-    seen = torch.ones(1, 3, 17, dtype=torch.bool)
+    valid = torch.ones(1, 3, 17, dtype=torch.bool)
     subsets = every_subset(3)
-    found, ok = triangulate_subsets(scene.cameras, key_points, seen, subsets)
+    found, ok = triangulate_subsets(scene.cameras, key_points, valid, subsets)
     assert torch.equal(ok[..., 3], ~subsets[:, :, 3, 0])
     assert ok[..., :3].all()
     assert (found[..., 3, :][~ok[..., 3]] == 0).all()

@@ -24,7 +24,7 @@ from ghpt.config import build, plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_pose2sim
 from ghpt.data.formats.key_points import KeyPoints, write_key_points
-from ghpt.data.people.views import look_through
+from ghpt.data.people.views import undistort_and_match
 from ghpt.data.synthetic.rigs import Rig, human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import read_reconstruction
@@ -53,14 +53,14 @@ def pixels(noise: float = 4.0) -> np.ndarray:
 
 def points_file(path: Path, values: np.ndarray, joints: list[int] | None = None) -> Path:
     """Key points as ghpt's own npz; of these joints alone, the others unseen."""
-    seen = np.isfinite(values).all(-1)
+    valid = np.isfinite(values).all(-1)
     if joints is not None:
-        seen &= np.isin(np.arange(values.shape[2]), joints)
-    values = np.where(seen[..., None], values, 0.0)
+        valid &= np.isin(np.arange(values.shape[2]), joints)
+    values = np.where(valid[..., None], values, 0.0)
     names = NAMES[: values.shape[1]]
     frame = np.arange(len(values))
     points = KeyPoints(
-        "", names, JOINTS, frame, values, seen.astype(float), seen, 50.0, (0,) * len(names)
+        "", names, JOINTS, frame, values, valid.astype(float), valid, 50.0, (0,) * len(names)
     )
     write_key_points(path, points)
     return path
@@ -242,7 +242,7 @@ def test_without_an_image_size_twice_the_principal_point_is_one(tmp_path):
         (0,) * 4,
     )
     with pytest.raises(GhptDataError, match="normalised"):
-        look_through(points, type(cameras)(**{**vars(cameras), "size": None}))
+        undistort_and_match(points, type(cameras)(**{**vars(cameras), "size": None}))
 
 
 def test_images_that_are_turned_are_named(tmp_path):

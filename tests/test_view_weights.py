@@ -9,7 +9,7 @@ import torch
 from torch import nn
 
 from ghpt.errors import GhptConfigError
-from ghpt.models.estimators.classical import Linear, person_size
+from ghpt.models.estimators.classical import Linear, person_scale
 from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
 from ghpt.models.estimators.view_weights import ViewWeights
 from ghpt.models.loss import StochasticLoss
@@ -55,7 +55,7 @@ def knowing(estimator, scene):
     """Let the scorer know the true poses' features."""
     problem = estimator.model.problem
     truth = problem.generate(scene.batch(), 1, torch.zeros(len(scene.points), dtype=torch.int64))
-    estimator.model.scorer.wanted = problem.describe(
+    estimator.model.scorer.wanted = problem.featurize(
         replace(truth, points=scene.points[:, None].float())
     )[:, 0]
     return estimator
@@ -82,7 +82,7 @@ def test_a_scorer_that_says_nothing_gives_nearly_the_linear_estimate():
 
 def test_a_scorer_that_knows_poses_finds_the_view_that_is_off():
     scene = random_scene(3, frames=8, views=4).noisy(1, 0)
-    size = person_size(scene.key_points, torch.ones(scene.key_points.shape[:-1], dtype=torch.bool))
+    size = person_scale(scene.key_points, torch.ones(scene.key_points.shape[:-1], dtype=torch.bool))
     offset = torch.zeros_like(scene.key_points)
     offset[:, 2, 15, 0] = 0.02 * size[:, 2]  # a wrist, within what the consensus takes for noise
     scene = replace(scene, key_points=scene.key_points + offset)
@@ -134,9 +134,11 @@ def test_where_the_views_disagree_as_a_whole_a_scorer_that_is_wrong_harms_less()
 
 def test_what_linear_determines_is_estimated_and_nothing_else():
     scene = random_scene(5, frames=6, views=4).noisy(3, 0)
-    seen = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.5
-    estimate = view_weights(hypotheses=20)(scene.batch(seen))
-    assert torch.equal(estimate.estimated, Linear()(scene.batch(seen)).estimated)
+    valid = (
+        torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(1)) < 0.5
+    )
+    estimate = view_weights(hypotheses=20)(scene.batch(valid))
+    assert torch.equal(estimate.estimated, Linear()(scene.batch(valid)).estimated)
     assert torch.isfinite(estimate.points).all()
 
 

@@ -52,7 +52,7 @@ MODEL = {
     "hypotheses": 12,
     "temperature": 1.5,
     "gumbel": True,
-    "spread": 1.5,
+    "logit_std_cap": 1.5,
     "selection": "weight",
     "seed": 0,
 }
@@ -83,10 +83,10 @@ class ToyData(KeyPointDataModule):
         super().__init__(**settings)
         self.views, self.missing = views, missing
 
-    def key(self, split: str) -> dict[str, Any]:
+    def cache_key(self, split: str) -> dict[str, Any]:
         return {"name": f"toy-{split}", "views": self.views, "missing": self.missing}
 
-    def make(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[Recording]:
         rng = np.random.default_rng(["train", "validation", "test"].index(split))
         for take in range(2):
             yield recording(
@@ -113,7 +113,7 @@ def recording(
     body = rng.normal(0, 400, (17, 3))
     truth = body + rng.normal(0, 60, (frames, 17, 3))
     pixels, _ = project(cameras, torch.from_numpy(truth))
-    seen = rng.random((frames, views, 17)) >= missing
+    valid = rng.random((frames, views, 17)) >= missing
     return Recording(
         name=name,
         subject=subject,
@@ -123,8 +123,8 @@ def recording(
         cameras=cameras,
         key_points=(pixels.numpy() + rng.normal(0, 5, pixels.shape)).astype(np.float32),
         confidence=rng.random((frames, views, 17), dtype=np.float32),
-        seen=seen,
+        valid=valid,
         truth=truth.astype(np.float32),
-        truth_seen=np.ones((frames, 17), bool),
+        truth_valid=np.ones((frames, 17), bool),
         frame=np.arange(frames),
     )

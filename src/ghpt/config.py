@@ -59,8 +59,8 @@ def locate(node: Mapping[str, Any], path: str) -> Callable[..., Any]:
     except (StopIteration, AttributeError):
         found = None
     if not callable(found):
-        mend = "Check the spelling of the full name."
-        raise GhptConfigError(f"{path}._target_", f"no class {target!r}", mend)
+        hint = "Check the spelling of the full name."
+        raise GhptConfigError(f"{path}._target_", f"no class {target!r}", hint)
     return found
 
 
@@ -91,7 +91,7 @@ def build(config: Any, path: str = "config", find: Find = locate) -> Any:
     except GhptConfigError as error:
         if error.key not in values:
             raise
-        raise GhptConfigError(f"{path}.{error.key}", error.problem, error.mend) from error
+        raise GhptConfigError(f"{path}.{error.key}", error.problem, error.hint) from error
 
 
 def check_plain(config: Any, path: str) -> None:

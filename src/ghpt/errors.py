@@ -24,35 +24,35 @@ def _again(kind: type[GhptError], text: str, attributes: dict[str, Any]) -> Ghpt
 class GhptDataError(GhptError):
     """Bad input data: a file, folder, array or camera.
 
-    Reads as ``WHERE: FIELD: PROBLEM. MEND`` (``field`` may be empty).
+    Reads as ``WHERE: FIELD: PROBLEM. HINT`` (``field`` may be empty).
     """
 
-    def __init__(self, where: object, field: str, problem: str, mend: str) -> None:
+    def __init__(self, where: object, field: str, problem: str, hint: str) -> None:
         self.where = str(where)
         self.field = field
         self.problem = problem
-        self.mend = mend
-        super().__init__(f"{where}: {f'{field}: ' if field else ''}{problem}. {mend}")
+        self.hint = hint
+        super().__init__(f"{where}: {f'{field}: ' if field else ''}{problem}. {hint}")
 
 
 class GhptConfigError(GhptError):
-    """A setting that cannot work. Reads as ``KEY: PROBLEM. MEND``."""
+    """A setting that cannot work. Reads as ``KEY: PROBLEM. HINT``."""
 
-    def __init__(self, key: str, problem: str, mend: str) -> None:
+    def __init__(self, key: str, problem: str, hint: str) -> None:
         self.key = key
         self.problem = problem
-        self.mend = mend
-        super().__init__(f"{key}: {problem}. {mend}")
+        self.hint = hint
+        super().__init__(f"{key}: {problem}. {hint}")
 
 
 class GhptCheckpointError(GhptError):
     """A checkpoint that is missing, damaged, foreign, or of another model."""
 
-    def __init__(self, path: object, problem: str, mend: str) -> None:
+    def __init__(self, path: object, problem: str, hint: str) -> None:
         self.path = str(path)
         self.problem = problem
-        self.mend = mend
-        super().__init__(f"{path}: {problem}. {mend}")
+        self.hint = hint
+        super().__init__(f"{path}: {problem}. {hint}")
 
 
 def one_line(error: BaseException) -> str:
@@ -66,16 +66,16 @@ def out_of_memory(error: Exception) -> GhptConfigError | None:
     if not (isinstance(error, MemoryError) or torch_s):
         return None
     lines = str(error).splitlines() or ["an allocation failed"]
-    mend = "Give smaller batches or fewer hypotheses, or close other programs."
-    return GhptConfigError("memory", f"there is not enough ({lines[0][:200].rstrip('.')})", mend)
+    hint = "Give smaller batches or fewer hypotheses, or close other programs."
+    return GhptConfigError("memory", f"there is not enough ({lines[0][:200].rstrip('.')})", hint)
 
 
-def check(condition: bool, key: str, problem: str, mend: str) -> None:
+def check(condition: bool, key: str, problem: str, hint: str) -> None:
     """Raise GhptConfigError unless ``condition`` holds: for the constructors that yaml values
     reach.
     """
     if not condition:
-        raise GhptConfigError(key, problem, mend)
+        raise GhptConfigError(key, problem, hint)
 
 
 def check_positive(**values: float | int) -> None:

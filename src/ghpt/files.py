@@ -325,8 +325,8 @@ def acquire(path: Path, problem: str) -> BaseFileLock:
         except NotImplementedError:
             continue
         except (Timeout, RuntimeError):  # RuntimeError: held by this very thread
-            mend = "Wait for it, or name another output."
-            raise GhptDataError(path.parent, "", problem, mend) from None
+            hint = "Wait for it, or name another output."
+            raise GhptDataError(path.parent, "", problem, hint) from None
         return lock
     raise GhptDataError(
         path.parent, "", "cannot be locked on this file system", "Name another output."

@@ -37,7 +37,7 @@ class About:
 
     name: str
     source: str
-    """``embedded`` or the path of the key points."""
+    """``synthetic`` or the path of the key points."""
     estimator: str
     """``view_weights`` of a checkpoint, or a classical estimator's name."""
     joints: tuple[str, ...]
@@ -72,7 +72,7 @@ class Reconstruction:
     """Mean logit of the pool under its weights for a learned estimator: higher is more plausible; 0
     for others.
     """
-    swapped: Bool[Tensor, "T V"]
+    flipped: Bool[Tensor, "T V"]
     """Views in which left and right were exchanged before triangulating."""
 
     def __len__(self) -> int:

@@ -36,10 +36,10 @@ class Recording:
     """Undistorted pixels, float32."""
     confidence: Float[np.ndarray, "T V J"]
     """The detector's own, in [0, 1]; 1 where the detector gives none."""
-    seen: Bool[np.ndarray, "T V J"]
+    valid: Bool[np.ndarray, "T V J"]
     truth: Float[np.ndarray, "T J 3"]
     """World frame, mm."""
-    truth_seen: Bool[np.ndarray, "T J"]
+    truth_valid: Bool[np.ndarray, "T J"]
     """All False in a recording without ground truth."""
     frame: Int[np.ndarray, " T"]
     """The data set's own frame number."""
@@ -49,7 +49,7 @@ class Recording:
 
 
 @dataclass(frozen=True)
-class KeyPointBatch:
+class Observations:
     """B frames, from any recordings of one camera arrangement."""
 
     sample: Int[Tensor, " B"]
@@ -62,26 +62,26 @@ class KeyPointBatch:
     """K, R, t with leading dimensions B V, float64."""
     key_points: Float[Tensor, "B V J 2"]
     confidence: Float[Tensor, "B V J"]
-    seen: Bool[Tensor, "B V J"]
+    valid: Bool[Tensor, "B V J"]
     truth: Float[Tensor, "B J 3"]
-    truth_seen: Bool[Tensor, "B J"]
+    truth_valid: Bool[Tensor, "B J"]
 
     def __len__(self) -> int:
         return len(self.sample)
 
-    def to(self, *args: Any, **kwargs: Any) -> KeyPointBatch:
+    def to(self, *args: Any, **kwargs: Any) -> Observations:
         """Move to a device."""
-        return KeyPointBatch(
+        return Observations(
             **{f.name: getattr(self, f.name).to(*args, **kwargs) for f in fields(self)}
         )
 
-    def rows(self, index: Int[Tensor, " b"]) -> KeyPointBatch:
+    def rows(self, index: Int[Tensor, " b"]) -> Observations:
         """The frames at these places."""
         parts = {f.name: getattr(self, f.name)[index] for f in fields(self) if f.name != "cameras"}
-        return KeyPointBatch(cameras=self.cameras.index(index), **parts)
+        return Observations(cameras=self.cameras.index(index), **parts)
 
-    def pin_memory(self) -> KeyPointBatch:
-        return KeyPointBatch(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
+    def pin_memory(self) -> Observations:
+        return Observations(**{f.name: getattr(self, f.name).pin_memory() for f in fields(self)})
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class PairBatch:
     """
     key_points: Float[Tensor, "B V M J 2"]
     confidence: Float[Tensor, "B V M J"]
-    seen: Bool[Tensor, "B V M J"]
+    valid: Bool[Tensor, "B V M J"]
     points: Float[Tensor, "B P 3"]
     """Random points of the capture volume, world, mm: the paper's X*."""
 
@@ -144,7 +144,7 @@ class PairBatch:
         points = normalise(
             self.of_pair(self.cameras.K), self.of_pair(self.key_points).flatten(2, 3)
         )
-        both = self.of_pair(self.seen).flatten(2, 3).all(dim=1) & torch.isfinite(points).all(
+        both = self.of_pair(self.valid).flatten(2, 3).all(dim=1) & torch.isfinite(points).all(
             -1
         ).all(1)
         points = torch.where(both[:, None, :, None], points, 0.0)
@@ -167,6 +167,6 @@ class RelativePoseEstimate:
     estimated: Bool[Tensor, "*B"]
 
 
-def joints_with_enough_views(seen: Bool[Tensor, "*B V J"], least: int = 2) -> Bool[Tensor, "*B J"]:
+def joints_with_enough_views(valid: Bool[Tensor, "*B V J"], least: int = 2) -> Bool[Tensor, "*B J"]:
     """Which joints are seen in at least ``least`` views, the fewest that triangulation needs."""
-    return seen.sum(dim=-2) >= least
+    return valid.sum(dim=-2) >= least

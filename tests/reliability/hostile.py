@@ -392,9 +392,9 @@ def part_of(found: Any, whole: Any) -> bool:
     rows, views = len(one["row"]), [other["views"].index(view) for view in one["views"]]
     kept = np.isin(other["view"], views) & np.isin(other["frame"][other["row"]], one["frame"])
     at = np.flatnonzero(kept)
-    seen = one["seen"]
+    valid = one["seen"]
     return rows <= len(at) and all(
-        np.array_equal(one[name][seen], other[name][at[:rows]][seen])
+        np.array_equal(one[name][valid], other[name][at[:rows]][valid])
         for name in ("key_points", "confidence")
     )
 

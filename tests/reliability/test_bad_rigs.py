@@ -10,50 +10,50 @@ import torch
 from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.relative_pose.scale import BodyHeight, average_lengths, body_scale
 from ghpt.skeleton import BONES, MIRROR
-from rigs_with_people import People, calibration, people, relative
+from rigs_with_people import Detections, calibration, people, relative
 
 CALIBRATE = calibration()
 SIDES = list(MIRROR)
 
 
-def unlinked(scene: People) -> People:
-    seen = scene.seen.clone()
-    seen[:40, 3], seen[40:, :3] = False, False
-    return replace(scene, seen=seen)
+def unlinked(scene: Detections) -> Detections:
+    valid = scene.valid.clone()
+    valid[:40, 3], valid[40:, :3] = False, False
+    return replace(scene, valid=valid)
 
 
-def one_frame(scene: People) -> People:
-    return replace(scene, key_points=scene.key_points[:1], seen=scene.seen[:1])
+def one_frame(scene: Detections) -> Detections:
+    return replace(scene, key_points=scene.key_points[:1], valid=scene.valid[:1])
 
 
-def constant_pose(scene: People) -> People:
+def constant_pose(scene: Detections) -> Detections:
     noise = torch.randn(
         scene.key_points.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
     )
     return replace(
         scene,
         key_points=scene.key_points[:1] + 3 * noise,
-        seen=scene.seen[:1].expand_as(scene.seen),
+        valid=scene.valid[:1].expand_as(scene.valid),
     )
 
 
-def flipped(scene: People) -> torch.Tensor:
+def flipped(scene: Detections) -> torch.Tensor:
     key_points = scene.key_points[:, 1].clone()
     key_points[..., 0] = scene.sizes[1, 0] - 1 - key_points[..., 0]
     return key_points
 
 
-def unsynchronised(scene: People) -> People:
-    return scene.changed(3, scene.key_points[:, 3].roll(len(scene.seen) // 2, 0))
+def unsynchronised(scene: Detections) -> Detections:
+    return scene.changed(3, scene.key_points[:, 3].roll(len(scene.valid) // 2, 0))
 
 
-def with_K(scene: People, views: list[int], factor: float) -> People:
+def with_K(scene: Detections, views: list[int], factor: float) -> Detections:
     K = scene.K.clone()
     K[views, :2] *= factor
     return replace(scene, K=K)
 
 
-def exchanged(scene: People) -> People:
+def exchanged(scene: Detections) -> Detections:
     """The names of two cameras with different lenses and image sizes."""
     K = scene.K.clone()
     K[2, 0, 0] = K[2, 1, 1] = 1.6 * K[2, 0, 0]
@@ -61,10 +61,10 @@ def exchanged(scene: People) -> People:
     centre = scene.K[2, :2, 2]
     moved[:, 2] = centre + 1.6 * (moved[:, 2] - centre)
     names = [0, 2, 1, 3]
-    return replace(scene, K=K, key_points=moved[:, names], seen=scene.seen[:, names])
+    return replace(scene, K=K, key_points=moved[:, names], valid=scene.valid[:, names])
 
 
-def doubled(scene: People) -> People:
+def doubled(scene: Detections) -> Detections:
     noise = torch.randn(
         scene.key_points[:, 0].shape,
         dtype=torch.float64,
@@ -139,7 +139,7 @@ def test_d6_good_rigs_are_not_slandered(scene, nightly, record_row):
 def test_d6_30_percent_outliers_still_work(far, record_row):
     scene = people()
     generator = torch.Generator().manual_seed(3)
-    out = torch.rand(scene.seen.shape, generator=generator) < 0.3
+    out = torch.rand(scene.valid.shape, generator=generator) < 0.3
     anywhere = (
         torch.rand(scene.key_points.shape, generator=generator, dtype=torch.float64)
         * scene.sizes[:, None]

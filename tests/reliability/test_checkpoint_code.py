@@ -246,10 +246,10 @@ def test_a5_no_checkpoint_chooses_what_is_run(
         save_with(trained, path, problem=problem)
         lay_out(victim)
         before = content(victim)
-        with watch() as seen, pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: ") as caught:
+        with watch() as valid, pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: ") as caught:
             load_model(path)
         assert "\n" not in str(caught.value)
-        if not seen and content(victim) == before and "evil_module" not in sys.modules:
+        if not valid and content(victim) == before and "evil_module" not in sys.modules:
             refused.append(name)
     record_row("A5", f"{len(cases)} targets in checkpoints, none called", len(refused), len(cases))
     assert refused == list(cases)
@@ -278,12 +278,12 @@ def test_every_payload_would_be_called_if_any_target_could_be_named(
         lay_out(victim)
         before = content(victim)
         called.clear()
-        with watch() as seen, suppress(Exception, SystemExit):
+        with watch() as valid, suppress(Exception, SystemExit):
             load_model(path)
         wanted = problem if name.startswith("_target_") else {"_target_": "evil_module.Evil"}
         if locate(wanted, "") in called:
             reached.append(name)
-        if seen or content(victim) != before:
+        if valid or content(victim) != before:
             changed.append(name)
     print("reached the system:", changed)
     assert reached == list(cases)
@@ -340,9 +340,9 @@ def test_a5_no_pickle_runs(tmp_path: Path, trained: Path, record_row: Callable[.
     refused, cases = [], pickles(trained, sentinel)
     for name, write in cases.items():
         write(path)
-        with watch() as seen, pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: "):
+        with watch() as valid, pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: "):
             load_model(path)
-        if not seen and not sentinel.exists():
+        if not valid and not sentinel.exists():
             refused.append(name)
     record_row("A5", f"{len(cases)} pickles in checkpoints, none run", len(refused), len(cases))
     assert refused == list(cases)

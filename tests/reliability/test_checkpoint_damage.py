@@ -26,7 +26,13 @@ from ghpt.commands.train import resumable, train
 from ghpt.config import build
 from ghpt.errors import GhptCheckpointError
 from ghpt.models import checkpoint as module_of_checkpoints
-from ghpt.models.checkpoint import FIELD, AtomicCheckpointIO, load_model, read_checkpoint
+from ghpt.models.checkpoint import (
+    FIELD,
+    FORMAT_VERSION,
+    AtomicCheckpointIO,
+    load_model,
+    read_checkpoint,
+)
 from signing import save_signed, signed
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
@@ -266,7 +272,9 @@ def mutated(whole: bytes, chance: random.Random) -> bytes | None:
             chance.choice(("optimizer_states", "loops", "epoch", "global_step", "state_dict"))
         ]
     else:
-        checkpoint[FIELD]["format_version"] = chance.choice((1, 3, "2", 2.5, None, True))
+        checkpoint[FIELD]["format_version"] = chance.choice(
+            (1, FORMAT_VERSION + 1, "3", 2.5, None, True)
+        )
     content = io.BytesIO()
     torch.save(checkpoint, content)
     return signed(content.getvalue())

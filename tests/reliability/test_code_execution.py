@@ -159,14 +159,14 @@ def test_labels_run_nothing(tmp_path: Path, record_row: Callable[..., None]) -> 
     for name, pickled in cases.items():
         file.write_bytes(header + pickled)
         with (
-            watch() as seen,
+            watch() as valid,
             pytest.raises(GhptDataError, match=r"is not a labels file|is missing") as caught,
         ):
             read_labels(file)
-        if not sentinel.exists() and not seen and str(file) in str(caught.value):
+        if not sentinel.exists() and not valid and str(file) in str(caught.value):
             refused.append(name)
         else:
-            print(name, seen)
+            print(name, valid)
     record_row(
         "A5",
         f"labels: {len(cases)} payloads, none run, all refused by GhptDataError",
@@ -182,12 +182,12 @@ def test_the_payloads_do_run_when_they_are_let(tmp_path: Path) -> None:
     ran = []
     for name, pickled in payloads(sentinel).items():
         try:
-            with watch() as seen:
+            with watch() as valid:
                 pickle.loads(pickled)
         except Exception:
             pass
         if sentinel.exists() or any(
-            not attempt.startswith("pickle.find_class") for attempt in seen
+            not attempt.startswith("pickle.find_class") for attempt in valid
         ):
             ran.append(name)
         sentinel.unlink(missing_ok=True)
@@ -211,8 +211,8 @@ def test_arrays_of_objects_run_nothing(
     )
     with pytest.raises(GhptDataError):
         read()  # what Python imports at the first use is not the file's doing
-    with watch() as seen, pytest.raises(GhptDataError, match="Python objects"):
+    with watch() as valid, pytest.raises(GhptDataError, match="Python objects"):
         read()
     assert not sentinel.exists()
-    assert not seen
+    assert not valid
     record_row("A5", f"{name} of objects: nothing run, refused by GhptDataError", 1, 1)

@@ -344,8 +344,8 @@ def test_d2_no_point_is_found_in_a_camera_s_own_centre(record_row):
     accepted = 0
     for cameras, key_points in ((doubled, twice), (scene.cameras, inside)):
         accepted += int(triangulate(cameras, key_points, ones(scene)).ok.sum())
-        seen = torch.ones(key_points.shape[:-1], dtype=torch.bool)
-        accepted += int(triangulate_subsets(cameras, key_points, seen, seen.mT[:, None])[1].sum())
+        valid = torch.ones(key_points.shape[:-1], dtype=torch.bool)
+        accepted += int(triangulate_subsets(cameras, key_points, valid, valid.mT[:, None])[1].sum())
     total = 4 * 300 * 17
     record_row("D2", "points in a camera's own centre", total - accepted, total)
     assert accepted == 0
@@ -356,15 +356,15 @@ def test_d2_subsets_refuse_degenerate_frames_and_spoil_no_other(record_row):
     wrong = []
     for hypotheses in (10, 40):  # solved one by one, and looked up
         keys = key(0, "battery", torch.arange(100))
-        seen = torch.ones(large.key_points.shape[:-1], dtype=torch.bool)
-        subsets = random_subsets(seen, hypotheses, keys)
+        valid = torch.ones(large.key_points.shape[:-1], dtype=torch.bool)
+        subsets = random_subsets(valid, hypotheses, keys)
         others = torch.arange(100) != 50
-        good, _ = triangulate_subsets(large.cameras, large.key_points, seen, subsets)
+        good, _ = triangulate_subsets(large.cameras, large.key_points, valid, subsets)
         for name, (_, status) in DEGENERATE.items():
             if "weight" in name:
                 continue
             scene, own = degenerate(name)
-            mixed, visible = put(large, seen, 50, scene, own > 0)
+            mixed, visible = put(large, valid, 50, scene, own > 0)
             subsets[50] = (own > 0).mT
             points, ok = triangulate_subsets(mixed.cameras, mixed.key_points, visible, subsets)
             if ok[50].any() != (status == S.OK) or ok[50].all() != (status == S.OK):
@@ -380,7 +380,7 @@ def test_d2_subsets_refuse_degenerate_frames_and_spoil_no_other(record_row):
 def test_d2_classical_estimators_invent_nothing_and_spoil_no_other(name, nightly, record_row):
     frames = 1000 if nightly else 60
     large = cut(random_scene(0, frames, 4), 3).noisy(2, 0)
-    seen = torch.ones(large.key_points.shape[:-1], dtype=torch.bool)
+    valid = torch.ones(large.key_points.shape[:-1], dtype=torch.bool)
     good = BASELINES[name](large.batch())
     others = torch.arange(frames) != 50
     wrong = []
@@ -388,7 +388,7 @@ def test_d2_classical_estimators_invent_nothing_and_spoil_no_other(name, nightly
         if "weight" in case:
             continue
         scene, own = degenerate(case)
-        mixed, visible = put(large, seen, 50, scene, own > 0)
+        mixed, visible = put(large, valid, 50, scene, own > 0)
         estimate = BASELINES[name](mixed.batch(visible))
         # with one bad view of four a robust estimator may go on without it; behind a camera it may
         # leave that out
@@ -498,15 +498,15 @@ def test_d3_is_recorded(record_row):
     assert tally["examples"] >= 500
 
 
-def everything(scene, seen):
+def everything(scene, valid):
     """All geometry of a batch, as a list of tensors with the frames first."""
-    result = triangulate(scene.cameras, scene.key_points, seen.double())
+    result = triangulate(scene.cameras, scene.key_points, valid.double())
     keys = key(5, "battery", scene.points[:, 0, 0].view(torch.int64))
-    few, many = (random_subsets(seen, n, keys) for n in (20, 200))
+    few, many = (random_subsets(valid, n, keys) for n in (20, 200))
     found = [result.points, result.status, result.angle, result.depth_min, few, many]
     for subsets in (few, many):
-        found += triangulate_subsets(scene.cameras, scene.key_points, seen, subsets)
-    batch = replace(scene.batch(seen), sample=keys)
+        found += triangulate_subsets(scene.cameras, scene.key_points, valid, subsets)
+    batch = replace(scene.batch(valid), sample=keys)
     for name in ("linear", "ransac_random", "m_estimator"):
         estimate = BASELINES[name](batch)
         found += [estimate.points, estimate.estimated]
@@ -516,12 +516,14 @@ def everything(scene, seen):
 @pytest.mark.parametrize("views", [3, 7, 31])
 def test_c4_a_frame_s_geometry_is_the_same_in_any_batch_on_any_threads(views, nightly, record_row):
     scene = random_scene(views, 64, views).noisy(2, 0)
-    seen = torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.8
+    valid = (
+        torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.8
+    )
     before = torch.get_num_threads()
     worst, unequal, total = 0.0, 0, 0
     try:
         torch.set_num_threads(1)
-        whole = everything(scene, seen)
+        whole = everything(scene, valid)
         for threads, size, frames in (
             (2, 64, 64),
             (1, 1, 64 if nightly else 3),
@@ -531,7 +533,7 @@ def test_c4_a_frame_s_geometry_is_the_same_in_any_batch_on_any_threads(views, ni
             for start in range(0, frames, size):
                 part = slice(start, start + size)
                 own = Scene(scene.cameras.index(part), scene.points[part], scene.key_points[part])
-                for a, b in zip(everything(own, seen[part]), whole, strict=True):
+                for a, b in zip(everything(own, valid[part]), whole, strict=True):
                     total += 1
                     if a.dtype.is_floating_point:
                         worst = max(worst, float((a - b[part]).abs().max() / 6000))
@@ -588,13 +590,13 @@ def test_c5_nothing_in_gives_nothing_out(frames, joints, hypotheses, views):
         ),
         joints,
     )
-    seen = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
-    assert triangulate(scene.cameras, scene.key_points, seen.double()).points.shape == (
+    valid = torch.ones(scene.key_points.shape[:-1], dtype=torch.bool)
+    assert triangulate(scene.cameras, scene.key_points, valid.double()).points.shape == (
         frames,
         joints,
         3,
     )
     subsets = torch.ones(frames, hypotheses, joints, views, dtype=torch.bool)
-    points, ok = triangulate_subsets(scene.cameras, scene.key_points, seen, subsets)
+    points, ok = triangulate_subsets(scene.cameras, scene.key_points, valid, subsets)
     assert points.shape == (frames, hypotheses, joints, 3)
     assert ok.shape == (frames, hypotheses, joints)

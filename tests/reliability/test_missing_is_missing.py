@@ -13,9 +13,9 @@ from ghpt.export import WRITERS, read_reconstruction
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.models.estimators.classical import Linear
 from ghpt.models.estimators.predictors import Classical
-from ghpt.models.estimators.uncertainty import Quality
+from ghpt.models.estimators.uncertainty import UncertaintyModel
 from ghpt.reconstruction import About, State
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 from ghpt.skeleton import JOINTS
 from predicting import walk
 
@@ -25,7 +25,7 @@ T, V, J = 40, 4, len(JOINTS)
 FILES = 60
 """Of 17 joints with a pattern of gaps each: 1020."""
 RIG = human36m_rig("S9")
-ABOUT = About("walk", "embedded", "linear", JOINTS, RIG.names, 50.0, False, {})
+ABOUT = About("walk", "synthetic", "linear", JOINTS, RIG.names, 50.0, False, {})
 
 
 def pattern(rng: np.random.Generator) -> np.ndarray:
@@ -39,23 +39,23 @@ def pattern(rng: np.random.Generator) -> np.ndarray:
     return draws[start : start + T] >= share
 
 
-def batch(seen: np.ndarray, rng: np.random.Generator) -> KeyPointBatch:
+def batch(valid: np.ndarray, rng: np.random.Generator) -> Observations:
     """What is not seen holds numbers that would show: zeros, NaN, or far off."""
     pixels = project(RIG.cameras, walk()[:T])[0]
-    spoilt = torch.tensor([0.0, np.nan, 1e6])[rng.integers(0, 3, seen.shape)].double()[..., None]
-    there = torch.from_numpy(seen)
+    spoilt = torch.tensor([0.0, np.nan, 1e6])[rng.integers(0, 3, valid.shape)].double()[..., None]
+    there = torch.from_numpy(valid)
     cameras = Cameras(
         *(x.expand(T, *x.shape) for x in (RIG.cameras.K, RIG.cameras.R, RIG.cameras.t))
     )
-    return KeyPointBatch(
+    return Observations(
         sample=torch.arange(T),
         recording=torch.zeros(T, dtype=torch.int64),
         cameras=cameras,
         key_points=torch.where(there[..., None], pixels, spoilt),
         confidence=there.double(),
-        seen=there,
+        valid=there,
         truth=torch.zeros(T, J, 3),
-        truth_seen=torch.zeros(T, J, dtype=torch.bool),
+        truth_valid=torch.zeros(T, J, dtype=torch.bool),
     )
 
 
@@ -72,13 +72,13 @@ def cells(path) -> np.ndarray:
 def test_d7_no_value_without_its_state(tmp_path, record_row):
     rng, checked, violations, filled = np.random.default_rng(0), 0, 0, 0
     predictor = Classical(
-        Linear(), Quality(noise=None, prior=10.0, shared=0.0), swaps=None, reject=None
+        Linear(), UncertaintyModel(noise=None, prior=10.0, shared=0.0), flips=None, reject=None
     )
     for number in range(FILES):
-        seen = pattern(rng)
+        valid = pattern(rng)
         folder = tmp_path / str(number)
         shards = Shards(folder, "key", T, 16)
-        whole = predictor(batch(seen, rng))
+        whole = predictor(batch(valid, rng))
         for shard in shards.missing():
             rows = slice(shards.rows(shard).start, shards.rows(shard).stop)
             shards.write(
@@ -91,7 +91,7 @@ def test_d7_no_value_without_its_state(tmp_path, record_row):
         shards.close()
         found = next(read_reconstruction(folder / "poses.npz")[1])
         state = found.state.numpy()
-        two = seen.sum(1) >= 2
+        two = valid.sum(1) >= 2
         expected = state == State.OBSERVED
         raw = np.load(folder / "poses.npz")
         c3d = ezc3d.c3d(str(folder / "poses.c3d"))

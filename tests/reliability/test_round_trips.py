@@ -225,7 +225,7 @@ def test_e1_npz_by_numpy_and_by_its_own_reader(tmp_path):
     assert read == who
     parts = list(parts)
     assert [len(p) for p in parts] == [7] * 7 + [1]
-    for field in ("frame", "state", "error", "views", "covariance", "score", "swapped"):
+    for field in ("frame", "state", "error", "views", "covariance", "score", "flipped"):
         assert torch.equal(torch.cat([getattr(p, field) for p in parts]), getattr(made, field)), (
             field
         )

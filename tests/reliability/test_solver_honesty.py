@@ -28,17 +28,17 @@ def random_problem(rng: np.random.Generator) -> tuple[Observations, Rig]:
     x = points @ R.mT + t[:, None]
     noise = torch.full((views, joints), 0.003, dtype=torch.float64)
     xy = x[..., :2] / x[..., 2:] + 0.003 * torch.from_numpy(rng.normal(0, 1, (views, joints, 2)))
-    seen = torch.from_numpy(rng.uniform(size=(views, joints)) < rng.uniform(0.3, 1.0))
+    valid = torch.from_numpy(rng.uniform(size=(views, joints)) < rng.uniform(0.3, 1.0))
     off = float(rng.choice([0.0, 0.01, 0.1, 1.0, 100.0]))
     R = vector_to_matrix(off * torch.from_numpy(rng.normal(0, 1, (views, 3)))) @ R
     t, points = (a + off * torch.from_numpy(rng.normal(0, 1, tuple(a.shape))) for a in (t, points))
     if rng.uniform() < 1 / 3:
         broken = (xy, t, points)[int(rng.integers(3))]
         broken.view(-1)[int(rng.integers(broken.numel()))] = float(rng.choice(SPOILT))
-    seen &= seen.sum(0) >= 2
+    valid &= valid.sum(0) >= 2
     frame = torch.zeros(joints, dtype=torch.int64)
-    return Observations(xy, noise, seen, frame, torch.arange(joints)), Rig(
-        R, t, torch.ones(views, dtype=torch.bool), points, seen
+    return Observations(xy, noise, valid, frame, torch.arange(joints)), Rig(
+        R, t, torch.ones(views, dtype=torch.bool), points, valid
     )
 
 

@@ -54,13 +54,13 @@ class RigBaseline:
         # the sum tells draws of different data sets apart, whose numbers are the same
         known = int(batch.rig[item]), int(batch.draw[item]), float(key_points.double().sum())
         if known not in self._found:
-            confidence, seen = (
-                x[item].transpose(0, 1).cpu() for x in (batch.confidence, batch.seen)
+            confidence, valid = (
+                x[item].transpose(0, 1).cpu() for x in (batch.confidence, batch.valid)
             )
             K = batch.cameras.K[item].double().cpu()
             names = [str(view) for view in range(len(K))]
             self._found[known] = self.calibration(
-                names, K, key_points, confidence, seen, None, self.seed
+                names, K, key_points, confidence, valid, None, self.seed
             )
         self._found.move_to_end(known)
         while len(self._found) > self.remembered:

@@ -85,7 +85,7 @@ class Case:
         """Median error in pixels, and share of inliers, of each placed view's key points whose
         point is known.
         """
-        known = self.seen_by.seen & rig.inlier.any(0) & rig.placed[:, None]
+        known = self.seen_by.valid & rig.inlier.any(0) & rig.placed[:, None]
         focal = (self.K[:, 0, 0] * self.K[:, 1, 1]).double().sqrt()[:, None]
         pixels = self.seen_by.error(rig.R, rig.t, rig.points) * self.seen_by.noise * focal
         median = (

@@ -287,12 +287,12 @@ class Diagnostics:
             )
 
 
-def _motion(key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]) -> float:
+def _motion(key_points: Float[Tensor, "T V J 2"], valid: Bool[Tensor, "T V J"]) -> float:
     """Median over the joints of the spread (half the range of the middle 80 %) of their place, in
     persons' sizes, in the view with most.
     """
-    size = typical_size(key_points.double(), seen)
-    place = torch.where(seen[..., None], key_points.double(), torch.nan)
+    size = typical_size(key_points.double(), valid)
+    place = torch.where(valid[..., None], key_points.double(), torch.nan)
     if not len(place):
         return 0.0
     low, high = place.nanquantile(torch.tensor([0.1, 0.9], dtype=torch.float64), dim=0)

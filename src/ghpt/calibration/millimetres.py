@@ -64,24 +64,24 @@ def read_scale(scale: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]
 
 
 def _height(key: str, value: Any) -> float:
-    mend = "Give the person's height in millimetres: 1750, say."
-    check(_is_number(value), key, f"is {value}", mend)
+    hint = "Give the person's height in millimetres: 1750, say."
+    check(_is_number(value), key, f"is {value}", hint)
     low, high = _HEIGHTS
     fits = [unit for unit, mm in UNITS.items() if low <= float(value) * mm <= high]
-    check(bool(fits), key, f"is {value}, which is nobody's height in mm, cm or m", mend)
+    check(bool(fits), key, f"is {value}, which is nobody's height in mm, cm or m", hint)
     return _in_mm(key, float(value), fits[0])
 
 
 def _segments(lengths: Mapping[str, Any]) -> dict[str, float]:
     """All in one unit: that in which each of them is the length of such a part of a person."""
     key = "scale.segments"
-    mend = "Give lengths in millimetres: {thigh: 430}, say."
+    hint = "Give lengths in millimetres: {thigh: 430}, say."
     for name, value in lengths.items():
-        check(_is_number(value), key, f"says {name} is {value!r}", mend)
+        check(_is_number(value), key, f"says {name} is {value!r}", hint)
     try:
         SegmentLengths({str(name): float(value) for name, value in lengths.items()})
     except GhptConfigError as error:
-        raise GhptConfigError(key, error.problem, error.mend) from error
+        raise GhptConfigError(key, error.problem, error.hint) from error
     typical = dict(zip(SEGMENTS, typical_lengths(), strict=True))
     low, high = (stature * part for stature, part in zip(_STATURES, _PROPORTIONS, strict=True))
     fits = set(UNITS)
@@ -90,29 +90,29 @@ def _segments(lengths: Mapping[str, Any]) -> dict[str, float]:
         own = {
             unit for unit, mm in UNITS.items() if low * share <= float(value) * mm <= high * share
         }
-        check(bool(own), key, f"says {name} is {value}, which is nobody's in mm, cm or m", mend)
+        check(bool(own), key, f"says {name} is {value}, which is nobody's in mm, cm or m", hint)
         fits &= own
-    check(bool(fits), key, f"has lengths of different units: {dict(lengths)}", mend)
+    check(bool(fits), key, f"has lengths of different units: {dict(lengths)}", hint)
     (unit,) = fits
     return {name: _in_mm(f"{key}.{name}", float(value), unit) for name, value in lengths.items()}
 
 
 def _baseline(baseline: Sequence[Any], names: Sequence[str]) -> list[Any]:
     key = "scale.baseline"
-    mend = (
+    hint = (
         f"Give two of {', '.join(names)} and their distance in mm: [{names[0]}, {names[-1]}, 3000]."
     )
     good = (
         len(baseline) == 3
         and len({chosen_name(name, names) for name in baseline[:2]} & set(names)) == 2
     )
-    check(good and _is_number(baseline[2]), key, f"is {baseline}", mend)
+    check(good and _is_number(baseline[2]), key, f"is {baseline}", hint)
     length = float(baseline[2])
     (least, most) = _APART
     if length >= least:
         return [*baseline[:2], length]
     metres = least <= length * UNITS["metres"] <= most
-    check(metres, key, f"is {baseline}: two cameras are not {length:g} mm apart", mend)
+    check(metres, key, f"is {baseline}: two cameras are not {length:g} mm apart", hint)
     return [*baseline[:2], _in_mm(key, length, "metres")]
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.epipolar import normalise
-from ghpt.models.estimators.classical import person_size
+from ghpt.models.estimators.classical import person_scale
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Observations:
     """Standard deviation that is assumed of x and of y, > 0: errors in units of it compare across
     views and joints.
     """
-    seen: Bool[Tensor, "V N"]
+    valid: Bool[Tensor, "V N"]
     frame: Int[Tensor, " N"]
     """Which of the T frames a point is of."""
     joint: Int[Tensor, " N"]
@@ -50,21 +50,21 @@ class Observations:
 
 
 def usable(
-    K: Float[Tensor, "V 3 3"], key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]
+    K: Float[Tensor, "V 3 3"], key_points: Float[Tensor, "T V J 2"], valid: Bool[Tensor, "T V J"]
 ) -> Bool[Tensor, "T V J"]:
     """Seen key points with finite numbers, in views with finite intrinsics and positive focal
     lengths.
     """
     focal = torch.stack((K[:, 0, 0], K[:, 1, 1]), dim=-1)
-    valid = torch.isfinite(K).all(-1).all(-1) & (focal > 0).all(-1)
-    return seen & torch.isfinite(key_points).all(-1) & valid[:, None]
+    usable_camera = torch.isfinite(K).all(-1).all(-1) & (focal > 0).all(-1)
+    return valid & torch.isfinite(key_points).all(-1) & usable_camera[:, None]
 
 
 def typical_size(
-    key_points: Float[Tensor, "T V J 2"], seen: Bool[Tensor, "T V J"]
+    key_points: Float[Tensor, "T V J 2"], valid: Bool[Tensor, "T V J"]
 ) -> Float[Tensor, " V"]:
     """Median over the frames of the person's size in each view, pixels; NaN where nobody is seen."""
-    size = person_size(key_points, seen)
+    size = person_scale(key_points, valid)
     missing = torch.full_like(size[:0].sum(0), torch.nan)
     return torch.where(size > 0, size, torch.nan).nanmedian(0).values if len(size) else missing
 
@@ -72,7 +72,7 @@ def typical_size(
 def choose_frames(
     key_points: Float[Tensor, "T V J 2"],
     confidence: Float[Tensor, "T V J"],
-    seen: Bool[Tensor, "T V J"],
+    valid: Bool[Tensor, "T V J"],
     most: int,
 ) -> Int[Tensor, " F"]:
     """At most ``most`` frames, in order, that cover the time and the places where the person stood.
@@ -82,7 +82,7 @@ def choose_frames(
     into cells by where the person is in every view (in persons' sizes), and taken best of each cell
     first, then second best, and so on.
     """
-    both = seen & (seen.sum(1, keepdim=True) >= 2)
+    both = valid & (valid.sum(1, keepdim=True) >= 2)
     score = (confidence.double().nan_to_num(0.0).clamp(0, 1) * both).sum((1, 2))
     frames = torch.nonzero(both.any(2).any(1))[:, 0]
     if len(frames) <= most:
@@ -90,11 +90,11 @@ def choose_frames(
     # stable: among equals the first, so the choice is the same on any machine
     order = frames[torch.sort(score[frames], descending=True, stable=True).indices]
     order = order[_rank(order * (4 * most) // len(key_points)) == 0]
-    size = typical_size(key_points.double(), seen)
-    count = seen.sum(2).clamp(min=1)[..., None]
-    middle = torch.where(seen[..., None], key_points.double(), 0.0).sum(2) / count
+    size = typical_size(key_points.double(), valid)
+    count = valid.sum(2).clamp(min=1)[..., None]
+    middle = torch.where(valid[..., None], key_points.double(), 0.0).sum(2) / count
     place = (middle / size.nan_to_num(1.0).clamp(min=1e-9)[:, None]).floor().clamp(-1e6, 1e6).long()
-    place = torch.where(seen.any(2)[..., None], place, -(10**7)).flatten(1)[order]
+    place = torch.where(valid.any(2)[..., None], place, -(10**7)).flatten(1)[order]
     cell = torch.unique(place, dim=0, return_inverse=True)[1]
     turn = torch.sort(_rank(cell), stable=True).indices
     return order[turn[:most]].sort().values
@@ -113,19 +113,19 @@ def _rank(group: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
 def observe(
     K: Float[Tensor, "V 3 3"],
     key_points: Float[Tensor, "T V J 2"],
-    seen: Bool[Tensor, "T V J"],
+    valid: Bool[Tensor, "T V J"],
     noise: float,
 ) -> Observations:
     """The chosen frames' key points, with ``noise`` x the median size of the person in the view as
     their noise.
     """
-    key_points = torch.where(seen[..., None], key_points.double(), 0.0)
-    size = typical_size(key_points, seen)
+    key_points = torch.where(valid[..., None], key_points.double(), 0.0)
+    size = typical_size(key_points, valid)
     known = torch.isfinite(size)
     sane = torch.where(known[:, None, None], K.double(), torch.eye(3, dtype=torch.float64))
     focal = (sane[:, 0, 0] * sane[:, 1, 1]).sqrt()
     xy = normalise(sane, key_points.transpose(0, 1).flatten(1, 2))
-    mask = (seen & known[:, None]).transpose(0, 1).flatten(1, 2) & (xy.abs() < LARGEST).all(-1)
+    mask = (valid & known[:, None]).transpose(0, 1).flatten(1, 2) & (xy.abs() < LARGEST).all(-1)
     unit = torch.where(known, noise * size, 1.0) / focal
     frames = key_points.shape[0]
     joints = key_points.shape[2]

@@ -78,7 +78,7 @@ class PairEstimation:
         )
 
     def __call__(self, seen_by: Observations, seed: int) -> PairTable:
-        count = len(seen_by.seen)
+        count = len(seen_by.valid)
         found = (self._pair(seen_by, a, b, seed) for a in range(count) for b in range(a + 1, count))
         rows = [row for row in found if row is not None]
         return (
@@ -86,7 +86,7 @@ class PairEstimation:
         )
 
     def _pair(self, seen_by: Observations, a: int, b: int, seed: int) -> tuple[Tensor, ...] | None:
-        both = seen_by.seen[a] & seen_by.seen[b]
+        both = seen_by.valid[a] & seen_by.valid[b]
         common = int(both.sum())
         if common < self.least:
             return None

@@ -35,7 +35,7 @@ def find_repair(
     names: tuple[str, ...],
     K: Float[Tensor, "V 3 3"],
     key_points: Float[Tensor, "T V J 2"],
-    seen: Bool[Tensor, "T V J"],
+    valid: Bool[Tensor, "T V J"],
     sizes: Int[Tensor, "V 2"] | None,
     noise: float,
     table: PairTable,
@@ -48,7 +48,7 @@ def find_repair(
     it stands and most of its key points agree. Needs two other placed views. ``noise``: share of
     the person's size.
     """
-    plain = observe(K, key_points, seen, noise)
+    plain = observe(K, key_points, valid, noise)
     rest = _rest(plain, table, {view}, resection, seed)
     if rest is None:
         return None
@@ -56,7 +56,7 @@ def find_repair(
     best = None
     for code, text, intrinsics, pixels in _undone(names, K, key_points, sizes, view):
         tried = observe(
-            intrinsics, pixels, seen[:, :, list(MIRROR)] if code in _LABELS else seen, noise
+            intrinsics, pixels, valid[:, :, list(MIRROR)] if code in _LABELS else valid, noise
         )
         new, share = _fit(
             replace(plain, **_of_view(plain, tried, view)), rest, view, resection, seed
@@ -64,7 +64,9 @@ def find_repair(
         if share >= 0.6 and new < 0.5 * cost:
             best = Repair(code, text, share)
             cost = 2 * new
-    return best or _exchange(names, K, plain, key_points, seen, noise, table, view, resection, seed)
+    return best or _exchange(
+        names, K, plain, key_points, valid, noise, table, view, resection, seed
+    )
 
 
 def _rest(
@@ -73,7 +75,7 @@ def _rest(
     """The rig of the other views alone, which these cannot have spoilt; None where no two are
     linked.
     """
-    kept = torch.tensor([view not in without for view in range(len(seen_by.seen))])
+    kept = torch.tensor([view not in without for view in range(len(seen_by.valid))])
     table = table.among(kept)
     if not table.linked.any():
         return None
@@ -86,7 +88,7 @@ def _exchange(
     K: Tensor,
     plain: Observations,
     key_points: Tensor,
-    seen: Tensor,
+    valid: Tensor,
     noise: float,
     table: PairTable,
     view: int,
@@ -101,9 +103,9 @@ def _exchange(
         valid = bool(torch.isfinite(both).all() & (both.diagonal(dim1=-2, dim2=-1) > 0).all())
         if other == view or not valid or torch.allclose(K[other], K[view], rtol=0.01):
             continue
-        swapped = K.clone()
-        swapped[[view, other]] = K[[other, view]]
-        tried = observe(swapped, key_points, seen, noise)
+        exchanged = K.clone()
+        exchanged[[view, other]] = K[[other, view]]
+        tried = observe(exchanged, key_points, valid, noise)
         people = _rest(plain, table, {view, other}, resection, seed)
         if people is None:
             continue
@@ -123,7 +125,7 @@ _LABELS = ("sides_swapped", "mirrored_image")
 
 def _of_view(plain: Observations, tried: Observations, view: int) -> dict[str, Tensor]:
     changed = {}
-    for field in ("xy", "noise", "seen"):
+    for field in ("xy", "noise", "valid"):
         values = getattr(plain, field).clone()
         values[view] = getattr(tried, field)[view]
         changed[field] = values
@@ -137,7 +139,7 @@ def _fit(
     key points.
     """
     found = resection.place(seen_by, rest, view, seed)
-    known = seen_by.seen[view] & rest.inlier.any(0)
+    known = seen_by.valid[view] & rest.inlier.any(0)
     if found is None or not known.any():
         return 1.0, 0.0
     R = rest.R.clone()

@@ -58,7 +58,7 @@ class Resection:
     def begin(self, seen_by: Observations, table: PairTable, edge: int, seed: int) -> Rig:
         """The rig of a pair alone, with the first view as the world."""
         a, b = table.views[edge].tolist()
-        views = len(seen_by.seen)
+        views = len(seen_by.valid)
         R = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
         t = torch.zeros(views, 3, dtype=torch.float64)
         placed = torch.zeros(views, dtype=torch.bool)
@@ -66,7 +66,7 @@ class Resection:
         placed[[a, b]] = True
         nothing = (
             torch.zeros(len(seen_by.frame), 3, dtype=torch.float64),
-            torch.zeros_like(seen_by.seen),
+            torch.zeros_like(seen_by.valid),
         )
         return self.triangulate(seen_by, Rig(R, t, placed, *nothing), seed)
 
@@ -109,7 +109,7 @@ class Resection:
         self, seen_by: Observations, rig: Rig, view: int, seed: int
     ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]] | None:
         """A view's R, t from the rig's points by PnP with LO-RANSAC; None where too few agree."""
-        used = seen_by.seen[view] & rig.inlier.any(0)
+        used = seen_by.valid[view] & rig.inlier.any(0)
         if used.sum() < self.least:
             return None
         options = ransac_options(self.threshold, self.iterations, seed, "max_reproj_error")
@@ -134,50 +134,50 @@ class Resection:
         agree, and its inliers together.
         """
         of = Observations(
-            *(getattr(seen_by, f)[rig.placed] for f in ("xy", "noise", "seen")),
+            *(getattr(seen_by, f)[rig.placed] for f in ("xy", "noise", "valid")),
             seen_by.frame,
             seen_by.joint,
         )
         R = rig.R[rig.placed]
         t = rig.t[rig.placed]
         K = torch.eye(3, dtype=torch.float64).expand_as(R)
-        subsets = _pairs_of_views(of.seen, self.pairs, seed)
+        subsets = _pairs_of_views(of.valid, self.pairs, seed)
         points, ok = triangulate_subsets(
-            Cameras(K[None], R[None], t[None]), of.xy[None], of.seen[None], subsets[None]
+            Cameras(K[None], R[None], t[None]), of.xy[None], of.valid[None], subsets[None]
         )
         tried = R.expand(len(subsets), -1, -1, -1), t.expand(len(subsets), -1, -1)
         error = of.error(*tried, points[0]) / self.threshold
-        agree = (error <= 1) & of.seen & ok[0][:, None]
-        rest = torch.where(agree, error, 0.0).sum(1) / (len(of.seen) + 1)
+        agree = (error <= 1) & of.valid & ok[0][:, None]
+        rest = torch.where(agree, error, 0.0).sum(1) / (len(of.valid) + 1)
         best = (agree.sum(1) - rest).argmax(0)
-        agree = agree.gather(0, best[None, None].expand(1, len(of.seen), -1))[0]
+        agree = agree.gather(0, best[None, None].expand(1, len(of.valid), -1))[0]
         result = triangulate(Cameras(K, R, t), of.xy, agree.double())
-        return self.agreeing(
+        return self.inlier_views(
             seen_by, replace(rig, points=result.points), result.ok & (agree.sum(0) >= 2)
         )
 
-    def agreeing(self, seen_by: Observations, rig: Rig, known: Bool[Tensor, " N"]) -> Rig:
+    def inlier_views(self, seen_by: Observations, rig: Rig, known: Bool[Tensor, " N"]) -> Rig:
         """The rig with the inliers of its points where they are ``known``."""
         inlier = (
             (seen_by.error(rig.R, rig.t, rig.points) <= self.threshold)
-            & seen_by.seen
+            & seen_by.valid
             & rig.placed[:, None]
             & known
         )
         return replace(rig, inlier=inlier & (inlier.sum(0) >= 2))
 
 
-def _pairs_of_views(seen: Bool[Tensor, "V N"], most: int, seed: int) -> Bool[Tensor, "H N V"]:
+def _pairs_of_views(valid: Bool[Tensor, "V N"], most: int, seed: int) -> Bool[Tensor, "H N V"]:
     """For each point every pair of views, or ``most`` random ones of those that see it."""
-    views, points = seen.shape
+    views, points = valid.shape
     if views * (views - 1) // 2 <= most:
         one, other = torch.triu_indices(views, views, offset=1)
         eye = torch.eye(views, dtype=torch.bool)
         return (eye[one] | eye[other])[:, None].expand(-1, points, -1)
-    count = seen.sum(0)
+    count = valid.sum(0)
     draw = uniform(key(seed, "pairs of views"), (most, points, 2))
     one = (draw[..., 0] * count).long()
     other = (draw[..., 1] * (count - 1)).long()
     other = other + (other >= one)
-    place = seen.T.cumsum(-1) - 1
-    return seen.T & ((place == one[..., None]) | (place == other[..., None]))
+    place = valid.T.cumsum(-1) - 1
+    return valid.T & ((place == one[..., None]) | (place == other[..., None]))

@@ -79,8 +79,8 @@ class RigEstimate:
         size.
         """
         if not 0 < factor < float("inf"):
-            mend = "Give a body height, segment lengths or a baseline that the recording shows."
-            raise GhptDataError("rig", "scale", f"{factor} mm per unit of length", mend)
+            hint = "Give a body height, segment lengths or a baseline that the recording shows."
+            raise GhptDataError("rig", "scale", f"{factor} mm per unit of length", hint)
         unit = torch.cat((torch.ones(3), torch.full((3,), factor))).double()
         points = self.points * factor
         return replace(
@@ -131,7 +131,7 @@ class RigCalibration:
         K: Float64[Tensor, "V 3 3"],
         key_points: Float[Tensor, "T V J 2"],
         confidence: Float[Tensor, "T V J"],
-        seen: Bool[Tensor, "T V J"],
+        valid: Bool[Tensor, "T V J"],
         sizes: Int[Tensor, "V 2"] | None,
         seed: int,
     ) -> RigEstimate:
@@ -140,7 +140,7 @@ class RigCalibration:
         twice, or arrays that do not belong together.
         """
         _check(names, K, key_points)
-        mask = usable(K, key_points, seen)
+        mask = usable(K, key_points, valid)
         frames = choose_frames(key_points, confidence, mask, self.frames)
         seen_by = observe(K, key_points[frames], mask[frames], self.noise)
         table = self.pairs(seen_by, seed)
@@ -173,11 +173,11 @@ class RigCalibration:
         order = torch.sort(
             torch.where(table.linked, table.expected, torch.inf), stable=True
         ).indices
-        linked = int(torch.isin(torch.arange(len(seen_by.seen)), table.views[table.linked]).sum())
+        linked = int(torch.isin(torch.arange(len(seen_by.valid)), table.views[table.linked]).sum())
         for edge in order[: min(self.seeds, int(table.linked.sum()))].tolist():
             rig = self.resection.begin(seen_by, table, edge, seed)
             rig = self.resection.grow(seen_by, table, rig, seed)
-            share = rig.inlier.sum() / (seen_by.seen & rig.placed[:, None]).sum().clamp(min=1)
+            share = rig.inlier.sum() / (seen_by.valid & rig.placed[:, None]).sum().clamp(min=1)
             if (int(rig.placed.sum()), float(share)) > merit:
                 best = rig
                 merit = (int(rig.placed.sum()), float(share))
@@ -211,7 +211,7 @@ class RigCalibration:
             torch.zeros(views, 3, dtype=torch.float64),
             torch.zeros(views, dtype=torch.bool),
             torch.zeros(frames * joints, 3, dtype=torch.float64),
-            torch.zeros_like(case.seen_by.seen),
+            torch.zeros_like(case.seen_by.valid),
         )
         placed = rig.placed
         nothing = torch.zeros(views, dtype=torch.float64)
@@ -261,13 +261,13 @@ def unitised(rig: Rig) -> Rig:
 
 
 def _check(names: Sequence[str], K: Tensor, key_points: Tensor) -> None:
-    mend = "Give each camera once, with its intrinsics and its key points."
+    hint = "Give each camera once, with its intrinsics and its key points."
     if len(names) < 2:
-        raise GhptDataError("rig", "cameras", f"{len(names)} given, a rig has two or more", mend)
+        raise GhptDataError("rig", "cameras", f"{len(names)} given, a rig has two or more", hint)
     if twice := [name for name in names if list(names).count(name) > 1]:
-        raise GhptDataError("rig", "cameras", f"{twice[0]!r} occurs twice", mend)
+        raise GhptDataError("rig", "cameras", f"{twice[0]!r} occurs twice", hint)
     if not len(names) == len(K) == key_points.shape[1]:
         count = (
             f"{len(names)} names, {len(K)} intrinsics, key points of {key_points.shape[1]} cameras"
         )
-        raise GhptDataError("rig", "cameras", count, mend)
+        raise GhptDataError("rig", "cameras", count, hint)

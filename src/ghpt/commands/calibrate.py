@@ -21,12 +21,12 @@ from ghpt.commands.app import Command
 from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.frames import MEASURED, frames_of_views
-from ghpt.commands.train import shown
+from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import KeyPoints
 from ghpt.data.formats.names import Name
-from ghpt.data.people.views import Views, look_through
+from ghpt.data.people.views import Views, undistort_and_match
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
@@ -44,7 +44,7 @@ from ghpt.report.rig_files import (
     write_rig,
     write_rig_figure,
 )
-from ghpt.report.tables import words
+from ghpt.report.tables import display_name
 
 _log = logging.getLogger(__name__)
 
@@ -124,7 +124,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
         cameras.K,
         torch.from_numpy(views.key_points).double(),
         torch.from_numpy(views.confidence).double(),
-        torch.from_numpy(views.seen),
+        torch.from_numpy(views.valid),
         cameras.size,
         config["seed"],
     )
@@ -183,7 +183,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     print_calibration(numbers)
     _log.info(
         "Report: %s, beside it the figure%s.",
-        shown(output / "report.md"),
+        display_path(output / "report.md"),
         " and the rig" * bool(chosen),
     )
     errors = [d["text"] for d in numbers["diagnoses"] if d["severity"] == "error"]
@@ -197,7 +197,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
             case.source,
             "calibration",
             f"{errors[0].rstrip('.')}; {written}",
-            f"See {shown(output / 'report.md')}.",
+            f"See {display_path(output / 'report.md')}.",
         )
     return numbers
 
@@ -212,7 +212,7 @@ def from_files(config: Mapping[str, Any]) -> Case:
     """The user's own key points and cameras."""
     cameras = own_cameras(config, "intrinsics.toml")
     points = own_key_points(config)
-    views = look_through(points, cameras, config["match"], config["views"])
+    views = undistort_and_match(points, cameras, config["match"], config["views"])
     title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
     return Case(
         title,
@@ -263,10 +263,12 @@ def from_data(config: Mapping[str, Any]) -> Case:
         t=rig.t,
     )
     arrays = (
-        np.array(getattr(found, field)) for field in ("key_points", "confidence", "seen", "frame")
+        np.array(getattr(found, field)) for field in ("key_points", "confidence", "valid", "frame")
     )
     views = Views(file, *arrays, found.rate_hz)
-    return Case(f"{found.name} of {words(data.name, data.source)}", data.source, views, "the truth")
+    return Case(
+        f"{found.name} of {display_name(data.name, data.source)}", data.source, views, "the truth"
+    )
 
 
 def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:

@@ -26,7 +26,7 @@ from ghpt.commands.app import Command
 from ghpt.commands.calibrate import people_note
 from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.train import shown
+from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import KeyPoints
@@ -37,7 +37,7 @@ from ghpt.geometry.lens import distort
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
 from ghpt.report.escape import escaped, plain
-from ghpt.report.tables import markdown, words
+from ghpt.report.tables import display_name, markdown
 
 _log = logging.getLogger(__name__)
 _HEADER = ["camera", "error px", "mended px"]
@@ -96,10 +96,15 @@ def examine(config: dict[str, Any], output: Path) -> dict[str, Any]:
     with atomic_write(output / "report.md", "w") as handle:
         handle.write(report(numbers))
     _print(numbers)
-    _log.info("Report: %s%s.", shown(output / "report.md"), ", beside it the mended files" * mended)
+    _log.info(
+        "Report: %s%s.", display_path(output / "report.md"), ", beside it the mended files" * mended
+    )
     if checkup.findings:
         raise GhptDataError(
-            patient.source, "cameras", summary(numbers), f"See {shown(output / 'report.md')}."
+            patient.source,
+            "cameras",
+            summary(numbers),
+            f"See {display_path(output / 'report.md')}.",
         )
     return numbers
 
@@ -130,12 +135,12 @@ def from_files(config: Mapping[str, Any], doctor: Doctor) -> Patient:
 
 
 def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
-    """An embedded recording, spoilt on request."""
+    """A synthetic recording, spoilt on request."""
     if config["data"]["root"] is not None:
         raise GhptConfigError(
             "data.root",
             "is a data set on disk",
-            "Give keypoints and cameras, or the embedded data.",
+            "Give keypoints and cameras, or the synthetic data.",
         )
     data, found = recording_of(config)
     evidence, cameras = from_recording(found, data, doctor, len(found))
@@ -147,7 +152,7 @@ def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
             )
         evidence, setup = BREAKAGES[config["spoil"]].spoil((evidence, setup))
     title = (
-        f"{found.name} of {words(data.name, data.source)}"
+        f"{found.name} of {display_name(data.name, data.source)}"
         + f", spoilt: {config['spoil']}" * bool(config["spoil"])
     )
     return Patient(title, data.source, evidence, cameras, setup, None, ())
@@ -156,7 +161,7 @@ def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
 def from_recording(
     recording: Recording, data: Any, doctor: Doctor, frames: int
 ) -> tuple[Evidence, CameraFile]:
-    """The middle ``frames`` frames of an embedded recording, as its rig's lenses show them."""
+    """The middle ``frames`` frames of a synthetic recording, as its rig's lenses show them."""
     rig = human36m_rig(recording.subject) if data.name == "h36m" else panoptic_rig(data.cameras)
     first = max(0, (len(recording) - frames) // 2)
     rows = slice(first, first + frames)
@@ -177,10 +182,10 @@ def from_recording(
         R=rig.cameras.R,
         t=rig.cameras.t,
     )
-    seen = np.array(recording.seen[rows])
+    valid = np.array(recording.valid[rows])
     frame = np.array(recording.frame[rows])
     return choose(
-        rig.names, pixels.numpy(), seen, frame, doctor.frames, doctor.shift, recording.name
+        rig.names, pixels.numpy(), valid, frame, doctor.frames, doctor.shift, recording.name
     ), file
 
 

@@ -51,7 +51,9 @@ def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, Recordi
     """A recording of ``config["data"]`` by name; without a name S9/Walking-1 or the first."""
     data = build(config["data"], "data")
     made = {"source": data.source, "split": data.evaluate}
-    stored = prepared(data.cache, data.key(data.evaluate), lambda: data.make(data.evaluate), made)
+    stored = prepared(
+        data.cache, data.cache_key(data.evaluate), lambda: data.generate(data.evaluate), made
+    )
     recordings = {recording.name: recording for recording in stored}
     name = config["recording"] or (
         "S9/Walking-1" if "S9/Walking-1" in recordings else next(iter(recordings), "")

@@ -63,9 +63,9 @@ def chosen_launcher(overrides: Sequence[Override], compose_only: bool) -> str:
     if name == "submitit_slurm" and not (
         compose_only or (shutil.which("sbatch") and shutil.which("srun"))
     ):
-        mend = f"Start it on a machine of the cluster, or with {LAUNCHER}=submitit_local."
+        hint = f"Start it on a machine of the cluster, or with {LAUNCHER}=submitit_local."
         raise GhptConfigError(
-            LAUNCHER, "submitit_slurm needs Slurm's sbatch and srun, which are not here", mend
+            LAUNCHER, "submitit_slurm needs Slurm's sbatch and srun, which are not here", hint
         )
     return str(name)
 

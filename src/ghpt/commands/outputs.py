@@ -165,8 +165,8 @@ class OutputFolder:
             if not self._owns(name):
                 raise _foreign(path)
             if name in self.files.keeps:
-                mend = "Go on with resume=true, start anew with overwrite=true, or name another output."
-                raise GhptDataError(path, "", "is there from an earlier run", mend)
+                hint = "Go on with resume=true, start anew with overwrite=true, or name another output."
+                raise GhptDataError(path, "", "is there from an earlier run", hint)
         for name in self.files.growing:
             if (self.path / name).exists() and name not in self._growing and not self.overwrite:
                 raise _foreign(self.path / name)

@@ -48,8 +48,8 @@ def _parse(word: str) -> Override:
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException:
-        mend = "Such as data=cmu2 or 'data.cameras=[1,2]'; --help shows all settings."
-        raise GhptConfigError(word, "is not of the form key=value", mend) from None
+        hint = "Such as data=cmu2 or 'data.cameras=[1,2]'; --help shows all settings."
+        raise GhptConfigError(word, "is not of the form key=value", hint) from None
 
 
 def _values(override: Override) -> list[Any]:
@@ -75,11 +75,11 @@ def _check_key(config: dict[str, Any], key: str, added: bool) -> None:
             if added and depth:
                 return  # whatever is built from it knows its settings
             above = ".".join(parts[:depth])
-            mend = suggest(part, node if isinstance(node, dict) else [])
+            hint = suggest(part, node if isinstance(node, dict) else [])
             elsewhere = [path for path in _paths(config) if path.endswith(f".{parts[-1]}")]
-            if elsewhere and "Did you mean" not in mend:
-                mend = f"Did you mean {elsewhere[0]!r}? {mend}"
-            raise GhptConfigError(key, f"no such setting{f' in {above}' if above else ''}", mend)
+            if elsewhere and "Did you mean" not in hint:
+                hint = f"Did you mean {elsewhere[0]!r}? {hint}"
+            raise GhptConfigError(key, f"no such setting{f' in {above}' if above else ''}", hint)
         node = node[part]
 
 

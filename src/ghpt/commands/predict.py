@@ -34,17 +34,17 @@ from ghpt.commands.prediction.run import predicted
 from ghpt.commands.prediction.statistics import Estimate, counts, estimate_of, evaluate
 from ghpt.commands.prediction.stored import frames_of_stored, open_stored
 from ghpt.commands.prediction.verdict import Level
-from ghpt.commands.train import shown
+from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.key_points import read_people
 from ghpt.data.formats.skeletons import joints17
-from ghpt.data.people.views import as_one_person, look_through
+from ghpt.data.people.views import as_one_person, undistort_and_match
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Scene
 from ghpt.export.scene import origin_note
 from ghpt.files import atomic_write, sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
-from ghpt.models.estimators.flips import Swaps
+from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.predictors import Classical, Learned
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
@@ -80,7 +80,7 @@ class Settings(InputSettings):
     progress_bar: bool
     baselines: dict[str, Any]
     trainer: dict[str, Any]
-    swaps: bool
+    flips: bool
     estimator: dict[str, Any]
     view_weights: dict[str, Any]
     fitted_frames: int
@@ -98,7 +98,7 @@ class Chosen:
     text: str
     """In words, for people."""
     predictor: Classical | Learned
-    swaps: Swaps | None
+    flips: LeftRightFlips | None
     weights: torch.nn.Module | None
     identity: dict[str, Any]
     """What its results depend on, as plain data."""
@@ -185,7 +185,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor.rejecting_nothing())}
     estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
     evaluation = evaluate(
-        frames, chosen.swaps, estimates, config["evaluated_frames"], config["batch"]
+        frames, chosen.flips, estimates, config["evaluated_frames"], config["batch"]
     )
     own = evaluation["estimators"][chosen.name]
     numbers = {
@@ -212,7 +212,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
         handle.write(prediction_report(numbers))
     print_prediction(numbers)
     files = ", ".join(WRITERS[name].file for name in formats)
-    _log.info("Written: %s and report.md in %s.", files, shown(output))
+    _log.info("Written: %s and report.md in %s.", files, display_path(output))
     print_verdict(numbers["verdict"])
     if config["strict"] and verdict.level != Level.GOOD:
         worst = max(verdict.findings, key=lambda finding: finding.level)
@@ -236,7 +236,7 @@ def choose(config: dict[str, Any]) -> Chosen:
     for a model that does not predict poses.
     """
     kind = "learned" if config["ckpt"] else "classical"
-    settings = config["estimator"][kind] | ({} if config["swaps"] else {"swaps": None})
+    settings = config["estimator"][kind] | ({} if config["flips"] else {"flips": None})
     if not config["ckpt"]:
         name = config["triangulation"]
         text = (
@@ -247,7 +247,7 @@ def choose(config: dict[str, Any]) -> Chosen:
             estimator=build(estimator, f"baselines.{name}")
         )
         return Chosen(
-            name, text, predictor, predictor.swaps, None, settings | {"estimator": estimator}
+            name, text, predictor, predictor.flips, None, settings | {"estimator": estimator}
         )
     changes = {"hypotheses": config["hypotheses"], "seed": config["seed"]}
     model, trained = load_model(config["ckpt"], config.get("trust") or (), **changes)
@@ -266,7 +266,7 @@ def choose(config: dict[str, Any]) -> Chosen:
         "hypotheses": model.hypotheses,
         "seed": config["seed"],
     }
-    return Chosen("view_weights", text, predictor, predictor.swaps, model, identity)
+    return Chosen("view_weights", text, predictor, predictor.flips, model, identity)
 
 
 def from_files(config: dict[str, Any]) -> Frames:
@@ -286,10 +286,12 @@ def from_files(config: dict[str, Any]) -> Frames:
     points, at, ordered = as_one_person(
         people, cameras, config["match"], config["views"], config["person"]
     )
-    views = look_through(points, cameras, config["match"], config["views"])
+    views = undistort_and_match(points, cameras, config["match"], config["views"])
 
     def detected(rows: Int[np.ndarray, " N"]) -> Seen:
-        values = (part[rows][:, at] for part in (points.key_points, points.confidence, points.seen))
+        values = (
+            part[rows][:, at] for part in (points.key_points, points.confidence, points.valid)
+        )
         return joints17(points.path, points.joints, *values)
 
     several = dict(zip(people.views, (people.counts() > 1).sum(0).tolist(), strict=True))

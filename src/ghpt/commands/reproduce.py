@@ -17,7 +17,7 @@ import yaml
 from ghpt.commands.app import Command
 from ghpt.commands.jobs import Job
 from ghpt.commands.outputs import Files
-from ghpt.commands.train import shown
+from ghpt.commands.train import display_path
 from ghpt.config import check_type, suggest
 from ghpt.errors import GhptConfigError, check
 from ghpt.paper.ablations import tables as ablations
@@ -32,7 +32,7 @@ from ghpt.paper.pose import figures as pose_figures
 from ghpt.paper.robustness import curves as robustness
 from ghpt.provenance import provenance
 from ghpt.report.escape import code
-from ghpt.report.tables import words
+from ghpt.report.tables import display_name
 
 _PARTS = (
     generalization,
@@ -168,7 +168,7 @@ def _reproduce(
         done = perform_all(wanted, folder, jobs, config["progress_bar"])
     except (KeyboardInterrupt, SystemExit):
         _log.warning(
-            "Stopped. What was finished is in %s; the same command goes on.", shown(folder)
+            "Stopped. What was finished is in %s; the same command goes on.", display_path(folder)
         )
         raise
     entries = [
@@ -193,7 +193,7 @@ def _reproduce(
         misses,
         numbers,
     )
-    _log.info("Report: %s, and report.html", shown(output / "report.md"))
+    _log.info("Report: %s, and report.html", display_path(output / "report.md"))
     return {"claims": len(page.claims), "held": held, "numbers": numbers, "misses": misses}
 
 
@@ -231,8 +231,8 @@ def _roots(data: Data) -> dict[str, str | None]:
         below = None if data["root"] is None else str(Path(data["root"]).expanduser() / name)
         roots[name] = data[name] or below
         if data[name] is None and below is not None and not Path(below).is_dir():
-            mend = f"Put the data set there, or name its folder alone: data.{name}=/path (the other stays embedded)."
-            raise GhptConfigError("data.root", f"{data['root']} has no folder {name}", mend)
+            hint = f"Put the data set there, or name its folder alone: data.{name}=/path (the other stays synthetic)."
+            raise GhptConfigError("data.root", f"{data['root']} has no folder {name}", hint)
     return roots
 
 
@@ -253,7 +253,9 @@ def _about(
     minutes = (time.perf_counter() - start) / 60
     seeds = [setup.seed for setup in setups]
     return {
-        "data": ", ".join(words(data, setups[0].source(data)) for data in ("h36m", "panoptic")),
+        "data": ", ".join(
+            display_name(data, setups[0].source(data)) for data in ("h36m", "panoptic")
+        ),
         "seeds": f"{len(seeds)} ({', '.join(map(str, seeds))}), of training and hypotheses; the data are the same",
         "made by": f"ghpt {origin['ghpt']}, commit {origin['commit'] or 'unknown'}, torch {origin['torch']}, "
         f"numpy {origin['numpy']}, Python {origin['python']}",

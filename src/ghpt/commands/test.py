@@ -8,7 +8,7 @@ from typing import Any, NotRequired, TypedDict
 from ghpt.commands.app import Command
 from ghpt.commands.lost import told
 from ghpt.commands.outputs import Files, input_paths
-from ghpt.commands.train import make_trainer, progress, shown
+from ghpt.commands.train import display_path, make_trainer, progress
 from ghpt.config import build, check_type
 from ghpt.errors import GhptCheckpointError
 from ghpt.files import sweep_temporaries
@@ -59,9 +59,10 @@ def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
     report.write_events(output, predictions, metrics)
     report.print_table(metrics)
     _log.info(
-        "Report: %s, beside it metrics.json and predictions.npz.", shown(output / "report.md")
+        "Report: %s, beside it metrics.json and predictions.npz.",
+        display_path(output / "report.md"),
     )
-    _log.info("Figures: tensorboard --logdir %s", shown(output))
+    _log.info("Figures: tensorboard --logdir %s", display_path(output))
     return metrics
 
 
@@ -90,7 +91,7 @@ def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str
         )
     check_type(config, report.settings, "")
     data = build(config["data"], "data")
-    data.serve(model.problem)
+    data.bind(model.problem)
     origin = provenance(config["seed"]) | {
         "checkpoint": str(config["ckpt"]),
         "training": trained["provenance"],

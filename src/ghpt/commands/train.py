@@ -29,7 +29,7 @@ from ghpt.models.checkpoint import (
 from ghpt.models.registry import check_registered, packages_to_trust
 from ghpt.provenance import provenance
 from ghpt.report.logger import ForgivingTensorBoard
-from ghpt.report.tables import words
+from ghpt.report.tables import display_name
 
 _STATE = {
     "epoch": int,
@@ -81,7 +81,7 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
     model = build(config["model"], "model")
     _check_optimizer(model)
     _warn_of_classes(config["model"])
-    data.serve(model.problem)
+    data.bind(model.problem)
     identity = {
         "format_version": FORMAT_VERSION,
         "config": {"model": config["model"], "data": config["data"], "seed": seed},
@@ -167,13 +167,13 @@ def progress(config: dict[str, Any]) -> list[L.Callback]:
     return [Progress()] if config["progress_bar"] else []
 
 
-def shown(path: Path) -> str:
+def display_path(path: Path) -> str:
     """A path as short as it can be typed here."""
     relative = os.path.relpath(path)
     return str(path) if relative.startswith("..") else relative
 
 
-def typed(key: str, value: object) -> str:
+def shell_override(key: str, value: object) -> str:
     """``key=value`` as a shell and Hydra's grammar take it."""
     text = f"{key}={value}"
     return text if re.fullmatch(r"[\w=./+-]+", text) else f"\"{key}='{value}'\""
@@ -211,15 +211,15 @@ def resumable(output: Path, config: dict[str, Any], model: Any) -> tuple[Path, s
     except GhptCheckpointError as error:
         if not previous.exists():
             raise
-        reason = f"{shown(last)}: {error.problem}"
+        reason = f"{display_path(last)}: {error.problem}"
     try:
         step = _check_resumable(previous, config, model)
     except OtherSettings:
         raise
     except GhptCheckpointError as error:
         problem = f"{reason}; {previous.name}: {error.problem}"
-        mend = "There is nothing to go on from: train without resume=true, in another output."
-        raise GhptCheckpointError(output, problem, mend) from None
+        hint = "There is nothing to go on from: train without resume=true, in another output."
+        raise GhptCheckpointError(output, problem, hint) from None
     return previous, f"{reason}. Going on from {previous.name}, which holds training step {step}."
 
 
@@ -231,9 +231,9 @@ def _check_resumable(path: Path, config: dict[str, Any], model: Any) -> int:
     """A checkpoint's training step. Raises GhptCheckpointError if it cannot be gone on from."""
     checkpoint = read_checkpoint(path)
     saved = checkpoint[FIELD].get("config")
-    mend = "Give one that train.py wrote."
+    hint = "Give one that train.py wrote."
     if not isinstance(saved, dict):
-        raise GhptCheckpointError(path, "does not say what it is of", mend)
+        raise GhptCheckpointError(path, "does not say what it is of", hint)
     for part in ("model", "data", "seed"):
         if part not in saved or _what(saved[part]) != _what(config[part]):
             problem = f"was made with other settings of {part!r}"
@@ -241,11 +241,11 @@ def _check_resumable(path: Path, config: dict[str, Any], model: Any) -> int:
     for name, kind in _STATE.items():
         state = checkpoint.get(name)
         if type(state) is not kind or (name == "optimizer_states" and not state):
-            raise GhptCheckpointError(path, f"holds no state of a training ({name})", mend)
+            raise GhptCheckpointError(path, f"holds no state of a training ({name})", hint)
     try:
         check_fit(model, checkpoint["state_dict"])
     except ValueError as error:
-        raise GhptCheckpointError(path, f"does not fit its own model ({error})", mend) from None
+        raise GhptCheckpointError(path, f"does not fit its own model ({error})", hint) from None
     return checkpoint["global_step"]
 
 
@@ -279,14 +279,16 @@ def _say_finished(
     measures: str,
     errors: dict[str, float],
 ) -> None:
-    _log.info("Validation on %s, %s:", words(data.name, data.source), measures)
+    _log.info("Validation on %s, %s:", display_name(data.name, data.source), measures)
     _log.info("  %s", summary(errors))
-    _log.info("Checkpoint: %s", shown(last))
+    _log.info("Checkpoint: %s", display_path(last))
     where = (
-        "data=h36m" if data.root is None else f"data={data.name} {typed('data.root', data.root)}"
+        "data=h36m"
+        if data.root is None
+        else f"data={data.name} {shell_override('data.root', data.root)}"
     )
     trust = ",".join(packages_to_trust(model))
-    command = ["python test.py", typed("ckpt", shown(last)), where]
+    command = ["python test.py", shell_override("ckpt", display_path(last)), where]
     if trust:
         command.append(f"'trust=[{trust}]'")
     _log.info("Test it: %s", " ".join(command))
@@ -296,9 +298,10 @@ def _say_stopped(last: Path, step: int | None) -> None:
     if step is None:
         _log.warning("Stopped before the first checkpoint of this run.")
     else:
-        _log.warning("Stopped. %s holds training step %d.", shown(last), step)
+        _log.warning("Stopped. %s holds training step %d.", display_path(last), step)
         _log.warning(
-            "Go on with the same command and %s resume=true", typed("output", shown(last.parent))
+            "Go on with the same command and %s resume=true",
+            shell_override("output", display_path(last.parent)),
         )
 
 

@@ -22,7 +22,7 @@ from ghpt.reconstruction import About, Reconstruction, State
 FORMAT_VERSION = 2
 _POINTS = {1: "<f4", 2: "<f8"}
 """How each version that is read stores positions; the first had few digits far from the zero."""
-_MEND = "Predict this recording again, or copy the file again"
+_HINT = "Predict this recording again, or copy the file again"
 _TEXTS = ("meta", "joints", "camera_names")
 
 
@@ -113,7 +113,7 @@ def read_reconstruction(
     layout = _layout(len(cameras), len(joints), meta["format_version"])
     for name, (dtype, shape) in layout.items():
         if name not in members or members[name][1:] != (np.dtype(dtype), (frames, *shape)):
-            raise GhptDataError(path, name, f"is not {dtype} of shape {(frames, *shape)}", _MEND)
+            raise GhptDataError(path, name, f"is not {dtype} of shape {(frames, *shape)}", _HINT)
     about = About(
         name=meta["name"],
         source=meta["source"],
@@ -133,7 +133,7 @@ def _origin(path: Path, meta: dict[str, Any]) -> tuple[float, float, float]:
     origin = meta.get("origin", [0.0, 0.0, 0.0])
     numbers = isinstance(origin, list) and [type(x) for x in origin] == [float] * 3
     if not numbers or not np.isfinite(origin).all():
-        raise GhptDataError(path, "meta.origin", f"is {origin!r}", _MEND)
+        raise GhptDataError(path, "meta.origin", f"is {origin!r}", _HINT)
     return tuple(origin)
 
 
@@ -154,14 +154,14 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
         zipfile.BadZipFile,
     ) as error:
         raise GhptDataError(
-            path, "", f"is not a readable reconstruction ({error})", _MEND
+            path, "", f"is not a readable reconstruction ({error})", _HINT
         ) from error
     version = meta.get("format_version") if isinstance(meta, dict) else None
     readable = type(version) is int and version in _POINTS
     if not readable or meta.get("format") != "ghpt reconstruction":
         known = " and ".join(map(str, _POINTS))
         problem = f"is {version!r}; this ghpt reads {known}"
-        raise GhptDataError(path, "meta.format_version", problem, _MEND)
+        raise GhptDataError(path, "meta.format_version", problem, _HINT)
     forms = {
         "name": str,
         "source": str,
@@ -172,7 +172,7 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
     }
     for field, form in forms.items():
         if not isinstance(meta.get(field, ...), form):
-            raise GhptDataError(path, f"meta.{field}", f"is {meta.get(field)!r}", _MEND)
+            raise GhptDataError(path, f"meta.{field}", f"is {meta.get(field)!r}", _HINT)
     return members, texts, meta
 
 
@@ -183,10 +183,10 @@ def _read(path: Path, members: dict[str, Member], start: int, stop: int) -> Reco
     }
     state = rows["state"]
     if ((state < 0) | (state > max(State))).any():
-        raise GhptDataError(path, "state", "holds a number that is no state", _MEND)
+        raise GhptDataError(path, "state", "holds a number that is no state", _HINT)
     placed = (state <= State.FILLED)[..., None].expand_as(rows["points"])
     if not rows["points"][placed].isfinite().all():
-        raise GhptDataError(path, "points", "a joint that is not missing has no position", _MEND)
+        raise GhptDataError(path, "points", "a joint that is not missing has no position", _HINT)
     for name in ("points", "error", "covariance"):
         rows[name] = rows[name].nan_to_num(0.0, 0.0, 0.0)
     rows["points"] = rows["points"].double()

@@ -145,9 +145,14 @@ class _Piece:
                 rr.Points2D, f"{image}/reprojected", pixels[:, v], shown, self.colours, 3.0
             )
             if evidence is not None:
-                seen = evidence.seen[:, v]
+                valid = evidence.valid[:, v]
                 self._points(
-                    rr.Points2D, f"{image}/key_points", evidence.key_points[:, v], seen, colour, 5.0
+                    rr.Points2D,
+                    f"{image}/key_points",
+                    evidence.key_points[:, v],
+                    valid,
+                    colour,
+                    5.0,
                 )
 
     def _points(

@@ -22,7 +22,7 @@ class Evidence(NamedTuple):
 
     key_points: Float[Tensor, "T V J 2"]
     """Undistorted pixels."""
-    seen: Bool[Tensor, "T V J"]
+    valid: Bool[Tensor, "T V J"]
     hypotheses: Float[Tensor, "T H J 3"] | None
     """World, mm; those of the pool that are worth a look."""
 
@@ -39,7 +39,7 @@ class Scene:
 
 def title(about: About) -> str:
     """Of a picture; says where the data are not real."""
-    return f"{about.name}: 3D poses from {'embedded (synthetic) data' if about.source == 'embedded' else about.source}"
+    return f"{about.name}: 3D poses from {'synthetic data' if about.source == 'synthetic' else about.source}"
 
 
 def origin_note(about: About) -> str:

@@ -36,15 +36,15 @@ def undistort(
     given = torch.isfinite(pixels).all(-1)
     safe = torch.where(given[..., None], pixels.to(torch.float64), 0.0)
     lens = _eight(coefficients)
-    seen = _normalise(safe, K)
+    valid = _normalise(safe, K)
     # just inside: on the limit itself the Jacobian is singular or the model has its pole
     limit = _largest_radius(lens)[..., None] * (1 - 1e-9)
-    point = _within(seen, limit)
+    point = _within(valid, limit)
     done = torch.zeros_like(given)
     for _ in range(_STEPS):
         value, (xx, xy, yx, yy) = _lens(point, lens)
-        error = value - seen
-        done = done | (error.abs().amax(-1) <= _CONVERGED * (1 + seen.abs().amax(-1)))
+        error = value - valid
+        done = done | (error.abs().amax(-1) <= _CONVERGED * (1 + valid.abs().amax(-1)))
         if done.all():
             break
         determinant = xx * yy - xy * yx

@@ -32,7 +32,7 @@ over r), as a function of ``1 / (1 + r^2)``.
 def triangulate_robustly(
     cameras: Cameras,
     key_points: Float[Tensor, "B V J 2"],
-    seen: Bool[Tensor, "B V J"],
+    valid: Bool[Tensor, "B V J"],
     scale: Float[Tensor, "B V"],
     weigh: Callable[[Tensor], Tensor],
     iterations: int,
@@ -46,10 +46,10 @@ def triangulate_robustly(
     longer than ``tolerance`` (mm) is NOT_CONVERGED; one whose step is far shorter rests. Where a
     solution fails, the linear one stands.
     """
-    rig = flat_cameras(cameras, seen.shape[:1])
+    rig = flat_cameras(cameras, valid.shape[:1])
 
     def part(rows: slice) -> tuple[Tensor, ...]:
-        given = seen[rows].permute(1, 2, 0)
+        given = valid[rows].permute(1, 2, 0)
         system = System(rig if len(rig.t) == 1 else rig.index(rows), key_points[rows], given)
         spoilt = (given & ~system.used).any(0)
         linear = system.solve(system.used.double())
@@ -68,7 +68,7 @@ def triangulate_robustly(
         unsettled = started & ~(good & (step <= tolerance))
         return (fields[0], fields[1].masked_fill(unsettled, int(Status.NOT_CONVERGED)), *fields[2:])
 
-    return Triangulation(*in_parts(part, seen.shape))
+    return Triangulation(*in_parts(part, valid.shape))
 
 
 def _reweighted(

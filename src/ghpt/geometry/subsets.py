@@ -11,28 +11,28 @@ _WORD = 62
 
 
 def random_subsets(
-    seen: Bool[Tensor, "B V J"], count: int, keys: Int[Tensor, " B"]
+    valid: Bool[Tensor, "B V J"], count: int, keys: Int[Tensor, " B"]
 ) -> Bool[Tensor, "B H J V"]:
     """For each hypothesis and joint a subset of the seen views, uniform over all those of two views
     or more.
 
-    ``count`` is H. A frame's subsets depend on its key and its own ``seen`` alone. A joint seen in
+    ``count`` is H. A frame's subsets depend on its key and its own ``valid`` alone. A joint seen in
     fewer than two views gets the empty subset.
     """
-    seen = seen.transpose(1, 2)[:, None]
-    views = seen.sum(-1, keepdim=True)
-    place = seen.cumsum(-1) - 1
-    words = -(-max(seen.shape[-1], 1) // _WORD)
-    word = bits(keys, (count, seen.shape[2], words)) & torch.iinfo(torch.int64).max
+    valid = valid.transpose(1, 2)[:, None]
+    views = valid.sum(-1, keepdim=True)
+    place = valid.cumsum(-1) - 1
+    words = -(-max(valid.shape[-1], 1) // _WORD)
+    word = bits(keys, (count, valid.shape[2], words)) & torch.iinfo(torch.int64).max
     word[..., :1] = _pairs_or_more(word[..., :1], views)
     if words == 1:
-        chosen = seen & (((word >> place.clamp(min=0)) & 1) != 0)
+        chosen = valid & (((word >> place.clamp(min=0)) & 1) != 0)
     else:
         place = place.clamp(min=0).expand(-1, count, -1, -1)
-        chosen = seen & (((word.gather(-1, place // _WORD) >> (place % _WORD)) & 1) != 0)
+        chosen = valid & (((word.gather(-1, place // _WORD) >> (place % _WORD)) & 1) != 0)
         # for more views than a word holds the fair bits themselves are drawn: once in 1e17 draws
         # fewer than two
-        chosen |= seen & (views > _WORD) & (chosen.sum(-1, keepdim=True) < 2)
+        chosen |= valid & (views > _WORD) & (chosen.sum(-1, keepdim=True) < 2)
     return chosen
 
 

@@ -299,7 +299,7 @@ def _one_centre(
 def triangulate_subsets(
     cameras: Cameras,
     key_points: Float[Tensor, "B V J 2"],
-    seen: Bool[Tensor, "B V J"],
+    valid: Bool[Tensor, "B V J"],
     subsets: Bool[Tensor, "B H J V"],
 ) -> tuple[Float[Tensor, "B H J 3"], Bool[Tensor, "B H J"]]:
     """Triangulate each joint of each hypothesis from its own subset of views (paper, section 3.1).
@@ -311,7 +311,7 @@ def triangulate_subsets(
     """
     views = subsets.shape[-1]
     hypotheses = subsets.shape[1]
-    usable = seen & usable_views(cameras, key_points)
+    usable = valid & usable_views(cameras, key_points)
     local, origin = local_cameras(cameras)
     equations = view_equations(local, key_points, usable).transpose(1, 2)
     floor = NO_DEPTH * torch.linalg.vector_norm(cameras.t.to(torch.float64), dim=-1).nan_to_num(0.0)

@@ -18,7 +18,7 @@ Kind = Literal["absolute", "relative", "aligned"]
 def joint_errors(
     estimate: PoseEstimate,
     truth: Float[Tensor, "*B J 3"],
-    truth_seen: Bool[Tensor, "*B J"],
+    truth_valid: Bool[Tensor, "*B J"],
     kind: Kind,
 ) -> tuple[Float[Tensor, "*B J"], Bool[Tensor, "*B J"]]:
     """Distance of each estimated joint to its true place, mm, float64, and which of them count.
@@ -30,7 +30,7 @@ def joint_errors(
     """
     points = estimate.points.double()
     truth = truth.double()
-    counted = estimate.estimated & truth_seen
+    counted = estimate.estimated & truth_valid
     if kind == "relative":
         points = points - points[..., PELVIS, None, :]
         truth = truth - truth[..., PELVIS, None, :]
@@ -87,16 +87,16 @@ class MPJPE(Metric):
         self,
         estimate: PoseEstimate,
         truth: Float[Tensor, "B J 3"],
-        truth_seen: Bool[Tensor, "B J"],
+        truth_valid: Bool[Tensor, "B J"],
         group: Int[Tensor, " B"],
     ) -> None:
         """Add B frames; ``group`` is each frame's group (its action, say), 0 ... groups-1."""
-        errors, counted = joint_errors(estimate, truth, truth_seen, self.kind)
+        errors, counted = joint_errors(estimate, truth, truth_valid, self.kind)
         # A product, not index_add_, whose order of summation varies on a GPU.
         member = torch.nn.functional.one_hot(group.long(), self.groups).double().mT
         self.error_sum += member @ errors
         self.counted += member @ counted.double()
-        self.with_truth += member @ truth_seen.double()
+        self.with_truth += member @ truth_valid.double()
 
     def compute(self) -> PoseErrors:
         six = list(SIX_JOINTS)

@@ -21,7 +21,7 @@ from ghpt.files import atomic_write, remove
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.registry import Untrusted, build_registered, check_trust, packages_to_trust
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 FIELD = "ghpt"
 """Where a checkpoint carries what is ours: format_version, config (plain), provenance (plain)."""
 LAST = "last.ckpt"
@@ -34,7 +34,7 @@ _END_SIZE = 22
 """The last bytes of a zip file without a comment: they begin with ``_END``, and end with two bytes
 that are the length of the comment."""
 _OURS = "Give one that train.py wrote."
-_MEND = "It is damaged or not a ghpt checkpoint; use another one."
+_HINT = "It is damaged or not a ghpt checkpoint; use another one."
 
 
 class AtomicCheckpointIO(CheckpointIO):
@@ -89,7 +89,7 @@ def _check_digest(path: Path, handle: IO[bytes]) -> None:
         unsigned = handle.read(4) == b"PK\x03\x04" and trailer[-_END_SIZE : 4 - _END_SIZE] == _END
         problem = "has no digest: ghpt 0.1 wrote it (format version 1), or another program"
         if not unsigned:
-            raise GhptCheckpointError(path, "cannot be read (it does not end in a digest)", _MEND)
+            raise GhptCheckpointError(path, "cannot be read (it does not end in a digest)", _HINT)
         raise GhptCheckpointError(path, problem, "Train again, or use it with ghpt 0.1.")
     handle.seek(0)
     digest = hashlib.sha256()
@@ -99,7 +99,7 @@ def _check_digest(path: Path, handle: IO[bytes]) -> None:
         left -= len(block)
     if trailer != _TITLE + digest.hexdigest().encode():
         problem = "cannot be read (its content does not have its digest)"
-        raise GhptCheckpointError(path, problem, _MEND)
+        raise GhptCheckpointError(path, problem, _HINT)
     handle.seek(0)
 
 
@@ -127,7 +127,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
     except Exception as error:
         # torch.load's errors are of many kinds: a damaged zip, a truncated pickle, a refused
         # global.
-        raise GhptCheckpointError(path, f"cannot be read ({_one_line(error)})", _MEND) from None
+        raise GhptCheckpointError(path, f"cannot be read ({_one_line(error)})", _HINT) from None
     ours = checkpoint.get(FIELD) if isinstance(checkpoint, dict) else None
     if not isinstance(ours, dict) or not _are_weights(checkpoint.get("state_dict")):
         raise GhptCheckpointError(path, "is not a checkpoint of ghpt", _OURS)
@@ -135,12 +135,12 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
         check_plain(ours, FIELD)
     except GhptConfigError as error:
         problem = f"is not a checkpoint of ghpt ({_one_line(error)})"
-        raise GhptCheckpointError(path, problem, _MEND) from None
+        raise GhptCheckpointError(path, problem, _HINT) from None
     found = ours.get("format_version")
     if type(found) is not int or found != FORMAT_VERSION:
         problem = f"has format version {str(found)[:20]}; this is {FORMAT_VERSION}"
-        mend = "Use the version of ghpt that wrote it, or train again."
-        raise GhptCheckpointError(path, problem, mend)
+        hint = "Use the version of ghpt that wrote it, or train again."
+        raise GhptCheckpointError(path, problem, hint)
     return checkpoint
 
 
@@ -177,13 +177,13 @@ def load_model(
     except GhptCheckpointError:
         raise
     except Untrusted as error:
-        raise GhptCheckpointError(path, error.problem, error.mend) from None
+        raise GhptCheckpointError(path, error.problem, error.hint) from None
     except Exception as error:  # a class of the user's own may raise any
         if isinstance(error, GhptConfigError) and error.key.removeprefix("model.") in changes:
             raise
         problem = f"does not fit its own model ({_one_line(error)})"
-        mend = "It is of another model or version; train again."
-        raise GhptCheckpointError(path, problem, mend) from None
+        hint = "It is of another model or version; train again."
+        raise GhptCheckpointError(path, problem, hint) from None
     return model, ours
 
 

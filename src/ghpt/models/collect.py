@@ -13,10 +13,10 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.pose.predictions import PredictionWriter
 from ghpt.models.relative_pose.predictions import PairWriter
-from ghpt.models.selection import SELECTIONS
-from ghpt.recording import KeyPointBatch, PairBatch, PoseEstimate, RelativePoseEstimate
+from ghpt.recording import Observations, PairBatch, PoseEstimate, RelativePoseEstimate
 
 
 class Collect(Callback):
@@ -50,7 +50,7 @@ class Collect(Callback):
 
     def on_test_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
         self.data = trainer.datamodule.frames["test"]
-        self.open([*SELECTIONS, *self.estimators])
+        self.open([*AGGREGATIONS, *self.estimators])
 
     @torch.no_grad()
     def on_test_batch_end(
@@ -80,7 +80,7 @@ class CollectPoses(Collect):
     def write(
         self,
         module: Any,
-        batch: KeyPointBatch,
+        batch: Observations,
         estimates: dict[str, PoseEstimate],
         weights: dict[str, torch.Tensor],
     ) -> None:
@@ -89,7 +89,7 @@ class CollectPoses(Collect):
         }
         frame = torch.from_numpy(self.data.frame_numbers(batch.sample.tolist()))
         self.writer.write(
-            batch.sample, estimates, batch.truth, batch.truth_seen, batch.recording, frame, weights
+            batch.sample, estimates, batch.truth, batch.truth_valid, batch.recording, frame, weights
         )
 
     def finish(self) -> None:

@@ -14,10 +14,15 @@ from torchmetrics import MeanMetric
 
 from ghpt import randomness
 from ghpt.errors import GhptError, check
+from ghpt.models.aggregation import (
+    AGGREGATIONS,
+    aggregation_weights,
+    cap_logit_std,
+    softmax_weights,
+)
 from ghpt.models.loss import LossTerms, mean_over_all
 from ghpt.models.problem import Problem
 from ghpt.models.scorer import Scorer
-from ghpt.models.selection import SELECTIONS, limit_spread, selection_weights, softmax_weights
 
 STATISTICS_HYPOTHESES = 16
 """Hypotheses of each training sample that the feature statistics are taken from: enough for a mean
@@ -43,10 +48,10 @@ class StochasticEstimator(L.LightningModule):
     """Hypothesis generator, scorer and loss (paper, section 3), for any ``Problem``.
 
     ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like
-    ``StochasticLoss``. ``spread`` limits how much a pool's logits differ (``limit_spread``).
-    ``selection``: the hypothesis of the estimation loss, ``weight`` or ``stochastic`` (straight
-    through).
-    All randomness is a function of (seed, optimiser step, sample): see ``ghpt.randomness``.
+    ``StochasticLoss``. ``logit_std_cap`` limits how much a pool's logits differ
+    (``cap_logit_std``). ``selection``: the hypothesis of the estimation loss, ``weight`` or
+    ``stochastic`` (straight through). All randomness is a function of (seed, optimiser step,
+    sample): see ``ghpt.randomness``.
     """
 
     def __init__(
@@ -58,7 +63,7 @@ class StochasticEstimator(L.LightningModule):
         hypotheses: int,
         temperature: float,
         gumbel: bool,
-        spread: float | None,
+        logit_std_cap: float | None,
         selection: str,
         seed: int,
     ) -> None:
@@ -76,9 +81,9 @@ class StochasticEstimator(L.LightningModule):
             "It must be > 0 (the paper: 1.5).",
         )
         check(
-            spread is None or spread > 0,
-            "model.spread",
-            f"is {spread}",
+            logit_std_cap is None or logit_std_cap > 0,
+            "model.logit_std_cap",
+            f"is {logit_std_cap}",
             "It must be > 0, or null for no limit.",
         )
         check(
@@ -98,7 +103,7 @@ class StochasticEstimator(L.LightningModule):
         self.hypotheses = hypotheses
         self.temperature = temperature
         self.gumbel = gumbel
-        self.spread = spread
+        self.logit_std_cap = logit_std_cap
         self.selection = selection
         self.seed = seed
         self.validation = torch.nn.ModuleDict(
@@ -108,9 +113,9 @@ class StochasticEstimator(L.LightningModule):
     def pool(self, batch: Any, keys: Int[Tensor, " B"]) -> Pool:
         """Draw, score and measure the hypotheses of a batch."""
         hypotheses = self.problem.generate(batch, self.hypotheses, keys)
-        logits = limit_spread(self.scorer(self.problem.describe(hypotheses)), self.spread)
+        logits = cap_logit_std(self.scorer(self.problem.featurize(hypotheses)), self.logit_std_cap)
         with torch.no_grad():
-            errors, counted = self.problem.error(self.problem.expand(hypotheses), batch)
+            errors, counted = self.problem.error(self.problem.as_estimates(hypotheses), batch)
         return Pool(hypotheses, logits, errors.to(logits.dtype), counted)
 
     def keys(self, purpose: str, batch: Any, *indices: int) -> Int[Tensor, " B"]:
@@ -122,7 +127,7 @@ class StochasticEstimator(L.LightningModule):
     def fit_statistics(self, batches: Iterator[Any]) -> None:
         """Take the scorer's feature statistics from hypotheses of the training samples."""
         features = [
-            self.problem.describe(
+            self.problem.featurize(
                 self.problem.generate(batch, STATISTICS_HYPOTHESES, self.keys("statistics", batch))
             ).flatten(0, 1)
             for batch in batches
@@ -145,11 +150,13 @@ class StochasticEstimator(L.LightningModule):
         weights = softmax_weights(pool.logits, self.temperature, noise)
         chosen = weights
         if self.selection == "stochastic":
-            drawn = selection_weights(
+            drawn = aggregation_weights(
                 "stochastic", pool.logits.detach(), pool.errors, self.temperature, keys
             )
             chosen = drawn + weights - weights.detach()
-        estimate_error, _ = self.problem.error(self.problem.combine(pool.hypotheses, chosen), batch)
+        estimate_error, _ = self.problem.error(
+            self.problem.aggregate(pool.hypotheses, chosen), batch
+        )
         return self.loss(weights, pool.errors, estimate_error.to(weights.dtype))
 
     def training_step(self, batch: Any, batch_idx: int) -> Tensor:
@@ -174,8 +181,8 @@ class StochasticEstimator(L.LightningModule):
         keys = self.keys("validation", batch)
         pool = self.pool(batch, keys)
         for name, metric in self.validation.items():
-            weights = selection_weights(name, pool.logits, pool.errors, self.temperature, keys)
-            error, _ = self.problem.error(self.problem.combine(pool.hypotheses, weights), batch)
+            weights = aggregation_weights(name, pool.logits, pool.errors, self.temperature, keys)
+            error, _ = self.problem.error(self.problem.aggregate(pool.hypotheses, weights), batch)
             metric.update(error.double(), pool.counted.double())
 
     def on_validation_epoch_end(self) -> None:
@@ -193,10 +200,12 @@ class StochasticEstimator(L.LightningModule):
         keys = self.keys("test", batch)
         pool = self.pool(batch, keys)
         weights = {
-            name: selection_weights(name, pool.logits, pool.errors, self.temperature, keys)
-            for name in SELECTIONS
+            name: aggregation_weights(name, pool.logits, pool.errors, self.temperature, keys)
+            for name in AGGREGATIONS
         }
-        estimates = {name: self.problem.combine(pool.hypotheses, w) for name, w in weights.items()}
+        estimates = {
+            name: self.problem.aggregate(pool.hypotheses, w) for name, w in weights.items()
+        }
         w = weights["weight"]
         summary = {
             "entropy": torch.special.entr(w).sum(dim=-1),

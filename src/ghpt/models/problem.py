@@ -11,7 +11,7 @@ A third problem is one file with a class like this and one yaml::
         def generate(self, batch, count, keys): ...      # two random points each -> [B, H, 2]
         def describe(self, hypotheses): ...              # sorted residuals -> [B, H, D]
         def combine(self, hypotheses, weights): ...      # weights [B, H] -> [B, 2]
-        def expand(self, hypotheses): ...                # each hypothesis as an estimate, [B, H, 2]
+        def as_estimates(self, hypotheses): ...                # each hypothesis as an estimate, [B, H, 2]
         def error(self, estimate, batch): ...            # distance to the true line -> [B], counted [B]
 """
 
@@ -33,15 +33,15 @@ class Problem(Protocol):
     def generate(self, batch: Any, count: int, keys: Int[Tensor, " B"]) -> Any:
         """``count`` random hypotheses for each item; a pure function of the item and its key."""
 
-    def describe(self, hypotheses: Any) -> Float[Tensor, "B H D"]:
+    def featurize(self, hypotheses: Any) -> Float[Tensor, "B H D"]:
         """What the scorer sees of each hypothesis: float32, finite, never the cameras."""
 
-    def combine(self, hypotheses: Any, weights: Float[Tensor, "B H"]) -> Any:
+    def aggregate(self, hypotheses: Any, weights: Float[Tensor, "B H"]) -> Any:
         """The estimate under weights that sum to 1; differentiable in the weights. One-hot weights
         select.
         """
 
-    def expand(self, hypotheses: Any) -> Any:
+    def as_estimates(self, hypotheses: Any) -> Any:
         """All hypotheses as estimates with leading dimensions B H."""
 
     def error(self, estimate: Any, batch: Any) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:

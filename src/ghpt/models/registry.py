@@ -25,7 +25,7 @@ from ghpt.models.relative_pose.problem import RelativePose
 from ghpt.models.relative_pose.scale import BodyHeight, KnownScale, Scale, SegmentLengths
 from ghpt.models.scorer import Scorer
 
-_METHODS = ("generate", "describe", "combine", "expand", "error")
+_METHODS = ("generate", "featurize", "aggregate", "as_estimates", "error")
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", re.ASCII)
 _NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {"__main__", "ghpt", "torch"}
 """Packages that are not the user's own. What is harmless of ghpt and torch is in ``PARTS``."""
@@ -108,9 +108,9 @@ def check_trust(trust: Sequence[str]) -> None:
     """Raise GhptConfigError unless these are names of modules that can be the user's own."""
     for name in trust:
         if not _NAME.fullmatch(name) or name.split(".")[0] in _NEVER_TRUSTED:
-            mend = "Name the module of your classes, as in trust=[mypackage.scorers]."
+            hint = "Name the module of your classes, as in trust=[mypackage.scorers]."
             problem = f"{name!r} is no module of your own (Python, ghpt and torch are not)"
-            raise GhptConfigError("trust", problem, mend)
+            raise GhptConfigError("trust", problem, hint)
 
 
 def packages_to_trust(config: Mapping[str, Any]) -> list[str]:

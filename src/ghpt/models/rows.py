@@ -26,7 +26,7 @@ WEIGHTS = ("entropy", "max", "effective")
 """Summaries of an item's weights: entropy (nats), the largest, and 1 / sum of squares (hypotheses
 in effect).
 """
-MEND = "Run the test again to make it anew"
+HINT = "Run the test again to make it anew"
 
 Layout = dict[str, tuple[str, tuple[int, ...]]]
 """Name -> (dtype, shape of one row) of every array with a row for each item."""
@@ -143,16 +143,16 @@ def read_tables(
         raise GhptDataError(path, "", "there is no such file", "Run test.py first") from error
     except (OSError, ValueError, TypeError, EOFError, RuntimeError, zipfile.BadZipFile) as error:
         raise GhptDataError(
-            path, "", f"is not a readable predictions file ({error})", MEND
+            path, "", f"is not a readable predictions file ({error})", HINT
         ) from error
     version = meta.get("format_version") if isinstance(meta, dict) else None
     if version != FORMAT_VERSION:
         raise GhptDataError(
-            path, "meta.format_version", f"is {version!r}; this ghpt reads {FORMAT_VERSION}", MEND
+            path, "meta.format_version", f"is {version!r}; this ghpt reads {FORMAT_VERSION}", HINT
         )
     names = meta.get("names")
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise GhptDataError(path, "meta.names", "is not a list of selections", MEND)
+        raise GhptDataError(path, "meta.names", "is not a list of selections", HINT)
     return members, tables, meta, tuple(names)
 
 
@@ -164,7 +164,7 @@ def check_arrays(path: Path, members: Mapping[str, Member], layout: Layout, coun
         layout | {f"weights_{summary}": ("<f4", ()) for summary in WEIGHTS}
     ).items():
         if name not in members or members[name][1:] != (np.dtype(dtype), (count, *shape)):
-            raise GhptDataError(path, name, f"is not {dtype} of shape {(count, *shape)}", MEND)
+            raise GhptDataError(path, name, f"is not {dtype} of shape {(count, *shape)}", HINT)
 
 
 def row_count(members: Mapping[str, Member], name: str) -> int:

@@ -189,7 +189,7 @@ def _segment_rows(explained: Numbers) -> list[list[str]]:
 def spread(recording: Recording, frames: int) -> Recording:
     """At most so many of its frames, evenly spread."""
     rows = np.unique(np.linspace(0, len(recording) - 1, min(frames, len(recording))).astype(int))
-    arrays = ("key_points", "confidence", "seen", "truth", "truth_seen", "frame")
+    arrays = ("key_points", "confidence", "valid", "truth", "truth_valid", "frame")
     return replace(recording, **{name: getattr(recording, name)[rows] for name in arrays})
 
 

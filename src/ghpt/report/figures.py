@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ghpt.metrics.pose_prior import PARTS
-from ghpt.models.selection import SELECTIONS
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.report.tables import title
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 
@@ -22,13 +22,13 @@ from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 LEFT, RIGHT, MIDDLE, TRUTH = "#0072B2", "#D55E00", "#000000", "#BBBBBB"
 SELECTION_COLOURS = dict(
     zip(
-        SELECTIONS,
+        AGGREGATIONS,
         ("#0072B2", "#56B4E9", "#009E73", "#D55E00", "#CC79A7", "#F0E442", "#000000", "#999999"),
         strict=True,
     )
 )
 SELECTION_HATCHES = dict(
-    zip(SELECTIONS, ("", "//", "...", "\\\\", "xx", "--", "", "oo"), strict=True)
+    zip(AGGREGATIONS, ("", "//", "...", "\\\\", "xx", "--", "", "oo"), strict=True)
 )
 """The same in print without colours."""
 _SIDES = tuple(
@@ -94,7 +94,7 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
     """
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
-    selections = [name for name in SELECTIONS if name in metrics["selections"]]
+    selections = [name for name in AGGREGATIONS if name in metrics["selections"]]
     width = 0.84 / len(selections)
     for i, name in enumerate(selections):
         prior = metrics["selections"][name]["pose_prior"][subject]

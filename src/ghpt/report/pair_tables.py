@@ -11,8 +11,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ghpt.files import atomic_write
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.relative_pose.evaluation import ALONE, ERRORS
-from ghpt.models.selection import SELECTIONS
 from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
 from ghpt.report.escape import code, escaped, plain
 from ghpt.report.tables import NONE, Rows, markdown, title, trained_on
@@ -115,7 +115,7 @@ def print_pair_tables(metrics: Mapping[str, Any], console: Console | None = None
     for name, row in zip(metrics["selections"], rows, strict=True):
         table.add_row(
             *map(plain, row),
-            end_section=name == SELECTIONS[-1],
+            end_section=name == AGGREGATIONS[-1],
             style="bold" if name == "weight" else None,
         )
     console.print(table)

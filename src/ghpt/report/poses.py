@@ -8,7 +8,7 @@ from ghpt.models.collect import CollectPoses
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.evaluation import evaluate
 from ghpt.models.pose.predictions import open_predictions
-from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.recording import Observations, PoseEstimate
 from ghpt.report.report import Report
 from ghpt.report.tables import print_table, write_report
 from ghpt.report.tensorboard import write_events
@@ -23,7 +23,7 @@ class Settings(TypedDict):
 
 def estimators(
     config: Mapping[str, Any], model: StochasticEstimator
-) -> dict[str, Callable[[KeyPointBatch], PoseEstimate]]:
+) -> dict[str, Callable[[Observations], PoseEstimate]]:
     """The model's view weights, where there are settings for them, and the classical estimators."""
     settings = config.get("view_weights")
     learned = {"view_weights": build(settings, "view_weights")(model)} if settings else {}

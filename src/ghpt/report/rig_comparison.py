@@ -12,7 +12,7 @@ from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.rotations import nearest_rotation
 from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.estimators.classical import Baseline
-from ghpt.recording import KeyPointBatch, Recording
+from ghpt.recording import Observations, Recording
 from ghpt.skeleton import BONES, JOINT, PELVIS, THORAX
 
 _FRAMES = 256
@@ -88,20 +88,20 @@ def triangulate_recording(
     estimated = []
     for first in range(0, len(recording), _FRAMES):
         rows = slice(first, first + _FRAMES)
-        seen = torch.from_numpy(recording.seen[rows].copy())
+        valid = torch.from_numpy(recording.valid[rows].copy())
         if without is not None:
-            seen[:, without] = False
-        count = len(seen)
+            valid[:, without] = False
+        count = len(valid)
         rig = recording.cameras
-        batch = KeyPointBatch(
+        batch = Observations(
             sample=torch.arange(first, first + count),
             recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
             key_points=torch.from_numpy(recording.key_points[rows]).double(),
             confidence=torch.from_numpy(recording.confidence[rows]).double(),
-            seen=seen,
-            truth=torch.zeros(count, seen.shape[-1], 3),
-            truth_seen=torch.zeros(count, seen.shape[-1], dtype=torch.bool),
+            valid=valid,
+            truth=torch.zeros(count, valid.shape[-1], 3),
+            truth_valid=torch.zeros(count, valid.shape[-1], dtype=torch.bool),
         )
         result = estimator(batch)
         points.append(result.points)
@@ -122,7 +122,7 @@ def held_out_errors(
         points, estimated = triangulate_recording(recording, estimator, without=view)
         one = recording.cameras.index(slice(view, view + 1))
         error = reprojection_error(one, key_points[:, view : view + 1], points)[:, 0]
-        counted = estimated & torch.from_numpy(recording.seen[:, view]) & torch.isfinite(error)
+        counted = estimated & torch.from_numpy(recording.valid[:, view]) & torch.isfinite(error)
         errors.append(torch.where(counted, error, 0.0))
         measured.append(counted)
     return torch.stack(errors, dim=1), torch.stack(measured, dim=1)

@@ -11,7 +11,7 @@ from rich.table import Table
 
 from ghpt.files import atomic_write
 from ghpt.metrics.pose_prior import PARTS
-from ghpt.models.selection import SELECTIONS
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.paper.published import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 from ghpt.report.escape import code, escaped, plain
 
@@ -50,10 +50,10 @@ _PER_ACTION = ("weight", "average", "best", "view_weights", "linear", "ransac")
 Rows = list[list[str]]
 
 
-def words(data: str | None, source: str | None) -> str:
-    """The data of a run in words that tell embedded from real: every heading goes through here."""
+def display_name(data: str | None, source: str | None) -> str:
+    """The data of a run in words that tell synthetic from real: every heading goes through here."""
     name = NAMES.get(str(data), str(data))
-    return f"embedded (synthetic) {name}" if source == "embedded" else f"{name} from {source}"
+    return f"synthetic {name}" if source == "synthetic" else f"{name} from {source}"
 
 
 def trained_on(metrics: Mapping[str, Any]) -> tuple[str | None, str | None]:
@@ -64,8 +64,8 @@ def trained_on(metrics: Mapping[str, Any]) -> tuple[str | None, str | None]:
 
 def title(metrics: Mapping[str, Any]) -> str:
     trained, source = trained_on(metrics)
-    training = f", trained on {words(trained, source)}" if trained else ""
-    return f"{words(metrics['data'], metrics['source'])}, {metrics['split']} split{training}"
+    training = f", trained on {display_name(trained, source)}" if trained else ""
+    return f"{display_name(metrics['data'], metrics['source'])}, {metrics['split']} split{training}"
 
 
 def main_rows(metrics: Mapping[str, Any]) -> Rows:
@@ -102,7 +102,7 @@ def print_table(metrics: Mapping[str, Any], console: Console | None = None) -> N
     for name, row in zip(metrics["selections"], main_rows(metrics), strict=True):
         cells = [cell.removesuffix(" %") for cell in row]
         style = "bold" if name in ("weight", "view_weights") else None
-        table.add_row(*map(plain, cells), end_section=name == SELECTIONS[-1], style=style)
+        table.add_row(*map(plain, cells), end_section=name == AGGREGATIONS[-1], style=style)
     (console or Console()).print(table)
 
 
@@ -176,7 +176,7 @@ def action_table(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
 def prior_table(metrics: Mapping[str, Any], subject: str) -> tuple[list[str], Rows]:
     """Header and rows: 1000 S^2 of a subject's six parts under each selection."""
     selections = {
-        name: numbers for name, numbers in metrics["selections"].items() if name in SELECTIONS
+        name: numbers for name, numbers in metrics["selections"].items() if name in AGGREGATIONS
     }
     rows = []
     for part in PARTS:
@@ -230,7 +230,7 @@ def _about_the_paper(metrics: Mapping[str, Any]) -> str:
         "Paper: relative MPJPE on the real data set, tab:quantitative-hypotheses and tab:generalization-evaluation. "
         "Its RANSAC is quoted from Iskakov et al., on their own detections."
     )
-    if metrics["source"] == "embedded":
+    if metrics["source"] == "synthetic":
         fitted = "random, average, best, worst" + (
             " and RANSAC" if metrics["data"] == "h36m" else ""
         )

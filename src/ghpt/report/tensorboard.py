@@ -165,7 +165,7 @@ def _sample(predictions: Predictions) -> Iterator[tuple[int, PredictionChunk]]:
 def _relative_error(chunk: PredictionChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
     """Each frame's error under the first shown selection, mm, and which frames are whole."""
     errors, counted = joint_errors(
-        chunk.estimates[SHOWN[0]], chunk.truth, chunk.truth_seen, "relative"
+        chunk.estimates[SHOWN[0]], chunk.truth, chunk.truth_valid, "relative"
     )
     return errors.mean(-1), counted.all(-1)
 

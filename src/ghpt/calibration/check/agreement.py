@@ -12,7 +12,7 @@ from ghpt.calibration.check.setup import Look, Rays, Setup
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.triangulation import triangulate_subsets
 from ghpt.models.estimators.classical import Baseline, MEstimator
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
 LARGEST = 0.1
 """Shares of the person's size. Beyond, an error says only that nothing agrees."""
@@ -56,7 +56,7 @@ def errors(
     offset = in_camera[..., :2] / torch.where(front, depth, 1.0)[..., None] - rays.xy
     error = offset.norm(dim=-1) / rays.size[..., None].clamp(min=1e-12)
     error = torch.where(front, error, LARGEST).clamp(max=LARGEST)
-    return torch.where(known & rays.seen & (rays.size > 0)[..., None], error, torch.nan)
+    return torch.where(known & rays.valid & (rays.size > 0)[..., None], error, torch.nan)
 
 
 def median(error: Float[Tensor, "*B F J"]) -> Float[Tensor, "*B"]:
@@ -73,7 +73,7 @@ def pair_errors(
     ``step``-th frame.
     """
     xy = rays.xy[:, ::step]
-    seen = rays.seen[:, ::step]
+    valid = rays.valid[:, ::step]
     size = rays.size[:, ::step]
     frames = xy.shape[1]
     views = len(setup)
@@ -83,12 +83,12 @@ def pair_errors(
     )
     K = torch.eye(3, dtype=torch.float64).expand(frames, views, 3, 3)
     rig = Cameras(K, setup.R.expand(frames, -1, -1, -1), setup.t.expand(frames, -1, -1))
-    points, ok = triangulate_subsets(rig, xy.transpose(0, 1), seen.transpose(0, 1), chosen)
-    both = seen[pairs].all(1)
+    points, ok = triangulate_subsets(rig, xy.transpose(0, 1), valid.transpose(0, 1), chosen)
+    both = valid[pairs].all(1)
     result = torch.zeros(len(pairs), views, dtype=torch.float64)
     for p in range(len(pairs)):  # the memory of all at once is V times that of the points
-        error = errors(Rays(xy, seen, size), setup.R, setup.t, points[:, p], ok[:, p])
-        lost = both[p] & ~ok[:, p] & seen  # rays that meet behind a camera agree with nothing
+        error = errors(Rays(xy, valid, size), setup.R, setup.t, points[:, p], ok[:, p])
+        lost = both[p] & ~ok[:, p] & valid  # rays that meet behind a camera agree with nothing
         result[p] = median(torch.where(lost, LARGEST, error))
     return result
 
@@ -136,10 +136,10 @@ def triangulated(
 ) -> tuple[Float[Tensor, "G F J 3"], Bool[Tensor, "G F J"]]:
     """Points from G choices of views by an estimator, in normalised image coordinates."""
     groups = len(used)
-    (frames, joints) = rays.seen.shape[1:]
-    seen = (rays.seen.transpose(0, 1) & used[:, None, :, None]).flatten(0, 1)
+    (frames, joints) = rays.valid.shape[1:]
+    valid = (rays.valid.transpose(0, 1) & used[:, None, :, None]).flatten(0, 1)
     count = groups * frames
-    batch = KeyPointBatch(
+    batch = Observations(
         sample=torch.arange(count),
         recording=torch.zeros(count, dtype=torch.int64),
         cameras=Cameras(
@@ -149,10 +149,10 @@ def triangulated(
             )
         ),
         key_points=rays.xy.transpose(0, 1).repeat(groups, 1, 1, 1),
-        confidence=seen.double(),
-        seen=seen,
+        confidence=valid.double(),
+        valid=valid,
         truth=torch.zeros(count, joints, 3),
-        truth_seen=torch.zeros(count, joints, dtype=torch.bool),
+        truth_valid=torch.zeros(count, joints, dtype=torch.bool),
     )
     found = estimator(batch)
     return found.points.unflatten(0, (groups, frames)), found.estimated.unflatten(
@@ -161,4 +161,4 @@ def triangulated(
 
 
 def _at(rays: Rays, view: int) -> Rays:
-    return Rays(rays.xy[view], rays.seen[view], rays.size[view])
+    return Rays(rays.xy[view], rays.valid[view], rays.size[view])

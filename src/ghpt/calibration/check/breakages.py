@@ -51,10 +51,10 @@ def _resolution(case: Case, views: Sequence[int], ratio: float) -> Case:
 def _undistorted(case: Case, views: Sequence[int]) -> Case:
     evidence, setup = case
     pixels = evidence.pixels.clone()
-    seen = evidence.seen.clone()
+    valid = evidence.valid.clone()
     for v in views:
-        pixels[v], seen[v] = ideal(pixels[v], seen[v], setup.K[v], setup.lens[v])
-    return replace(evidence, pixels=pixels, seen=seen), setup
+        pixels[v], valid[v] = ideal(pixels[v], valid[v], setup.K[v], setup.lens[v])
+    return replace(evidence, pixels=pixels, valid=valid), setup
 
 
 def _lens_missing(case: Case, views: Sequence[int]) -> Case:
@@ -87,11 +87,11 @@ def _late(case: Case, views: Sequence[int], by: int) -> Case:
     """Their frame n + by shows what the others' frame n shows."""
     evidence, setup = case
     pixels = evidence.pixels.clone()
-    seen = evidence.seen.clone()
+    valid = evidence.valid.clone()
     for v in views:
-        pixels[v], seen[v] = pixels[v].roll(by, 0), seen[v].roll(by, 0)
-        seen[v, slice(0, by) if by > 0 else slice(by, None)] = False
-    return replace(evidence, pixels=pixels, seen=seen), setup
+        pixels[v], valid[v] = pixels[v].roll(by, 0), valid[v].roll(by, 0)
+        valid[v, slice(0, by) if by > 0 else slice(by, None)] = False
+    return replace(evidence, pixels=pixels, valid=valid), setup
 
 
 def _exchanged(case: Case, views: Sequence[int]) -> Case:
@@ -99,19 +99,19 @@ def _exchanged(case: Case, views: Sequence[int]) -> Case:
     evidence, setup = case
     order = list(range(len(setup)))
     order[0], order[views[0]] = order[views[0]], order[0]
-    return replace(evidence, pixels=evidence.pixels[order], seen=evidence.seen[order]), setup
+    return replace(evidence, pixels=evidence.pixels[order], valid=evidence.valid[order]), setup
 
 
 def _mirrored(case: Case, views: Sequence[int], image: bool, sides: bool) -> Case:
     evidence, setup = case
     pixels = evidence.pixels.clone()
-    seen = evidence.seen.clone()
+    valid = evidence.valid.clone()
     for v in views:
         if image:
             pixels[v, ..., 0] = setup.width[v] - 1 - pixels[v, ..., 0]
         if sides:
-            pixels[v], seen[v] = pixels[v][..., list(MIRROR), :], seen[v][..., list(MIRROR)]
-    return replace(evidence, pixels=pixels, seen=seen), setup
+            pixels[v], valid[v] = pixels[v][..., list(MIRROR), :], valid[v][..., list(MIRROR)]
+    return replace(evidence, pixels=pixels, valid=valid), setup
 
 
 @dataclass(frozen=True)

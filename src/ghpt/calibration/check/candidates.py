@@ -94,8 +94,8 @@ POSES: dict[str, tuple[Callable[[Tensor, Tensor], tuple[Tensor, Tensor]], str]] 
 def of_file(setup: Setup) -> Iterator[Candidate]:
     """Mistakes that concern all cameras alike."""
     every = "all cameras"
-    for code, (mend, text) in POSES.items():
-        R, t = mend(setup.R, setup.t)
+    for code, (hint, text) in POSES.items():
+        R, t = hint(setup.R, setup.t)
         yield Candidate(code, (), text.replace("{camera}", every), replace(setup, R=R, t=t), 0.0)
     for ratio in RESOLUTIONS:
         text = f"intrinsics of all cameras fit the key points when scaled by {ratio:.3g}; give both at one resolution"
@@ -131,8 +131,8 @@ def of_view(setup: Setup, view: int) -> Iterator[Candidate]:
     R = setup.R[view]
     t = setup.t[view]
     K = setup.K[view]
-    for code, (mend, text) in POSES.items():
-        turned, moved = mend(R, t)
+    for code, (hint, text) in POSES.items():
+        turned, moved = hint(R, t)
         yield Candidate(code, (view,), text, setup.changed(view, R=turned, t=moved), 0.0)
     for factor, words in UNITS.items():
         text = f"t of {{camera}} is in another unit than the others' ({words}); multiply it by {factor:g}"

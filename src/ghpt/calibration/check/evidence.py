@@ -35,7 +35,7 @@ class Evidence:
     names: tuple[str, ...]
     pixels: Float[Tensor, "V S F J 2"]
     """As detected, through the lens."""
-    seen: Bool[Tensor, "V S F J"]
+    valid: Bool[Tensor, "V S F J"]
     frame: Int[Tensor, " F"]
     at_rate: AtRate | None = None
     """The pixels of a view, and what is seen, if its frame numbers count ``ratio`` times as fast as
@@ -43,9 +43,9 @@ class Evidence:
     """
 
     @property
-    def reach(self) -> int:
+    def max_shift(self) -> int:
         """N: the largest shift in time that can be tried, in frames."""
-        return (self.seen.shape[1] - 1) // 2
+        return (self.valid.shape[1] - 1) // 2
 
 
 def gather(
@@ -54,11 +54,11 @@ def gather(
     match: Mapping[Name, Name],
     views: Sequence[Name] | None,
     frames: int,
-    reach: int,
+    max_shift: int,
 ) -> tuple[Evidence, CameraFile, tuple[int, ...]]:
     """At most ``frames`` frames, evenly spread over those in which people are seen; their cameras
-    in the order of the views; and which of the key points' views these are. ``reach``: the largest
-    shift, at most a quarter of the frames.
+    in the order of the views; and which of the key points' views these are. ``max_shift``:
+    the largest shift, at most a quarter of the frames.
 
     Raises GhptDataError where views and cameras do not match, without extrinsics, and with fewer
     than two views.
@@ -71,59 +71,61 @@ def gather(
     at = [view for view, _ in pairs]
     ordered = cameras.select([camera for _, camera in pairs])
     if ordered.cameras is None:
-        mend = "Calibrate them first: python calibrate.py --help"
+        hint = "Calibrate them first: python calibrate.py --help"
         raise GhptDataError(
-            cameras.path, "extrinsics", "are missing: there is nothing to check", mend
+            cameras.path, "extrinsics", "are missing: there is nothing to check", hint
         )
-    return of_points(points, at, ordered, frames, reach), ordered, tuple(at)
+    return of_points(points, at, ordered, frames, max_shift), ordered, tuple(at)
 
 
 def of_points(
-    points: KeyPoints, at: Sequence[int], cameras: CameraFile, frames: int, reach: int
+    points: KeyPoints, at: Sequence[int], cameras: CameraFile, frames: int, max_shift: int
 ) -> Evidence:
     """The evidence of the views ``at``, whose cameras these are. Raises GhptDataError for key
     points that are no pixels.
     """
     at = list(at)
-    arrays = points.key_points[:, at], points.confidence[:, at], points.seen[:, at]
+    arrays = points.key_points[:, at], points.confidence[:, at], points.valid[:, at]
     check_pixels(points.path, arrays[0], arrays[2], cameras)
-    pixels, _, seen = joints17(points.path, points.joints, *arrays)
-    return choose(cameras.names, pixels, seen, points.frame, frames, reach, points.path)
+    pixels, _, valid = joints17(points.path, points.joints, *arrays)
+    return choose(cameras.names, pixels, valid, points.frame, frames, max_shift, points.path)
 
 
 def choose(
     names: tuple[str, ...],
     pixels: Float[np.ndarray, "T V J 2"],
-    seen: Bool[np.ndarray, "T V J"],
+    valid: Bool[np.ndarray, "T V J"],
     frame: Int[np.ndarray, " T"],
     frames: int,
-    reach: int,
+    max_shift: int,
     where: str,
 ) -> Evidence:
     """The evidence of a recording's detected pixels; a frame number that is left out is a gap in
     time.
     """
-    usable = np.flatnonzero((seen.sum(1) >= 2).sum(-1) >= _LEAST_JOINTS)
+    usable = np.flatnonzero((valid.sum(1) >= 2).sum(-1) >= _LEAST_JOINTS)
     if not len(usable):
-        mend = "Check that the views show the same person at the same time."
+        hint = "Check that the views show the same person at the same time."
         raise GhptDataError(
-            where, "key points", f"no frame has {_LEAST_JOINTS} joints in two views", mend
+            where, "key points", f"no frame has {_LEAST_JOINTS} joints in two views", hint
         )
     rows = usable[
         np.unique(np.linspace(0, len(usable) - 1, min(frames, len(usable))).round().astype(int))
     ]
-    reach = min(reach, len(usable) // 4)
-    seen = seen & np.isfinite(pixels).all(-1)
+    max_shift = min(max_shift, len(usable) // 4)
+    valid = valid & np.isfinite(pixels).all(-1)
     order = (2, 0, 1, 3)
 
     def around(
         moments: Float[np.ndarray, " F"], views: int | slice
     ) -> tuple[np.ndarray, np.ndarray]:
         """What is nearest to the moments (numbers of frames) and their neighbours: [S, F, ...]."""
-        wanted = moments[None] + np.arange(-reach, reach + 1)[:, None]
+        wanted = moments[None] + np.arange(-max_shift, max_shift + 1)[:, None]
         index = np.searchsorted(frame, np.rint(wanted)).clip(0, len(frame) - 1)
-        there = (np.abs(frame[index] - wanted) <= _NEAR)[(..., *[None] * (seen[:, views].ndim - 1))]
-        shown = seen[:, views][index] & there
+        there = (np.abs(frame[index] - wanted) <= _NEAR)[
+            (..., *[None] * (valid[:, views].ndim - 1))
+        ]
+        shown = valid[:, views][index] & there
         return np.where(shown[..., None], pixels[:, views][index], 0.0), shown
 
     def at_rate(view: int, ratio: float) -> tuple[Tensor, Tensor]:

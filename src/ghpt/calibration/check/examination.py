@@ -253,8 +253,12 @@ class Doctor:
         return found
 
     def _shifts(self, look: Look, setup: Setup, view: int) -> list[int]:
-        reach = look.evidence.reach
-        return [by for by in range(-reach - setup.shift[view], reach - setup.shift[view] + 1) if by]
+        max_shift = look.evidence.max_shift
+        return [
+            by
+            for by in range(-max_shift - setup.shift[view], max_shift - setup.shift[view] + 1)
+            if by
+        ]
 
     def _rates(self, look: Look, setup: Setup, now: Agreement, view: int) -> list[Candidate]:
         """Of a view that does not agree."""

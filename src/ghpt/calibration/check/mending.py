@@ -51,15 +51,15 @@ def mended_points(
     """
     setup = checkup.setup
     at = list(at)
-    arrays = points.key_points[:, at], points.confidence[:, at], points.seen[:, at]
-    pixels, sure, seen = (array.copy() for array in joints17(points.path, points.joints, *arrays))
-    old = pixels.copy(), sure.copy(), seen.copy()
+    arrays = points.key_points[:, at], points.confidence[:, at], points.valid[:, at]
+    pixels, sure, valid = (array.copy() for array in joints17(points.path, points.joints, *arrays))
+    old = pixels.copy(), sure.copy(), valid.copy()
     for view, source in enumerate(setup.source):
         rows, there = moment(points.frame, setup.rate[view], setup.shift[view])
-        for new, given in zip((pixels, sure, seen), old, strict=True):
+        for new, given in zip((pixels, sure, valid), old, strict=True):
             moved = given[rows, source]
             new[:, view] = moved[:, list(MIRROR)] if setup.sides[view] else moved
-        seen[:, view] &= there[:, None]
+        valid[:, view] &= there[:, None]
         if setup.mirrored[view]:
             pixels[:, view, :, 0] = setup.width[view] - 1 - pixels[:, view, :, 0]
     names = tuple(cameras.names[source] for source in setup.source)
@@ -71,7 +71,7 @@ def mended_points(
         points.frame,
         pixels.astype(np.float64),
         sure.astype(np.float64),
-        seen,
+        valid,
         points.rate_hz,
         several,
     )

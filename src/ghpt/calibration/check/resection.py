@@ -25,7 +25,7 @@ def resect(
     """R, t of one view by PnP with LO-RANSAC; an inlier's error is at most ``threshold`` sizes of
     the person. None where nothing agrees.
     """
-    used = rays.seen & known & (rays.size > 0)[:, None]
+    used = rays.valid & known & (rays.size > 0)[:, None]
     if int(used.sum()) < _LEAST:
         return None
     typical = float(rays.size[rays.size > 0].median())

@@ -12,7 +12,7 @@ from torch import Tensor
 from ghpt.calibration.check.evidence import Evidence
 from ghpt.data.formats.camera_files import CameraFile
 from ghpt.geometry.lens import undistort
-from ghpt.models.estimators.classical import person_size
+from ghpt.models.estimators.classical import person_scale
 from ghpt.skeleton import MIRROR
 
 _FAR = 1e5
@@ -84,7 +84,7 @@ class Rays:
     """What cameras see in normalised image coordinates, x_cam / z_cam."""
 
     xy: Float[Tensor, "*B F J 2"]
-    seen: Bool[Tensor, "*B F J"]
+    valid: Bool[Tensor, "*B F J"]
     size: Float[Tensor, "*B F"]
     """The person's, the unit of all errors; 0 where it is not seen."""
 
@@ -106,24 +106,24 @@ class Look:
 
     def prepare(self, setup: Setup, view: int) -> None:
         """Look at one view at all shifts at once, which is many times faster than one by one."""
-        shifts = range(-self.evidence.reach, self.evidence.reach + 1)
+        shifts = range(-self.evidence.max_shift, self.evidence.max_shift + 1)
         if all(self._key(setup, view, shift) in self._kept for shift in shifts):
             return
-        pixels, seen = self._pixels(setup, view, slice(None))
-        whole = rays(pixels.flatten(0, 1), seen.flatten(0, 1), setup.K[view], setup.lens[view])
-        parts = (x.unflatten(0, seen.shape[:2]) for x in (whole.xy, whole.seen, whole.size))
+        pixels, valid = self._pixels(setup, view, slice(None))
+        whole = rays(pixels.flatten(0, 1), valid.flatten(0, 1), setup.K[view], setup.lens[view])
+        parts = (x.unflatten(0, valid.shape[:2]) for x in (whole.xy, whole.valid, whole.size))
         for shift, part in zip(shifts, zip(*parts, strict=True), strict=True):
             self._kept[self._key(setup, view, shift)] = Rays(*part)
 
     def _one(self, setup: Setup, view: int, shift: int) -> Rays:
-        if abs(shift) > self.evidence.reach:
+        if abs(shift) > self.evidence.max_shift:
             raise ValueError(
-                f"a shift of {shift} frames is beyond the evidence's {self.evidence.reach}"
+                f"a shift of {shift} frames is beyond the evidence's {self.evidence.max_shift}"
             )
         key = self._key(setup, view, shift)
         if key not in self._kept:
-            pixels, seen = self._pixels(setup, view, self.evidence.reach + shift)
-            self._kept[key] = rays(pixels, seen, setup.K[view], setup.lens[view])
+            pixels, valid = self._pixels(setup, view, self.evidence.max_shift + shift)
+            self._kept[key] = rays(pixels, valid, setup.K[view], setup.lens[view])
         return self._kept[key]
 
     @staticmethod
@@ -136,46 +136,46 @@ class Look:
         evidence = self.evidence
         if setup.rate[view] == 1 or evidence.at_rate is None:
             pixels = evidence.pixels[source][at]
-            seen = evidence.seen[source][at]
+            valid = evidence.valid[source][at]
         else:
-            pixels, seen = (values[at] for values in evidence.at_rate(source, setup.rate[view]))
+            pixels, valid = (values[at] for values in evidence.at_rate(source, setup.rate[view]))
         if setup.mirrored[view]:
             pixels = torch.stack((setup.width[view] - 1 - pixels[..., 0], pixels[..., 1]), dim=-1)
         if setup.sides[view]:
             pixels = pixels[..., list(MIRROR), :]
-            seen = seen[..., list(MIRROR)]
-        return pixels, seen
+            valid = valid[..., list(MIRROR)]
+        return pixels, valid
 
 
 def rays(
     pixels: Float[Tensor, "F J 2"],
-    seen: Bool[Tensor, "F J"],
+    valid: Bool[Tensor, "F J"],
     K: Float[Tensor, "3 3"],
     lens: Float[Tensor, " 5"],
 ) -> Rays:
     """Pixels out of the lens; those that no ray reaches are not seen."""
-    straight, seen = ideal(pixels, seen, K, lens)
+    straight, valid = ideal(pixels, valid, K, lens)
     xy = torch.linalg.solve(K, torch.nn.functional.pad(straight, (0, 1), value=1.0).mT).mT[..., :2]
-    xy = torch.where(seen[..., None], xy, 0.0)
-    return Rays(xy, seen, person_size(xy, seen))
+    xy = torch.where(valid[..., None], xy, 0.0)
+    return Rays(xy, valid, person_scale(xy, valid))
 
 
 def ideal(
     pixels: Float[Tensor, "*B J 2"],
-    seen: Bool[Tensor, "*B J"],
+    valid: Bool[Tensor, "*B J"],
     K: Float[Tensor, "3 3"],
     lens: Float[Tensor, " 5"],
 ) -> tuple[Float[Tensor, "*B J 2"], Bool[Tensor, "*B J"]]:
     """Pinhole pixels of pixels seen through a lens, and which of them are seen and exist."""
-    seen = seen & (pixels.abs() < _FAR).all(-1)
+    valid = valid & (pixels.abs() < _FAR).all(-1)
     if not lens.any():
-        return pixels, seen
-    safe = torch.where(seen[..., None], pixels, K[:2, 2])
+        return pixels, valid
+    safe = torch.where(valid[..., None], pixels, K[:2, 2])
     straight, exists = undistort(safe.flatten(0, -2), K, lens)
-    return straight.reshape(pixels.shape), seen & exists.reshape(seen.shape)
+    return straight.reshape(pixels.shape), valid & exists.reshape(valid.shape)
 
 
 def _stack(each: list[Rays]) -> Rays:
     return Rays(
-        *(torch.stack([getattr(one, name) for one in each]) for name in ("xy", "seen", "size"))
+        *(torch.stack([getattr(one, name) for one in each]) for name in ("xy", "valid", "size"))
     )

@@ -10,7 +10,7 @@ from ghpt.errors import GhptDataError
 from ghpt.models.estimators.classical import Baseline
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.relative_pose.scale import HUMAN, STATURES, stature
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
 UNITS_MM = {1.0: "millimetres", 10.0: "centimetres", 1000.0: "metres"}
 _ADULT = 1730.0
@@ -39,7 +39,7 @@ def unit_for(height: float) -> float:
 
 
 def decide_unit(
-    cameras: CameraFile, batch: KeyPointBatch, estimator: Baseline, ask: bool
+    cameras: CameraFile, batch: Observations, estimator: Baseline, ask: bool
 ) -> CameraFile:
     """The cameras in mm, by the size of the person whom they show in these frames; as they are
     where the file says its unit, and where the views do not agree on a person, which is another
@@ -68,11 +68,11 @@ def decide_unit(
     if not ask:
         return cameras
     problem = "the file does not say its unit of length, and the person's size, of whom no limb is seen, does not tell"
-    mend = "Give the length of the unit in mm: unit_mm=1000 for metres, unit_mm=1 for millimetres."
+    hint = "Give the length of the unit in mm: unit_mm=1000 for metres, unit_mm=1 for millimetres."
     if height:
         problem = (
             f"the file does not say its unit of length, and the person measures {height:.3g} of it, "
             "which is nobody's size in mm, cm or m"
         )
-        mend = f"Give the length of the unit in mm: unit_mm={_ADULT / height:.4g} makes the person 1.73 m tall."
-    raise GhptDataError(cameras.path, "unit_mm", problem, mend)
+        hint = f"Give the length of the unit in mm: unit_mm={_ADULT / height:.4g} makes the person 1.73 m tall."
+    raise GhptDataError(cameras.path, "unit_mm", problem, hint)

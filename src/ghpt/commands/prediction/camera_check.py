@@ -22,13 +22,13 @@ def check_cameras(frames: Frames, doctor: Doctor) -> Checkup | None:
         return None
     rows = _windows(len(frames))
     file = frames.detected.cameras
-    pixels, _, seen = frames.detected.read(rows)
+    pixels, _, valid = frames.detected.read(rows)
     pixels = np.asarray(pixels, np.float64)
     try:
         evidence = choose(
             file.names,
             pixels,
-            np.array(seen),
+            np.array(valid),
             frames.frame[rows],
             doctor.frames,
             doctor.shift,

@@ -23,7 +23,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import local_cameras
 from ghpt.models.estimators.classical import Baseline
 from ghpt.reconstruction import Reconstruction
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 from ghpt.skeleton import JOINTS
 
 _NEAR = 1e5
@@ -38,7 +38,7 @@ MEASURED = 64
 """Frames by which the person tells the unit of length."""
 _STAMPED = 4096
 """Frames that are read at a time for the stamp."""
-_MEND = "Calibrate first (python calibrate.py keypoints=... cameras=...), and give the rig.toml that it writes."
+_HINT = "Calibrate first (python calibrate.py keypoints=... cameras=...), and give the rig.toml that it writes."
 
 Seen = tuple[Float[np.ndarray, "N V J 2"], Float[np.ndarray, "N V J"], Bool[np.ndarray, "N V J"]]
 """Undistorted pixels (float32), confidences and what is seen, of the 17 joints."""
@@ -60,7 +60,7 @@ class Frames:
 
     title: str
     source: str
-    """``embedded`` or the path of the key points."""
+    """``synthetic`` or the path of the key points."""
     camera_names: tuple[str, ...]
     cameras: Cameras
     """Leading dimension V, mm, float64."""
@@ -88,23 +88,23 @@ class Frames:
         """What was reconstructed of a batch, in the cameras' world."""
         return replace(part, points=part.points.double() + self.origin)
 
-    def batch(self, rows: Int[np.ndarray, " N"]) -> KeyPointBatch:
+    def batch(self, rows: Int[np.ndarray, " N"]) -> Observations:
         """Some rows, before cameras in a world whose zero is ``origin``.
 
         A frame's ``sample`` is its own number, so its random draws are the same in any batch.
         """
-        key_points, confidence, seen = (torch.from_numpy(values) for values in self.read(rows))
+        key_points, confidence, valid = (torch.from_numpy(values) for values in self.read(rows))
         count = len(rows)
         rig = self.cameras.relative_to(self.origin)
-        return KeyPointBatch(
+        return Observations(
             sample=torch.from_numpy(self.frame[rows]),
             recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
             key_points=key_points,
             confidence=confidence,
-            seen=seen,
+            valid=valid,
             truth=torch.zeros(count, len(JOINTS), 3),
-            truth_seen=torch.zeros(count, len(JOINTS), dtype=torch.bool),
+            truth_valid=torch.zeros(count, len(JOINTS), dtype=torch.bool),
         )
 
     def spread(self, most: int) -> Int[np.ndarray, " N"]:
@@ -129,7 +129,7 @@ def frames_of_views(views: Views, source: str, title: str) -> Frames:
     """
 
     def read(rows: Int[np.ndarray, " N"]) -> Seen:
-        return views.key_points[rows], views.confidence[rows], views.seen[rows]
+        return views.key_points[rows], views.confidence[rows], views.valid[rows]
 
     rate = None if views.rate_hz is None or math.isnan(views.rate_hz) else float(views.rate_hz)
     cameras = views.cameras
@@ -157,13 +157,13 @@ def calibrated(where: str, cameras: CameraFile) -> Cameras:
     extrinsics.
     """
     if len(cameras) < 2:
-        mend = "A place in space takes two views or more of the same moment."
+        hint = "A place in space takes two views or more of the same moment."
         raise GhptDataError(
-            where, "views", f"there is only {', '.join(cameras.names) or 'none'}", mend
+            where, "views", f"there is only {', '.join(cameras.names) or 'none'}", hint
         )
     if cameras.cameras is None:
         raise GhptDataError(
-            cameras.path, "rotation, translation", "not all cameras have extrinsics", _MEND
+            cameras.path, "rotation, translation", "not all cameras have extrinsics", _HINT
         )
     return cameras.cameras
 
@@ -172,4 +172,4 @@ def evidence(frames: Frames, shards: Shards) -> Iterator[Evidence]:
     """The key points of each shard."""
     for shard in range(len(shards)):
         batch = frames.batch(np.array(shards.rows(shard)))
-        yield Evidence(batch.key_points, batch.seen, None)
+        yield Evidence(batch.key_points, batch.valid, None)

@@ -54,8 +54,8 @@ class Gaps:
         if self.cut_off_hz is None:
             return
         rate = _known("smooth", self.rate_hz, "Give rate_hz=60, say.")
-        mend = f"Give more than 0 and less than half the frame rate of {rate:g} Hz."
-        check(0 < self.cut_off_hz < rate / 2, "smooth", f"is {self.cut_off_hz:g} Hz", mend)
+        hint = f"Give more than 0 and less than half the frame rate of {rate:g} Hz."
+        check(0 < self.cut_off_hz < rate / 2, "smooth", f"is {self.cut_off_hz:g} Hz", hint)
 
     @property
     def nothing(self) -> bool:
@@ -112,25 +112,25 @@ class Gaps:
 
 def gap_frames(fill: int | str | None, rate_hz: float | None) -> int | None:
     """The longest gap in frames, of ``6`` or of seconds as ``0.1s``. Raises GhptConfigError."""
-    mend = "Give frames (fill=6) or seconds (fill=0.1s)."
+    hint = "Give frames (fill=6) or seconds (fill=0.1s)."
     if fill is None:
         return None
     if isinstance(fill, int) and not isinstance(fill, bool):
-        check(fill >= 1, "fill", f"is {fill}", mend)
+        check(fill >= 1, "fill", f"is {fill}", hint)
         return fill
     seconds = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?s", str(fill))
     if seconds is None:
-        raise GhptConfigError("fill", f"is {fill!r}", mend)
+        raise GhptConfigError("fill", f"is {fill!r}", hint)
     rate = _known("fill", rate_hz, "Give rate_hz=60, say, or frames: fill=6.")
     frames = int(float(seconds[1]) * rate + 1e-9)
-    check(frames >= 1, "fill", f"is less than a frame at {rate:g} Hz", mend)
+    check(frames >= 1, "fill", f"is less than a frame at {rate:g} Hz", hint)
     return frames
 
 
-def _known(key: str, rate_hz: float | None, mend: str) -> float:
+def _known(key: str, rate_hz: float | None, hint: str) -> float:
     """The frame rate. Raises GhptConfigError for ``key`` unless it is one."""
     rate = rate_hz or math.nan
-    check(0 < rate < math.inf, key, "needs the frame rate, which the files do not tell", mend)
+    check(0 < rate < math.inf, key, "needs the frame rate, which the files do not tell", hint)
     return rate
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from ghpt.commands.inputs import InputSettings
 from ghpt.commands.prediction.verdict import Commands
-from ghpt.commands.train import shown, typed
+from ghpt.commands.train import display_path, shell_override
 
 _HEIGHT = 1750
 """mm: stands for the person's own."""
@@ -26,7 +26,9 @@ def commands_on(config: Mapping[str, Any], output: Path) -> Commands:
 
     def command(script: str, suffix: str, values: Mapping[str, Any]) -> str:
         words = [setting(key, value) for key, value in values.items()]
-        return " ".join(["python", script, *words, typed("output", shown(output) + suffix)])
+        return " ".join(
+            ["python", script, *words, shell_override("output", display_path(output) + suffix)]
+        )
 
     def predict(**more: Any) -> str:
         return command("predict.py", "_again", given | own | more)
@@ -47,7 +49,7 @@ def setting(key: str, value: object) -> str:
         return shlex.quote(f"{key}={_list(value)}")
     if isinstance(value, float):
         return f"{key}={value:g}"
-    return typed(key, value)
+    return shell_override(key, value)
 
 
 def _list(values: Iterable[object]) -> str:

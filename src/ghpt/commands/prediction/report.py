@@ -31,11 +31,11 @@ def summary_lines(numbers: Numbers) -> list[str]:
         + (f", {100 * share['filled']:.1f} % filled" if share["filled"] else "")
         + (f"; missing: {missing}." if missing else "."),
     ]
-    swapped = {view: n for view, n in numbers["swapped"].items() if n}
-    if swapped:
+    flipped = {view: n for view, n in numbers["swapped"].items() if n}
+    if flipped:
         lines.append(
             "Left and right exchanged in "
-            + ", ".join(f"{n} frames of {v}" for v, n in swapped.items())
+            + ", ".join(f"{n} frames of {v}" for v, n in flipped.items())
             + "."
         )
     if numbers["stature_mm"]:

@@ -19,11 +19,11 @@ from torch.utils.data import DataLoader
 from ghpt.commands.lost import told
 from ghpt.commands.prediction.frames import Frames
 from ghpt.commands.prediction.shards import Shards
-from ghpt.commands.train import make_trainer, shown
+from ghpt.commands.train import display_path, make_trainer
 from ghpt.reconstruction import Reconstruction
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
-Predictor = Callable[[KeyPointBatch], Reconstruction]
+Predictor = Callable[[Observations], Reconstruction]
 _log = logging.getLogger(__name__)
 
 
@@ -121,7 +121,10 @@ def _stop_told(shards: Shards, first: bool) -> Iterator[None]:
             shards.look()
             done = len(shards) - len(shards.missing())
             _log.warning(
-                "Stopped. %d of %d shards are in %s.", done, len(shards), shown(shards.folder)
+                "Stopped. %d of %d shards are in %s.",
+                done,
+                len(shards),
+                display_path(shards.folder),
             )
             _log.warning("The same command goes on with them.")
         raise

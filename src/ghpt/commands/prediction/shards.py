@@ -25,7 +25,7 @@ from ghpt.errors import GhptDataError
 from ghpt.files import acquire, atomic_write, errors_name, sweep_temporaries
 from ghpt.reconstruction import Reconstruction
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 MANIFEST = "manifest.jsonl"
 _DTYPES = {
     "frame": "<i8",
@@ -35,9 +35,9 @@ _DTYPES = {
     "views": "|b1",
     "covariance": "<f4",
     "score": "<f4",
-    "swapped": "|b1",
+    "flipped": "|b1",
 }
-_MEND = "Run the prediction again: what is damaged is made anew"
+_HINT = "Run the prediction again: what is damaged is made anew"
 _SHARD = re.compile(r"\d{6,}\.npz")
 _log = logging.getLogger(__name__)
 
@@ -134,7 +134,7 @@ class Shards:
             )
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise GhptDataError(
-                path, "", f"is not the shard that was written ({error})", _MEND
+                path, "", f"is not the shard that was written ({error})", _HINT
             ) from error
 
     def chunks(self) -> Iterator[Reconstruction]:

@@ -14,14 +14,14 @@ from torch import Tensor
 
 from ghpt.commands.prediction.frames import Frames
 from ghpt.geometry.cameras import reprojection_error
-from ghpt.models.estimators.classical import person_size
-from ghpt.models.estimators.flips import Swaps, undo_swaps
+from ghpt.models.estimators.classical import person_scale
+from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, SEGMENTS, stature
 from ghpt.reconstruction import Reconstruction, State
-from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.recording import Observations, PoseEstimate
 from ghpt.report.rig_comparison import segment_variation
 
-Estimate = Callable[[KeyPointBatch], PoseEstimate]
+Estimate = Callable[[Observations], PoseEstimate]
 Numbers = dict[str, Any]
 _LEAST = 20
 """Key points for a median that a verdict may rest on."""
@@ -35,7 +35,7 @@ def counts(
     """
     frames = 0
     states = torch.zeros(len(joints), len(State), dtype=torch.int64)
-    swapped = torch.zeros(len(cameras), dtype=torch.int64)
+    flipped = torch.zeros(len(cameras), dtype=torch.int64)
     every = max(1, -(-total // MEASURED_FRAMES))
     points = []
     observed = []
@@ -45,7 +45,7 @@ def counts(
         observed.append(chunk.state[measured] == State.OBSERVED)
         frames += len(chunk)
         states += torch.stack([(chunk.state == state).sum(0) for state in State], dim=1)
-        swapped += chunk.swapped.sum(0)
+        flipped += chunk.flipped.sum(0)
     share = {
         state.name.lower(): float(states[:, state].sum()) / max(frames * len(joints), 1)
         for state in State
@@ -55,7 +55,7 @@ def counts(
         "frames": frames,
         "share": share,
         "observed": dict(zip(joints, each, strict=True)),
-        "swapped": dict(zip(cameras, swapped.tolist(), strict=True)),
+        "swapped": dict(zip(cameras, flipped.tolist(), strict=True)),
         "stature_mm": float(stature(torch.cat(points), torch.cat(observed))) or None,
     }
 
@@ -63,18 +63,18 @@ def counts(
 @torch.no_grad()
 def evaluate(
     frames: Frames,
-    swaps: Swaps | None,
+    flips: LeftRightFlips | None,
     estimates: Mapping[str, Estimate],
     most: int,
     size: int,
 ) -> Numbers:
-    """For each estimator, on at most so many frames, evenly spread, and with ``swaps`` undone for
+    """For each estimator, on at most so many frames, evenly spread, and with ``flips`` undone for
     all: reprojection errors by view; errors in views that were left out, on the joints that all of
     them estimate without that view; variation of the segments' lengths.
     """
     rows = frames.spread(most)
     parts = [
-        _undone(frames.batch(rows[start : start + size]), swaps)
+        _undone(frames.batch(rows[start : start + size]), flips)
         for start in range(0, len(rows), size)
     ]
     own = {name: [estimate(part) for part in parts] for name, estimate in estimates.items()}
@@ -84,14 +84,14 @@ def evaluate(
     counted = torch.stack(
         [torch.cat([there for _, there in found]) for found in held.values()]
     ).all(0)
-    seen = torch.cat([part.seen for part in parts])
+    valid = torch.cat([part.valid for part in parts])
     result: Numbers = {}
     for name in estimates:
         placed = torch.cat([found.estimated for found in own[name]])
         error = torch.cat(
             [_errors(part, found) for part, found in zip(parts, own[name], strict=True)]
         )
-        measured = seen & placed[:, None] & error.isfinite()
+        measured = valid & placed[:, None] & error.isfinite()
         variation, known = segment_variation(
             torch.cat([found.points.double() for found in own[name]]), placed
         )
@@ -120,44 +120,44 @@ def evaluate(
     return {"frames": len(rows), "estimators": result}
 
 
-def estimate_of(predictor: Callable[[KeyPointBatch], Reconstruction]) -> Estimate:
+def estimate_of(predictor: Callable[[Observations], Reconstruction]) -> Estimate:
     """What a predictor gives, as the other estimators give it."""
 
-    def estimate(batch: KeyPointBatch) -> PoseEstimate:
+    def estimate(batch: Observations) -> PoseEstimate:
         found = predictor(batch)
         return PoseEstimate(found.points, found.state == State.OBSERVED)
 
     return estimate
 
 
-def _undone(batch: KeyPointBatch, swaps: Swaps | None) -> KeyPointBatch:
-    return batch if swaps is None else undo_swaps(batch, swaps)[0]
+def _undone(batch: Observations, flips: LeftRightFlips | None) -> Observations:
+    return batch if flips is None else undo_flips(batch, flips)[0]
 
 
-def _errors(batch: KeyPointBatch, found: PoseEstimate) -> Float[Tensor, "B V J"]:
+def _errors(batch: Observations, found: PoseEstimate) -> Float[Tensor, "B V J"]:
     return reprojection_error(batch.cameras, batch.key_points, found.points)
 
 
 def _held_out(
-    batch: KeyPointBatch, estimate: Estimate
+    batch: Observations, estimate: Estimate
 ) -> tuple[Float[Tensor, "B V J"], Bool[Tensor, "B V J"]]:
     """For each view the distance of its key points from the joints that the others give, and where
     there is one.
     """
     errors = []
     counted = []
-    for view in range(batch.seen.shape[1]):
-        seen = batch.seen.clone()
-        seen[:, view] = False
-        found = estimate(replace(batch, seen=seen))
+    for view in range(batch.valid.shape[1]):
+        valid = batch.valid.clone()
+        valid[:, view] = False
+        found = estimate(replace(batch, valid=valid))
         error = _errors(batch, found)[:, view]
         errors.append(error)
-        counted.append(batch.seen[:, view] & found.estimated & error.isfinite())
+        counted.append(batch.valid[:, view] & found.estimated & error.isfinite())
     return torch.stack(errors, dim=1), torch.stack(counted, dim=1)
 
 
 def _scales(
-    parts: list[KeyPointBatch],
+    parts: list[Observations],
     error: Float[Tensor, "T V J"],
     measured: Bool[Tensor, "T V J"],
     held: list[Tensor],
@@ -168,7 +168,7 @@ def _scales(
     none, ``all`` is None and those of the views are reprojection errors. None for fewer than
     ``_LEAST`` key points.
     """
-    size = torch.cat([person_size(part.key_points, part.seen) for part in parts])[
+    size = torch.cat([person_scale(part.key_points, part.valid) for part in parts])[
         ..., None
     ].double()
     left_out = torch.cat(held)

@@ -20,7 +20,7 @@ from ghpt.data.formats.skeletons import joints17, recognise
 from ghpt.data.formats.stored_npz import Member, members_of, read_rows, text_table
 from ghpt.data.formats.validate import check_view_count, frame_rate
 from ghpt.data.people.people import KeyPoints, joints_for
-from ghpt.data.people.views import look_through, matched
+from ghpt.data.people.views import matched, undistort_and_match
 from ghpt.errors import GhptDataError
 
 _CHECKED = 2000
@@ -51,16 +51,16 @@ class StoredKeyPoints:
     def part(self, rows: Int[np.ndarray, " N"]) -> KeyPoints:
         """Some rows, which rise."""
         values = self._read("key_points", rows).astype(np.float64)
-        seen = np.isfinite(values).all(-1)
+        valid = np.isfinite(values).all(-1)
         if "seen" in self.members:
-            seen &= self._read("seen", rows)
+            valid &= self._read("seen", rows)
         sure = (
             self._read("confidence", rows).astype(np.float64)
             if "confidence" in self.members
-            else np.ones(seen.shape)
+            else np.ones(valid.shape)
         )
-        sure = np.where(seen, np.nan_to_num(sure).clip(0, 1), 0)
-        values = np.where(seen[..., None], values, 0)
+        sure = np.where(valid, np.nan_to_num(sure).clip(0, 1), 0)
+        values = np.where(valid[..., None], values, 0)
         return KeyPoints(
             str(self.path),
             self.views,
@@ -68,7 +68,7 @@ class StoredKeyPoints:
             self.frame[rows],
             values,
             sure,
-            seen,
+            valid,
             self.rate_hz,
             (0,) * len(self.views),
         )
@@ -130,15 +130,15 @@ def open_stored(
     )
     joints = texts.get("joints", ()) if skeleton is None and "skeleton" not in texts else ()
     if not joints:
-        flat = spread.key_points.reshape(-1, shape[1], 2), spread.seen.reshape(-1, shape[1])
+        flat = spread.key_points.reshape(-1, shape[1], 2), spread.valid.reshape(-1, shape[1])
         name = skeleton or next(iter(texts.get("skeleton", ())), None) or recognise(path, *flat)
         joints = joints_for(path, name, shape[1])
     _check_names(path, {"views": (views, shape[0]), "joints": (joints, shape[1])}, frame)
     stored = StoredKeyPoints(path, members, views, joints, frame, rate_hz)
-    seen = np.zeros(shape[0], bool)
+    valid = np.zeros(shape[0], bool)
     for start in range(0, count, _PART):
-        seen |= stored.part(np.arange(start, min(start + _PART, count))).seen.any((0, 2))
-    for view in np.flatnonzero(~seen):
+        valid |= stored.part(np.arange(start, min(start + _PART, count))).valid.any((0, 2))
+    for view in np.flatnonzero(~valid):
         raise GhptDataError(
             path,
             f"view {views[view]}",
@@ -155,7 +155,7 @@ def frames_of_stored(
     views: Sequence[Name] | None,
     title: str,
 ) -> Frames:
-    """Raises GhptDataError as ``look_through`` does, and as ``frames_of_views``."""
+    """Raises GhptDataError as ``undistort_and_match`` does, and as ``frames_of_views``."""
     path = str(stored.path)
     pairs = matched(path, stored.views, cameras, match or {}, views)
     at = [view for view, _ in pairs]
@@ -163,24 +163,24 @@ def frames_of_stored(
     rig = calibrated(path, ordered)
     count = len(stored.frame)
     spread = np.unique(np.linspace(0, count - 1, min(_CHECKED, count)).astype(np.int64))
-    look_through(stored.part(spread), cameras, match, views)
+    undistort_and_match(stored.part(spread), cameras, match, views)
 
     def read(rows: Int[np.ndarray, " N"]) -> Seen:
         part = stored.part(rows)
-        pixels = np.zeros((*part.seen[:, at].shape, 2), np.float32)
-        seen = part.seen[:, at].copy()
+        pixels = np.zeros((*part.valid[:, at].shape, 2), np.float32)
+        valid = part.valid[:, at].copy()
         for view, of in enumerate(at):
             K = ordered.K[view].numpy()
             lens = ordered.distortion[view].numpy()
-            pixels[:, view], seen[:, view] = undistorted(
-                part.key_points[:, of], seen[:, view], K, lens
+            pixels[:, view], valid[:, view] = undistorted(
+                part.key_points[:, of], valid[:, view], K, lens
             )
-        return joints17(path, part.joints, pixels, part.confidence[:, at], seen)
+        return joints17(path, part.joints, pixels, part.confidence[:, at], valid)
 
     def detected(rows: Int[np.ndarray, " N"]) -> Seen:
         part = stored.part(rows)
         return joints17(
-            path, part.joints, part.key_points[:, at], part.confidence[:, at], part.seen[:, at]
+            path, part.joints, part.key_points[:, at], part.confidence[:, at], part.valid[:, at]
         )
 
     frame = stored.frame

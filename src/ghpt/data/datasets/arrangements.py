@@ -1,4 +1,4 @@
-"""The paper's five camera arrangements as DataModules, each from its embedded or its real source."""
+"""The paper's five camera arrangements as DataModules, each from its synthetic or its real source."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -11,22 +11,22 @@ from ghpt.data.datasets.human36m import DAMAGED, human36m_files, human36m_record
 from ghpt.data.datasets.panoptic import panoptic_files, panoptic_recordings
 from ghpt.data.datasets.store import file_stamps
 from ghpt.data.synthetic.detector import Detector
-from ghpt.data.synthetic.recordings import embedded_recordings
+from ghpt.data.synthetic.recordings import synthetic_recordings
 from ghpt.errors import GhptDataError, check
 from ghpt.recording import Recording
 
 
-class Embedded(TypedDict):
-    """Settings of the embedded source."""
+class Synthetic(TypedDict):
+    """Settings of the synthetic source."""
 
     seed: int
     detector: dict[str, Any]
 
 
 class _Arrangement(KeyPointDataModule):
-    """The choice between the embedded and the real source."""
+    """The choice between the synthetic and the real source."""
 
-    def __init__(self, cameras: Sequence[int], embedded: Embedded, **settings: Any) -> None:
+    def __init__(self, cameras: Sequence[int], synthetic: Synthetic, **settings: Any) -> None:
         super().__init__(**settings)
         check(
             len(cameras) >= 2,
@@ -34,21 +34,23 @@ class _Arrangement(KeyPointDataModule):
             f"is {list(cameras)}",
             "Triangulation needs at least 2 views.",
         )
-        check_arguments(Detector, embedded["detector"], "data.embedded.detector")
+        check_arguments(Detector, synthetic["detector"], "data.synthetic.detector")
         self.cameras = list(cameras)
-        self.embedded = embedded
+        self.synthetic = synthetic
 
-    def _embedded(self, split: str) -> Iterable[Recording]:
-        detector = Detector(**self.embedded["detector"])
-        return embedded_recordings(self.name, split, self.embedded["seed"], detector, self.cameras)
+    def _synthetic(self, split: str) -> Iterable[Recording]:
+        detector = Detector(**self.synthetic["detector"])
+        return synthetic_recordings(
+            self.name, split, self.synthetic["seed"], detector, self.cameras
+        )
 
     def _key(self, split: str, files: list[Path] | None, **more: Any) -> dict[str, Any]:
         key = {
-            "name": f"{self.name}-{split}-{'real' if self.root else 'embedded'}",
+            "name": f"{self.name}-{split}-{'real' if self.root else 'synthetic'}",
             "cameras": self.cameras,
         }
         if files is None:
-            return key | {"embedded": self.embedded, "made by": _made_by()}
+            return key | {"synthetic": self.synthetic, "made by": _made_by()}
         return key | more | {"root": self.source, "files": file_stamps(files, self._root())}
 
     def _root(self) -> Path:
@@ -61,7 +63,7 @@ class _Arrangement(KeyPointDataModule):
 
 
 def _made_by() -> str:
-    """A hash of the files that make the embedded recordings: whoever changes them need not clear a
+    """A hash of the files that make the synthetic recordings: whoever changes them need not clear a
     cache.
     """
     package = Path(__file__).parents[2]
@@ -83,12 +85,12 @@ class Human36M(_Arrangement):
         super().__init__(**settings)
         self.damaged = damaged
 
-    def make(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[Recording]:
         if self.root is not None:
             return human36m_recordings(self._root(), split, self.cameras, self.damaged)
-        return (r for r in self._embedded(split) if self.damaged or r.name not in DAMAGED)
+        return (r for r in self._synthetic(split) if self.damaged or r.name not in DAMAGED)
 
-    def key(self, split: str) -> dict[str, Any]:
+    def cache_key(self, split: str) -> dict[str, Any]:
         return self._key(split, human36m_files(self._root(), split) if self.root else None) | {
             "damaged": self.damaged
         }
@@ -97,12 +99,12 @@ class Human36M(_Arrangement):
 class Panoptic(_Arrangement):
     """CMU Panoptic Studio's HD cameras by number; each sequence 60/20/20 % in time."""
 
-    def make(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[Recording]:
         return (
             panoptic_recordings(self._root(), self.cameras, split)
             if self.root
-            else self._embedded(split)
+            else self._synthetic(split)
         )
 
-    def key(self, split: str) -> dict[str, Any]:
+    def cache_key(self, split: str) -> dict[str, Any]:
         return self._key(split, panoptic_files(self._root(), self.cameras) if self.root else None)

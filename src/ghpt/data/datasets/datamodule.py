@@ -1,4 +1,4 @@
-"""DataModules that serve the 2D key points of a camera arrangement, embedded or real (``root``)."""
+"""DataModules that serve the 2D key points of a camera arrangement, synthetic or real (``root``)."""
 
 from abc import abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
@@ -14,7 +14,7 @@ from ghpt.data.datasets.frames import BatchOrder, FrameLoader, Frames, trainable
 from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.data.datasets.store import prepared
 from ghpt.errors import GhptDataError, check
-from ghpt.recording import KeyPointBatch, PairBatch, Recording
+from ghpt.recording import Observations, PairBatch, Recording
 
 SPLITS = ("train", "validation", "test")
 
@@ -22,7 +22,7 @@ SPLITS = ("train", "validation", "test")
 class KeyPointDataModule(L.LightningDataModule):
     """Shared by all arrangements: preparation, choice of frames, batches.
 
-    ``root`` None means the embedded (synthetic) source, a path the real data set there. ``seed``
+    ``root`` None means the synthetic source, a path the real data set there. ``seed``
     chooses the training samples and their order. ``batch_size`` is the global one, divided among
     the processes. ``evaluate`` names the split that ``test`` runs on.
     """
@@ -73,7 +73,7 @@ class KeyPointDataModule(L.LightningDataModule):
         self.pairs: PairSettings | None = None
         self.frames: dict[str, Frames | Pairs] = {}
 
-    def serve(self, problem: Any) -> None:
+    def bind(self, problem: Any) -> None:
         """Serve what ``problem`` takes: pairs of cameras where it has ``PairSettings`` (``pairs``),
         else frames.
         """
@@ -81,15 +81,15 @@ class KeyPointDataModule(L.LightningDataModule):
 
     @property
     def source(self) -> str:
-        """``embedded`` or the path of the real data."""
-        return "embedded" if self.root is None else str(Path(self.root).resolve())
+        """``synthetic`` or the path of the real data."""
+        return "synthetic" if self.root is None else str(Path(self.root).resolve())
 
     @abstractmethod
-    def make(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[Recording]:
         """The split's recordings from their source, slowly."""
 
     @abstractmethod
-    def key(self, split: str) -> dict[str, Any]:
+    def cache_key(self, split: str) -> dict[str, Any]:
         """Everything that decides what ``make`` gives, as plain data."""
 
     def prepare_data(self) -> None:
@@ -117,14 +117,14 @@ class KeyPointDataModule(L.LightningDataModule):
         """
         recordings = prepared(
             self.cache,
-            self.key(split),
-            lambda: self.make(split),
+            self.cache_key(split),
+            lambda: self.generate(split),
             {"source": self.source, "split": split},
         )
         if not sum(map(len, recordings)):
-            mend = "Choose another split, or check what data.root holds."
+            hint = "Choose another split, or check what data.root holds."
             raise GhptDataError(
-                self.source, f"{self.name} {split}", "the split has no frames", mend
+                self.source, f"{self.name} {split}", "the split has no frames", hint
             )
         return recordings
 
@@ -176,7 +176,7 @@ class KeyPointDataModule(L.LightningDataModule):
         order = BatchOrder(len(self.frames[role]), self.batch_size, rank, world, seed, done)
         return FrameLoader(self.frames[role], order, self.workers)
 
-    def all_training_batches(self) -> Iterator[KeyPointBatch | PairBatch]:
+    def all_training_batches(self) -> Iterator[Observations | PairBatch]:
         """Every training sample once, in order, the same on every process: for the feature
         statistics.
         """

@@ -30,7 +30,7 @@ def in_image(
 
 def undistorted(
     pixels: Float[np.ndarray, "T J 2"],
-    seen: Bool[np.ndarray, "T J"],
+    valid: Bool[np.ndarray, "T J"],
     K: Float[np.ndarray, "3 3"],
     distortion: Float[np.ndarray, " 5"],
 ) -> tuple[Float[np.ndarray, "T J 2"], Bool[np.ndarray, "T J"]]:
@@ -39,12 +39,12 @@ def undistorted(
     Those that are not finite, or where the lens model cannot be inverted, are not seen; they become
     0.
     """
-    seen = seen & (np.abs(pixels) < _FAR).all(-1)
-    raw = torch.from_numpy(np.where(seen[..., None], pixels, K[:2, 2]).astype(np.float64)).reshape(
+    valid = valid & (np.abs(pixels) < _FAR).all(-1)
+    raw = torch.from_numpy(np.where(valid[..., None], pixels, K[:2, 2]).astype(np.float64)).reshape(
         -1, 2
     )
     ideal, exists = undistort(raw, torch.from_numpy(K), torch.from_numpy(distortion))
-    seen = seen & exists.numpy().reshape(seen.shape)
-    return np.where(seen[..., None], ideal.numpy().reshape(pixels.shape), 0).astype(
+    valid = valid & exists.numpy().reshape(valid.shape)
+    return np.where(valid[..., None], ideal.numpy().reshape(pixels.shape), 0).astype(
         np.float32
-    ), seen
+    ), valid

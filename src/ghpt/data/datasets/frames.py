@@ -10,11 +10,11 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from ghpt import randomness
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import KeyPointBatch, Recording, joints_with_enough_views
+from ghpt.recording import Observations, Recording, joints_with_enough_views
 from ghpt.skeleton import PELVIS
 
 
-class Frames(Dataset[KeyPointBatch]):
+class Frames(Dataset[Observations]):
     """Chosen frames of recordings that share a number of views; one item is a whole batch.
 
     ``frames`` are positions in the recordings laid end to end, in any order; sample i is
@@ -40,7 +40,7 @@ class Frames(Dataset[KeyPointBatch]):
         recording = bisect_right(self.start, self.frames[sample]) - 1
         return recording, int(self.frames[sample] - self.start[recording])
 
-    def __getitem__(self, samples: Sequence[int]) -> KeyPointBatch:
+    def __getitem__(self, samples: Sequence[int]) -> Observations:
         places = [self.locate(sample) for sample in samples]
         recording = torch.tensor([r for r, _ in places], dtype=torch.int64)
 
@@ -51,15 +51,15 @@ class Frames(Dataset[KeyPointBatch]):
                 rows[row] = getattr(self.recordings[r], field)[t]
             return torch.from_numpy(rows)
 
-        return KeyPointBatch(
+        return Observations(
             sample=torch.tensor(list(samples), dtype=torch.int64),
             recording=recording,
             cameras=self.cameras.index(recording),
             key_points=gather("key_points"),
             confidence=gather("confidence"),
-            seen=gather("seen"),
+            valid=gather("valid"),
             truth=gather("truth"),
-            truth_seen=gather("truth_seen"),
+            truth_valid=gather("truth_valid"),
         )
 
     def frame_numbers(self, samples: Sequence[int]) -> np.ndarray:
@@ -75,7 +75,7 @@ def trainable(recordings: Sequence[Recording], frames: np.ndarray, joints: int) 
     """
     data = Frames(recordings, frames)
     batch = data[range(len(frames))]
-    usable = joints_with_enough_views(batch.seen) & batch.truth_seen
+    usable = joints_with_enough_views(batch.valid) & batch.truth_valid
     return (usable[:, PELVIS] & (usable.sum(dim=1) >= joints)).numpy()
 
 

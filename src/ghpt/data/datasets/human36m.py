@@ -177,7 +177,7 @@ def _recording(
     frames = len(rows)
     views = len(subject.views)
     key_points = np.empty((frames, views, 17, 2), np.float32)
-    seen = np.empty((frames, views, 17), np.bool_)
+    valid = np.empty((frames, views, 17), np.bool_)
     truth = np.empty((frames, 17, 3), np.float32)
     for start in range(0, frames, _BLOCK):
         block = slice(start, start + _BLOCK)
@@ -187,14 +187,14 @@ def _recording(
         )
         truth[block] = _pick(subject.truth, rows[block])
         for view in range(views):
-            key_points[block, view], seen[block, view] = undistorted(
+            key_points[block, view], valid[block, view] = undistorted(
                 pixels[:, view],
                 there[:, view],
                 subject.cameras.K[view].numpy(),
                 subject.distortion[view],
             )
-    truth_seen = np.isfinite(truth).all(-1)
-    truth[~truth_seen] = 0
+    truth_valid = np.isfinite(truth).all(-1)
+    truth[~truth_valid] = 0
     return Recording(
         name=take,
         subject=subject.name,
@@ -203,10 +203,10 @@ def _recording(
         camera_names=subject.camera_names,
         cameras=subject.cameras,
         key_points=key_points,
-        confidence=np.ones(seen.shape, np.float32),
-        seen=seen,
+        confidence=np.ones(valid.shape, np.float32),
+        valid=valid,
         truth=truth,
-        truth_seen=truth_seen,
+        truth_valid=truth_valid,
         frame=frame.astype(np.int64),
     )
 

@@ -24,7 +24,7 @@ from ghpt.data.formats.validate import check_array, npy_header, open_input
 from ghpt.errors import GhptDataError
 
 LABELS_FILE = "human36m-multiview-labels-GTbboxes.npy"
-_MEND = "Get the file again, or prepare it anew with karfly/learnable-triangulation-pytorch."
+_HINT = "Get the file again, or prepare it anew with karfly/learnable-triangulation-pytorch."
 _MAX_OPCODES = 10_000
 """The real file needs a few hundred; its bulk is in arrays."""
 _MAX_FIELDS = 32
@@ -81,7 +81,7 @@ def read_labels(path: Path) -> Labels:
         check_array(path, f"table[{key!r}]", rows[key], (None,), "iu")
         if count and len(table) and (rows[key].min() < 0 or rows[key].max() >= len(names[count])):
             problem = f"goes from {rows[key].min()} to {rows[key].max()}, with {len(names[count])} {count}"
-            raise GhptDataError(path, f"table[{key!r}]", problem, _MEND)
+            raise GhptDataError(path, f"table[{key!r}]", problem, _HINT)
     points = _column(path, "table", table, "keypoints")
     return Labels(
         path,
@@ -178,7 +178,7 @@ def _unpickled(path: Path) -> dict[str, Any]:
     with open_input(path) as handle:
         _, _, dtype = npy_header(path, "", handle, path.stat().st_size, pickled=True)
         if not dtype.hasobject:
-            raise GhptDataError(path, "", f"holds {dtype}, not a pickled dict", _MEND)
+            raise GhptDataError(path, "", f"holds {dtype}, not a pickled dict", _HINT)
         with mmap.mmap(handle.fileno(), 0, access=mmap.ACCESS_READ) as data:
             try:
                 data.seek(handle.tell())
@@ -188,10 +188,10 @@ def _unpickled(path: Path) -> dict[str, Any]:
                 (content,) = content.state[4]
             except Exception as error:  # damaged pickles raise almost anything
                 raise GhptDataError(
-                    path, "", f"is not a labels file ({error!s:.200})", _MEND
+                    path, "", f"is not a labels file ({error!s:.200})", _HINT
                 ) from error
     if not isinstance(content, dict):
-        raise GhptDataError(path, "", f"holds a {type(content).__name__}, not a dict", _MEND)
+        raise GhptDataError(path, "", f"holds a {type(content).__name__}, not a dict", _HINT)
     return content
 
 
@@ -210,7 +210,7 @@ def _check_opcodes(data: mmap.mmap) -> None:
 def _names(path: Path, key: str, content: dict[str, Any]) -> tuple[str, ...]:
     names = content.get(key)
     if not isinstance(names, list) or not names or not all(isinstance(name, str) for name in names):
-        raise GhptDataError(path, key, "is not a list of names", _MEND)
+        raise GhptDataError(path, key, "is not a list of names", _HINT)
     return tuple(names)
 
 
@@ -219,15 +219,15 @@ def _structured(
 ) -> np.ndarray:
     array = content.get(key)
     if not isinstance(array, _Array):
-        raise GhptDataError(path, key, "is missing, or not an array", _MEND)
+        raise GhptDataError(path, key, "is missing, or not an array", _HINT)
     try:
         built = array.build()
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError) as error:
-        raise GhptDataError(path, key, f"is not a numpy array ({error})", _MEND) from error
+        raise GhptDataError(path, key, f"is not a numpy array ({error})", _HINT) from error
     return check_array(path, key, built, shape, "V")
 
 
 def _column(path: Path, key: str, array: np.ndarray, name: str) -> np.ndarray:
     if name not in (array.dtype.names or ()):
-        raise GhptDataError(path, f"{key}[{name!r}]", "is missing", _MEND)
+        raise GhptDataError(path, f"{key}[{name!r}]", "is missing", _HINT)
     return array[name]

@@ -138,7 +138,7 @@ class Pairs(Dataset[PairBatch]):
             ),
             key_points=gather("key_points"),
             confidence=gather("confidence"),
-            seen=gather("seen"),
+            valid=gather("valid"),
             points=torch.stack([r.points for r in self.rigs])[rig],
         )
 
@@ -160,7 +160,7 @@ class Pairs(Dataset[PairBatch]):
 _EMPTY = {
     "key_points": lambda *shape: np.zeros((*shape, 2), dtype=np.float32),
     "confidence": lambda *shape: np.zeros(shape, dtype=np.float32),
-    "seen": lambda *shape: np.zeros(shape, dtype=bool),
+    "valid": lambda *shape: np.zeros(shape, dtype=bool),
 }
 
 
@@ -207,7 +207,7 @@ def _volume(recordings: Sequence[Recording]) -> tuple[Float[Tensor, " 3"], Float
     are none.
     """
     step = max(1, sum(map(len, recordings)) // _VOLUME_FRAMES)
-    joints = np.concatenate([r.truth[::step][r.truth_seen[::step]] for r in recordings]).astype(
+    joints = np.concatenate([r.truth[::step][r.truth_valid[::step]] for r in recordings]).astype(
         np.float64
     )
     if not len(joints):

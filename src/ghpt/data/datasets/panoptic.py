@@ -90,16 +90,16 @@ def panoptic_recordings(root: Path, numbers: Sequence[int], split: str) -> Itera
         scenes = _scenes(folder)
         start, end = (int(part * len(scenes)) for part in SPLITS[split])
         frame = np.array(list(scenes)[start:end], dtype=np.int64)
-        truth, truth_seen = _truth([scenes[number] for number in frame])
+        truth, truth_valid = _truth([scenes[number] for number in frame])
         names, cameras, distortion = _cameras(folder, numbers)
         shape = (len(frame), len(numbers), len(JOINT))
         key_points = np.zeros((*shape, 2), np.float32)
-        seen = np.zeros(shape, np.bool_)
+        valid = np.zeros(shape, np.bool_)
         confidence = np.zeros(shape, np.float32)
         for view, found in enumerate(detections(folder, numbers, list(scenes))):
             _, here, there = np.intersect1d(frame, found["frame"], return_indices=True)
             confidence[here, view] = found["confidence"][there]
-            key_points[here, view], seen[here, view] = undistorted(
+            key_points[here, view], valid[here, view] = undistorted(
                 found["key_points"][there],
                 found["seen"][there],
                 cameras.K[view].numpy(),
@@ -113,10 +113,10 @@ def panoptic_recordings(root: Path, numbers: Sequence[int], split: str) -> Itera
             camera_names=names,
             cameras=cameras,
             key_points=key_points,
-            confidence=np.where(seen, confidence, 0).astype(np.float32),
-            seen=seen,
+            confidence=np.where(valid, confidence, 0).astype(np.float32),
+            valid=valid,
             truth=truth,
-            truth_seen=truth_seen,
+            truth_valid=truth_valid,
             frame=frame,
         )
 
@@ -127,8 +127,8 @@ def joints17(
     """COCO19 as the 17 joints, by name. A mean (spine, head top) is there if all of its joints are."""
     parts = [[COCO19.index(name) for name in _PARTS[joint]] for joint in JOINT]
     points = np.stack([joints19[:, part].mean(1) for part in parts], axis=1)
-    seen = np.stack([there[:, part].all(1) for part in parts], axis=1)
-    return np.where(seen[..., None], points, 0).astype(np.float32), seen
+    valid = np.stack([there[:, part].all(1) for part in parts], axis=1)
+    return np.where(valid[..., None], points, 0).astype(np.float32), valid
 
 
 def _sequences(root: Path) -> list[Path]:

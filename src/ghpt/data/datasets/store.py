@@ -1,6 +1,6 @@
 """Prepared recordings on disk: one raw little-endian file per field, memory-mapped, and a manifest.
 
-Every source, embedded or real, is prepared into this format once; a later start opens it without
+Every source, synthetic or real, is prepared into this format once; a later start opens it without
 reading it, so the number of frames costs no memory and no time.
 """
 
@@ -23,13 +23,13 @@ from ghpt.recording import Recording
 from ghpt.skeleton import JOINTS
 
 FORMAT = "ghpt recordings"
-VERSION = 1
+VERSION = 2
 FIELDS: dict[str, tuple[str, tuple[str | int, ...], str]] = {
     "key_points": ("<f4", ("V", len(JOINTS), 2), "undistorted pixels"),
     "confidence": ("<f4", ("V", len(JOINTS)), "0 to 1"),
-    "seen": ("|u1", ("V", len(JOINTS)), "0 or 1"),
+    "valid": ("|u1", ("V", len(JOINTS)), "0 or 1"),
     "truth": ("<f4", (len(JOINTS), 3), "world, mm"),
-    "truth_seen": ("|u1", (len(JOINTS),), "0 or 1"),
+    "truth_valid": ("|u1", (len(JOINTS),), "0 or 1"),
     "frame": ("<i8", (), "the data set's frame number"),
 }
 """Field -> (dtype, shape of one frame, unit)."""
@@ -38,7 +38,7 @@ _CHUNK = 4096
 """Frames that are in memory at once while a store is written."""
 _READERS = 1
 """To be raised when the real sources make something else of the same files."""
-_MEND = "Delete this folder; it will be prepared anew"
+_HINT = "Delete this folder; it will be prepared anew"
 
 
 def cache_root() -> Path:
@@ -154,7 +154,7 @@ def open_store(folder: str | Path) -> list[Recording]:
             FIELDS.items(), manifest["files"].values(), strict=True
         )
     }
-    arrays |= {field: arrays[field].view(np.bool_) for field in ("seen", "truth_seen")}
+    arrays |= {field: arrays[field].view(np.bool_) for field in ("valid", "truth_valid")}
     return [_recording(entry, arrays) for entry in manifest["recordings"]]
 
 
@@ -165,18 +165,18 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
         manifest = json.loads(path.read_bytes())
     except FileNotFoundError as error:
         raise GhptDataError(
-            path, "", "there is no manifest, so this is no prepared recording", _MEND
+            path, "", "there is no manifest, so this is no prepared recording", _HINT
         ) from error
     except (OSError, ValueError, RecursionError) as error:
-        raise GhptDataError(path, "", f"cannot be read ({error})", _MEND) from error
+        raise GhptDataError(path, "", f"cannot be read ({error})", _HINT) from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
-        raise GhptDataError(path, "format", f"is not '{FORMAT}'", _MEND)
+        raise GhptDataError(path, "format", f"is not '{FORMAT}'", _HINT)
     if manifest.get("version") != VERSION:
         problem = f"is {manifest.get('version')!r}; this ghpt reads {VERSION}"
-        raise GhptDataError(path, "version", problem, _MEND)
+        raise GhptDataError(path, "version", problem, _HINT)
     if manifest.pop("digest", None) != _digest(manifest):
         raise GhptDataError(
-            path, "digest", "does not fit the rest: the manifest was changed or damaged", _MEND
+            path, "digest", "does not fit the rest: the manifest was changed or damaged", _HINT
         )
     for field, (dtype, _, _) in FIELDS.items():
         file = Path(folder) / f"{field}.bin"
@@ -187,7 +187,7 @@ def read_manifest(folder: str | Path) -> dict[str, Any]:
         found = file.stat().st_size if file.is_file() else None
         if found != expected:
             problem = "is missing" if found is None else f"has {found} bytes instead of {expected}"
-            raise GhptDataError(file, field, problem, _MEND)
+            raise GhptDataError(file, field, problem, _HINT)
     return manifest
 
 
@@ -197,7 +197,7 @@ def verify_store(folder: str | Path) -> None:
         path = Path(folder) / f"{field}.bin"
         with open(path, "rb") as handle:
             if hashlib.file_digest(handle, "sha256").hexdigest() != entry["sha256"]:
-                raise GhptDataError(path, field, "is not what was written (SHA-256 differs)", _MEND)
+                raise GhptDataError(path, field, "is not what was written (SHA-256 differs)", _HINT)
 
 
 def _shape(field: str, frames: int, views: int) -> list[int]:

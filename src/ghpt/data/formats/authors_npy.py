@@ -42,11 +42,11 @@ def read_authors(path: Path, skeleton: str | None) -> KeyPoints:
             )
             raise GhptDataError(predictions, "", problem, "Keep the chunks of one rig in a folder.")
         with np.errstate(over="ignore", invalid="ignore"):
-            found, seen = in_image(crop.astype(np.float64), corners)
+            found, valid = in_image(crop.astype(np.float64), corners)
         pixels.append(found)
-        there.append(seen & np.isfinite(found).all(-1))
-    seen = np.concatenate(there)
-    points = np.where(seen[..., None], np.concatenate(pixels), 0)
+        there.append(valid & np.isfinite(found).all(-1))
+    valid = np.concatenate(there)
+    points = np.where(valid[..., None], np.concatenate(pixels), 0)
     if (np.abs(points) >= 1e6).any():
         raise GhptDataError(path, "", "holds a number beyond 1e6", "Detect again; check the boxes.")
     frames, views, count, _ = points.shape
@@ -63,8 +63,8 @@ def read_authors(path: Path, skeleton: str | None) -> KeyPoints:
         joints_for(path, skeleton or "human36m", count),
         frame,
         points,
-        seen.astype(np.float64),
-        seen,
+        valid.astype(np.float64),
+        valid,
         None,
         (0,) * views,
     )

@@ -13,14 +13,21 @@ from jaxtyping import Float
 from ghpt.data.formats.json_views import json_files, view_name
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.formats.validate import check_view_count, read_json
-from ghpt.data.people.people import Detections, People, check_people, detections, gather, triples
+from ghpt.data.people.people import (
+    Detections,
+    ViewDetections,
+    check_people,
+    detections,
+    gather,
+    triples,
+)
 from ghpt.errors import GhptDataError
 
-_MEND = 'It must be a list of {"image_id": 12, "keypoints": [x, y, score, ...], "score": 0.9}.'
+_HINT = 'It must be a list of {"image_id": 12, "keypoints": [x, y, score, ...], "score": 0.9}.'
 _Found = list[tuple[int, Float[np.ndarray, "K 3"]]]
 
 
-def read_coco(path: Path, skeleton: str | None) -> People:
+def read_coco(path: Path, skeleton: str | None) -> Detections:
     """Everybody in COCO results: a folder with a file for each camera, or one file with the names
     of the images.
 
@@ -30,7 +37,7 @@ def read_coco(path: Path, skeleton: str | None) -> People:
     without a name. 17 joints are COCO's. Raises GhptDataError.
     """
     files = json_files(path)
-    found: list[Detections] = []
+    found: list[ViewDetections] = []
     for file in files:
         views, frames = _views(file, named=path.is_dir())
         found += [detections(file, view, frames[view], views[view]) for view in sorted(frames)]
@@ -47,7 +54,7 @@ def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[i
     people = content.get("annotations") if isinstance(content, dict) else content
     for field, listed in (("images", images), ("annotations", people)):
         if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
-            raise GhptDataError(file, field, "is not a list of objects", _MEND)
+            raise GhptDataError(file, field, "is not a list of objects", _HINT)
     counts = Counter(_key(person.get("image_id")) for person in people)
     check_people(file, "annotations", max(counts.values(), default=0))
     names = {_key(image.get("id")): image.get("file_name") for image in images}

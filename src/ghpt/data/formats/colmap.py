@@ -24,7 +24,7 @@ from ghpt.geometry.rotations import quaternion_to_matrix
 
 _LARGEST = 1 << 30
 """Bytes of images.bin or images.txt, which hold every image's points."""
-_MEND = "Export the model again with COLMAP's model_converter."
+_HINT = "Export the model again with COLMAP's model_converter."
 _MODELS = {
     0: ("SIMPLE_PINHOLE", 3),
     1: ("PINHOLE", 4),
@@ -83,11 +83,11 @@ def read_colmap(folder: Path) -> list[ColmapCamera]:
     try:
         found = list(islice(read_cameras(_content(camera_file)), MOST_VIEWS + 1))
     except (struct.error, ValueError, OverflowError) as error:
-        raise GhptDataError(camera_file, "", f"is damaged ({error})", _MEND) from error
+        raise GhptDataError(camera_file, "", f"is damaged ({error})", _HINT) from error
     try:
         images = sorted(islice(read_images(_content(image_file)), MOST_VIEWS + 1))
     except (struct.error, ValueError, OverflowError) as error:
-        raise GhptDataError(image_file, "", f"is damaged ({error})", _MEND) from error
+        raise GhptDataError(image_file, "", f"is damaged ({error})", _HINT) from error
     check_view_count(camera_file, len(found))
     check_view_count(image_file, len(images))
     cameras = {number: rest for number, *rest in found}
@@ -96,7 +96,7 @@ def read_colmap(folder: Path) -> list[ColmapCamera]:
     for image, (name, other) in zip(images, names, strict=True):
         if image.camera not in cameras:
             raise GhptDataError(
-                image_file, f"image {image.name}", f"there is no camera {image.camera}", _MEND
+                image_file, f"image {image.name}", f"there is no camera {image.camera}", _HINT
             )
         model, size, parameters = cameras[image.camera]
         K, lens = _intrinsics(camera_file, name, model, parameters)
@@ -185,9 +185,9 @@ def _names(where: Path, paths: list[PurePosixPath]) -> list[tuple[str, str]]:
                 (name, str(path.parent / path.stem))
                 for name, path in zip(names, paths, strict=True)
             ]
-    mend = "A rig's cameras stand still: keep one image of each, called as its view."
+    hint = "A rig's cameras stand still: keep one image of each, called as its view."
     raise GhptDataError(
-        where, "images", f"are {len(paths)} with names that tell no cameras apart", mend
+        where, "images", f"are {len(paths)} with names that tell no cameras apart", hint
     )
 
 
@@ -221,6 +221,6 @@ def _rotation(where: Path, image: Image) -> Float[np.ndarray, "3 3"]:
     length = math.hypot(*image.wxyz)
     if not 0.5 < length < 2:
         raise GhptDataError(
-            where, f"image {image.name}", "has a quaternion that is not of length 1", _MEND
+            where, f"image {image.name}", "has a quaternion that is not of length 1", _HINT
         )
     return quaternion_to_matrix(torch.tensor(image.wxyz, dtype=torch.float64) / length).numpy()

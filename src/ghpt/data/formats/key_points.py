@@ -24,12 +24,12 @@ from ghpt.data.formats.openpose import follow_views, read_openpose
 from ghpt.data.formats.own_npz import read_own, write_key_points
 from ghpt.data.formats.skeletons import SKELETONS, joints_of, parts_of
 from ghpt.data.formats.validate import frame_rate, open_input
-from ghpt.data.people.people import KeyPoints, People, everyone
+from ghpt.data.people.people import Detections, KeyPoints, as_people
 from ghpt.errors import GhptDataError
 
 __all__ = ["FORMATS", "KeyPoints", "People", "read_key_points", "read_people", "write_key_points"]
 
-_MEND = (
+_HINT = (
     "Known: a folder with OpenPose's JSON files in a folder for each camera; COCO results or MMPose's JSON, a file for "
     "each camera; caliscope's xy_*.csv; an npz file of ghpt; the authors' all_2d_preds.npy; DeepLabCut, SLEAP and "
     "LightningPose files (docs/calibration.md). Or name it: format=."
@@ -41,7 +41,7 @@ def read_people(
     skeleton: str | None = None,
     rate_hz: int | float | None = None,
     format: str | None = None,
-) -> People:
+) -> Detections:
     """Everybody in a folder or file of key points; ``skeleton`` and ``rate_hz`` say what the files
     do not, or overrule them; ``format`` is one of ``FORMATS``, and recognised by content if None.
 
@@ -56,9 +56,9 @@ def read_people(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
     found = FORMATS[format or _recognised(path)](path, skeleton)
-    people = everyone(found) if isinstance(found, KeyPoints) else found
+    people = as_people(found) if isinstance(found, KeyPoints) else found
     parts_of(path, people.joints)
-    seen_by = set(people.view[people.seen.any(-1)].tolist())
+    seen_by = set(people.view[people.valid.any(-1)].tolist())
     for view, name in enumerate(people.views):
         if view not in seen_by:
             raise GhptDataError(
@@ -75,14 +75,14 @@ def read_key_points(
 ) -> KeyPoints:
     """The one person of ``read_people`` who is tracked best in each view
     (``ghpt.data.formats.openpose.follow``), without regard to the other views:
-    `ghpt.data.people.views.look_through` chooses better where cameras are calibrated.
+    `ghpt.data.people.views.undistort_and_match` chooses better where cameras are calibrated.
     """
     people = read_people(path, skeleton, rate_hz, format)
     return people.pick(follow_views(people))
 
 
 def _caliscope(path: Path, _: str | None) -> KeyPoints:
-    views, frame, points, seen = read_caliscope(path)
+    views, frame, points, valid = read_caliscope(path)
     joints = SKELETONS["mediapipe_33"]
     return KeyPoints(
         str(path),
@@ -90,14 +90,14 @@ def _caliscope(path: Path, _: str | None) -> KeyPoints:
         joints,
         frame,
         points,
-        seen.astype(np.float64),
-        seen,
+        valid.astype(np.float64),
+        valid,
         None,
         (0,) * len(views),
     )
 
 
-FORMATS: dict[str, Callable[[Path, str | None], KeyPoints | People]] = {
+FORMATS: dict[str, Callable[[Path, str | None], KeyPoints | Detections]] = {
     "openpose": read_openpose,
     "coco": read_coco,
     "mmpose": read_mmpose,
@@ -115,7 +115,7 @@ def _recognised(path: Path) -> str:
     if not path.is_dir():
         form = _of_file(path)
         if form in (None, "openpose"):
-            raise GhptDataError(path, "", "is not a key-point format that is known", _MEND)
+            raise GhptDataError(path, "", "is not a key-point format that is known", _HINT)
         return form
     if any(path.glob("all_2d_preds*.npy")):
         return "authors"

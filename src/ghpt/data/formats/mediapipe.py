@@ -74,9 +74,9 @@ def read_caliscope(
         )
     shape = (len(frames), len(ports), _JOINTS)
     points = np.zeros((*shape, 2))
-    seen = np.zeros(shape, np.bool_)
-    points.reshape(-1, 2)[place], seen.reshape(-1)[place] = table[:, 3:5], True
-    return tuple(f"cam_{port}" for port in ports), frames, points, seen
+    valid = np.zeros(shape, np.bool_)
+    points.reshape(-1, 2)[place], valid.reshape(-1)[place] = table[:, 3:5], True
+    return tuple(f"cam_{port}" for port in ports), frames, points, valid
 
 
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:
@@ -111,8 +111,8 @@ def _lines(handle: io.TextIOBase) -> Iterator[str]:
 def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
     line = handle.readline(_LONGEST_LINE)
     if ";" in line or "\t" in line:
-        mend = "Save it with commas between the columns and points in the numbers (a spreadsheet may have changed it)."
-        raise GhptDataError(path, "", "has columns that commas do not part", mend)
+        hint = "Save it with commas between the columns and points in the numbers (a spreadsheet may have changed it)."
+        raise GhptDataError(path, "", "has columns that commas do not part", hint)
     try:
         header = [name.strip() for name in next(csv.reader([line]))]
         columns = [header.index(name) for name in COLUMNS]

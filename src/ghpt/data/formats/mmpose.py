@@ -11,26 +11,33 @@ from jaxtyping import Float
 from ghpt.data.formats.json_views import json_files, view_name
 from ghpt.data.formats.skeletons import canonical
 from ghpt.data.formats.validate import read_json
-from ghpt.data.people.people import Detections, People, check_people, detections, gather, triples
+from ghpt.data.people.people import (
+    Detections,
+    ViewDetections,
+    check_people,
+    detections,
+    gather,
+    triples,
+)
 from ghpt.errors import GhptDataError
 
-_MEND = "It must be a file that MMPose wrote for a video (save_predictions, or pred_out_dir)."
+_HINT = "It must be a file that MMPose wrote for a video (save_predictions, or pred_out_dir)."
 
 
-def read_mmpose(path: Path, skeleton: str | None) -> People:
+def read_mmpose(path: Path, skeleton: str | None) -> Detections:
     """Everybody in a folder with MMPose's file of each camera; the files' names are the views'.
 
     Frame numbers are ``frame_id``; the joints' names those of ``meta_info``, if it is there. Raises
     GhptDataError.
     """
-    found: list[Detections] = []
+    found: list[ViewDetections] = []
     named: dict[tuple[str, ...], Path] = {}
     for file in json_files(path):
         content = read_json(file)
         meta = content.get("meta_info", {}) if isinstance(content, dict) else {}
         frames = content.get("instance_info") if isinstance(content, dict) else content
         if not isinstance(frames, list) or not all(isinstance(frame, dict) for frame in frames):
-            raise GhptDataError(file, "instance_info", "is not a list of frames", _MEND)
+            raise GhptDataError(file, "instance_info", "is not a list of frames", _HINT)
         joints = _joints(file, meta)
         view = _view(file, frames)
         if joints is not None and len(view.values) and view.values.shape[1] != len(joints):
@@ -48,7 +55,7 @@ def read_mmpose(path: Path, skeleton: str | None) -> People:
     return gather(path, found, next(iter(named)) or None, skeleton)
 
 
-def _view(file: Path, frames: list[dict[str, Any]]) -> Detections:
+def _view(file: Path, frames: list[dict[str, Any]]) -> ViewDetections:
     numbers = []
     found = []
     for index, frame in enumerate(frames):
@@ -56,11 +63,11 @@ def _view(file: Path, frames: list[dict[str, Any]]) -> Detections:
         people = frame.get("instances")
         if type(number) is not int or not 0 <= number < 10**15:
             raise GhptDataError(
-                file, f"instance_info[{index}].frame_id", "is not a frame number", _MEND
+                file, f"instance_info[{index}].frame_id", "is not a frame number", _HINT
             )
         if not isinstance(people, list) or not all(isinstance(person, dict) for person in people):
             raise GhptDataError(
-                file, f"instance_info[{index}].instances", "is not a list of people", _MEND
+                file, f"instance_info[{index}].instances", "is not a list of people", _HINT
             )
         check_people(file, f"instance_info[{index}].instances", len(people))
         numbers.append(number)
@@ -79,10 +86,10 @@ def _person(file: Path, field: str, person: dict[str, Any]) -> Float[np.ndarray,
     if not isinstance(points, list) or not all(
         isinstance(point, list) and len(point) == 2 for point in points
     ):
-        raise GhptDataError(file, f"{field}.keypoints", "is not a list of [x, y]", _MEND)
+        raise GhptDataError(file, f"{field}.keypoints", "is not a list of [x, y]", _HINT)
     if not isinstance(scores, list) or len(scores) != len(points):
         raise GhptDataError(
-            file, f"{field}.keypoint_scores", "is not a list of a score for each joint", _MEND
+            file, f"{field}.keypoint_scores", "is not a list of a score for each joint", _HINT
         )
     return triples(
         file,
@@ -102,6 +109,6 @@ def _joints(file: Path, meta: Any) -> tuple[str, ...] | None:
         or not all(type(name) is str for name in names.values())
     ):
         raise GhptDataError(
-            file, "meta_info.keypoint_id2name", "does not name the joints from 0 on", _MEND
+            file, "meta_info.keypoint_id2name", "does not name the joints from 0 on", _HINT
         )
     return canonical([names[number] for number in numbers])

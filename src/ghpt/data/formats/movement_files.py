@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ghpt.data.formats.skeletons import canonical
-from ghpt.data.people.people import Detections, People, gather
+from ghpt.data.people.people import Detections, ViewDetections, gather
 from ghpt.errors import GhptDataError
 
 EXTENSIONS = (".csv", ".h5", ".slp")
@@ -24,24 +24,24 @@ _LARGEST = 2 << 30
 """Bytes."""
 
 
-def read_deeplabcut(path: Path, skeleton: str | None) -> People:
+def read_deeplabcut(path: Path, skeleton: str | None) -> Detections:
     """Everybody in a folder with DeepLabCut's CSV of each camera. Its .h5 files are refused: they
     hold pickles.
     """
     return _read(path, skeleton, "DeepLabCut", (".csv",))
 
 
-def read_lightning_pose(path: Path, skeleton: str | None) -> People:
+def read_lightning_pose(path: Path, skeleton: str | None) -> Detections:
     """The one person of a folder with LightningPose's CSV of each camera."""
     return _read(path, skeleton, "LightningPose", (".csv",))
 
 
-def read_sleap(path: Path, skeleton: str | None) -> People:
+def read_sleap(path: Path, skeleton: str | None) -> Detections:
     """Everybody in a folder with SLEAP's .slp or analysis .h5 of each camera."""
     return _read(path, skeleton, "SLEAP", (".slp", ".h5"))
 
 
-def _read(path: Path, skeleton: str | None, software: str, endings: tuple[str, ...]) -> People:
+def _read(path: Path, skeleton: str | None, software: str, endings: tuple[str, ...]) -> Detections:
     files = (
         [f for f in sorted(path.iterdir()) if f.suffix.lower() in endings]
         if path.is_dir()
@@ -87,20 +87,20 @@ def _read(path: Path, skeleton: str | None, software: str, endings: tuple[str, .
     return gather(path, found, next(iter(named)), skeleton)
 
 
-def _view(file: Path, data: Any) -> tuple[tuple[str, ...], Detections]:
+def _view(file: Path, data: Any) -> tuple[tuple[str, ...], ViewDetections]:
     """The joints' names and the detections of movement's data set: dimensions time, space,
     keypoints, individuals.
     """
     order = ("time", "individuals", "keypoints")
     position = np.asarray(data["position"].transpose(*order, "space"), dtype=np.float64)[..., :2]
     confidence = np.asarray(data["confidence"].transpose(*order), dtype=np.float64)
-    seen = np.isfinite(position).all(-1) & (np.abs(np.nan_to_num(position)) < 1e6).all(-1)
+    valid = np.isfinite(position).all(-1) & (np.abs(np.nan_to_num(position)) < 1e6).all(-1)
     # SLEAP's hand-made labels have no score, LightningPose and DeepLabCut a likelihood
     score = np.where(np.isfinite(confidence), confidence, 1.0)
-    values = np.where(seen[..., None], np.concatenate([position, score[..., None]], -1), 0)
-    frame, person = np.nonzero(seen.any(-1))
+    values = np.where(valid[..., None], np.concatenate([position, score[..., None]], -1), 0)
+    frame, person = np.nonzero(valid.any(-1))
     joints = canonical([str(name) for name in data["keypoints"].values])
     name = re.split(r"DLC_|[_.-]?(?:predictions|analysis)", file.stem)[0] or file.stem
-    return joints, Detections(
-        name, np.arange(len(seen)), frame, values[frame, person], np.full(len(frame), -1)
+    return joints, ViewDetections(
+        name, np.arange(len(valid)), frame, values[frame, person], np.full(len(frame), -1)
     )

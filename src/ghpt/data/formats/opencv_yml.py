@@ -25,7 +25,7 @@ _DEEPEST = 100
 _INDENTED = re.compile(rb"^[ ?:-]{%d}" % (_DEEPEST + 1), re.MULTILINE)
 _Base: type = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 """Builds texts, lists and dicts alone; libyaml's is ten times as fast and may be absent."""
-_MEND = "It must be a yml file that OpenCV or EasyMocap wrote."
+_HINT = "It must be a yml file that OpenCV or EasyMocap wrote."
 
 
 class _Loader(_Base):
@@ -48,7 +48,7 @@ def read_yml(path: Path) -> dict[str, Node | None]:
     with open_input(path) as handle:
         data = handle.read(_LARGEST + 1)
     if len(data) > _LARGEST:
-        raise GhptDataError(path, "", f"has more than {_LARGEST >> 10} KiB", _MEND)
+        raise GhptDataError(path, "", f"has more than {_LARGEST >> 10} KiB", _HINT)
     if not data.endswith((b"\n", b"\r")):
         raise GhptDataError(
             path, "", "ends in the middle of a line: it is truncated", "Copy it again."
@@ -56,7 +56,7 @@ def read_yml(path: Path) -> dict[str, Node | None]:
     characters = np.frombuffer(data, np.uint8)
     deeper, higher = (np.isin(characters, list(signs)).astype(np.int32) for signs in (b"[{", b"]}"))
     if np.cumsum(deeper - higher).max(initial=0) > _DEEPEST or _INDENTED.search(data):
-        raise GhptDataError(path, "", f"has more than {_DEEPEST} lists in lists", _MEND)
+        raise GhptDataError(path, "", f"has more than {_DEEPEST} lists in lists", _HINT)
     # %YAML:1.0 is no directive of YAML's
     body = b"\n".join(
         line
@@ -67,10 +67,10 @@ def read_yml(path: Path) -> dict[str, Node | None]:
         content = yaml.load(body.decode(), Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise GhptDataError(
-            path, "", f"is not valid yml ({' '.join(str(error).split())})", _MEND
+            path, "", f"is not valid yml ({' '.join(str(error).split())})", _HINT
         ) from error
     if not isinstance(content, dict):
-        raise GhptDataError(path, "", "holds no keys", _MEND)
+        raise GhptDataError(path, "", "holds no keys", _HINT)
     return {str(key): _node(path, str(key), value) for key, value in content.items()}
 
 
@@ -96,5 +96,5 @@ def _matrix(path: Path, key: str, value: dict[str, Any]) -> Float[np.ndarray, "r
         if min(shape) < 0 or flat.size != shape[0] * shape[1]:
             raise ValueError(f"{flat.size} numbers for {shape[0]} x {shape[1]}")
     except (ValueError, TypeError, OverflowError) as error:
-        raise GhptDataError(path, key, f"is no matrix ({error})", _MEND) from error
+        raise GhptDataError(path, key, f"is no matrix ({error})", _HINT) from error
     return flat.reshape(shape)

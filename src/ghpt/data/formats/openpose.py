@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ghpt.data.formats.validate import SMALL_JSON, check_view_count, read_json
-from ghpt.data.people.people import Detections, People, check_people, gather, triples
+from ghpt.data.people.people import Detections, ViewDetections, check_people, gather, triples
 from ghpt.errors import GhptDataError
 
 _LAYOUT = "It must hold a folder for each camera, each with a JSON file for each frame: cam1/cam1_000000000012.json."
@@ -24,7 +24,7 @@ Frames = list[Float[np.ndarray, "_ K 3"]]
 """For each frame the people in it: x, y, confidence of their joints; pixels."""
 
 
-def read_openpose(root: Path, skeleton: str | None) -> People:
+def read_openpose(root: Path, skeleton: str | None) -> Detections:
     """Everybody in OpenPose's files, or those of other detectors in its layout. Raises
     GhptDataError.
 
@@ -45,8 +45,8 @@ def camera_folders(root: Path) -> list[Path]:
         else []
     )
     if not folders:
-        mend = "Name the folder above." if root.is_dir() and any(root.glob("*.json")) else _LAYOUT
-        raise GhptDataError(root, "", "holds no folder with OpenPose's JSON files", mend)
+        hint = "Name the folder above." if root.is_dir() and any(root.glob("*.json")) else _LAYOUT
+        raise GhptDataError(root, "", "holds no folder with OpenPose's JSON files", hint)
     check_view_count(root, len(folders))
     return folders
 
@@ -61,7 +61,7 @@ def frame_number(path: Path) -> int:
     return int(digits[-1])
 
 
-def read_view(folder: Path) -> Detections:
+def read_view(folder: Path) -> ViewDetections:
     """One camera's people; all have the same number of joints.
 
     The frame number is the last number in the file's name, so a file that is missing shifts
@@ -97,7 +97,7 @@ def read_view(folder: Path) -> Detections:
             identities += identity
     values = np.concatenate(found) if found else np.zeros((0, 0, 3))
     frames = np.array(sorted(files), np.int64)
-    return Detections(
+    return ViewDetections(
         folder.name, frames, np.array(numbers, np.int64), values, np.array(identities, np.int64)
     )
 
@@ -138,7 +138,7 @@ def seen_joints(people: Float[np.ndarray, "*B K 3"]) -> Bool[np.ndarray, "*B K"]
     return people[..., 2] > 0
 
 
-def follow_views(people: People) -> Int[np.ndarray, "T V"]:
+def follow_views(people: Detections) -> Int[np.ndarray, "T V"]:
     """The index of the one person who is followed through each view by itself (`follow`), -1 where
     there is nobody.
     """
@@ -148,7 +148,7 @@ def follow_views(people: People) -> Int[np.ndarray, "T V"]:
         of = np.flatnonzero(people.view == view)
         rows, starts = np.unique(people.row[of], return_index=True)
         values = np.concatenate(
-            [people.key_points[of], np.where(people.seen, people.confidence, 0)[of, :, None]], -1
+            [people.key_points[of], np.where(people.valid, people.confidence, 0)[of, :, None]], -1
         )
         chosen[rows, view] = of[starts + follow(np.split(values, starts[1:]))]
     return chosen
@@ -184,9 +184,9 @@ def follow(people: Frames) -> Int[np.ndarray, " T"]:
 
 
 def _size(people: Float[np.ndarray, "P K 3"]) -> Float[np.ndarray, " P"]:
-    seen = seen_joints(people)[..., None]
-    low = np.where(seen, people[..., :2], np.inf).min(1, initial=np.inf)
-    high = np.where(seen, people[..., :2], -np.inf).max(1, initial=-np.inf)
+    valid = seen_joints(people)[..., None]
+    low = np.where(valid, people[..., :2], np.inf).min(1, initial=np.inf)
+    high = np.where(valid, people[..., :2], -np.inf).max(1, initial=-np.inf)
     return np.linalg.norm(
         np.where(np.isfinite(low), high - np.where(np.isfinite(low), low, 0), 0), axis=-1
     )

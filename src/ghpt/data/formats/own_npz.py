@@ -34,7 +34,7 @@ def write_key_points(path: str | Path, points: KeyPoints) -> None:
         "joints": np.array(points.joints, dtype=np.str_),
         "frame": points.frame,
         "confidence": points.confidence,
-        "seen": points.seen,
+        "seen": points.valid,
     }
     if points.rate_hz is not None:
         arrays["rate_hz"] = np.array(points.rate_hz)
@@ -74,11 +74,11 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
         skeleton = _texts(path, "skeleton")[0]
     joints = _texts(path, "joints") if skeleton is None and "joints" in there else ()
     finite = np.isfinite(values).all(-1)
-    seen = finite & more.get("seen", finite)
-    values = np.where(seen[..., None], values, 0)
+    valid = finite & more.get("seen", finite)
+    values = np.where(valid[..., None], values, 0)
     joints = joints or joints_for(
         path,
-        skeleton or recognise(path, values.reshape(-1, count, 2), seen.reshape(-1, count)),
+        skeleton or recognise(path, values.reshape(-1, count, 2), valid.reshape(-1, count)),
         count,
     )
     for field, names, expected in (("views", views, count_views), ("joints", joints, count)):
@@ -98,8 +98,8 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
         joints,
         frame,
         values,
-        np.where(seen, confidence, 0),
-        seen,
+        np.where(valid, confidence, 0),
+        valid,
         rate,
         (0,) * count_views,
     )
@@ -131,8 +131,8 @@ def _texts(path: Path, field: str) -> tuple[str, ...]:
             size = archive.getinfo(f"{field}.npy").file_size
             shape, _, dtype = npy_header(path, field, member, size)
             if dtype.kind != "U" or len(shape) > 1 or size > _LONGEST_NAMES:
-                mend = "Write it with numpy.array([...], dtype=str)."
-                raise GhptDataError(path, field, "is not a list of texts", mend)
+                hint = "Write it with numpy.array([...], dtype=str)."
+                raise GhptDataError(path, field, "is not a list of texts", hint)
             return tuple(map(str, np.frombuffer(member.read(), dtype).reshape(-1)))
     except (*_DAMAGED, UnicodeError) as error:
         raise GhptDataError(path, field, f"is damaged ({error})", "Write it again.") from error

@@ -127,8 +127,8 @@ def parts_of(where: object, joints: Sequence[str]) -> list[tuple[str, ...]]:
         found["spine"] = ("pelvis", "thorax")
     missing = [joint for joint in JOINTS if not found[joint]]
     if len(missing) > 9:
-        mend = f"Name the joints as in {', '.join(SKELETONS)}; the 17 are {', '.join(JOINTS)}."
-        raise GhptDataError(where, "joints", f"lack {', '.join(missing)}", mend)
+        hint = f"Name the joints as in {', '.join(SKELETONS)}; the 17 are {', '.join(JOINTS)}."
+        raise GhptDataError(where, "joints", f"lack {', '.join(missing)}", hint)
     return [found[joint] for joint in JOINTS]
 
 
@@ -137,7 +137,7 @@ def joints17(
     joints: Sequence[str],
     key_points: Float[np.ndarray, "T V K 2"],
     confidence: Float[np.ndarray, "T V K"],
-    seen: Bool[np.ndarray, "T V K"],
+    valid: Bool[np.ndarray, "T V K"],
 ) -> tuple[Float[np.ndarray, "T V J 2"], Float[np.ndarray, "T V J"], Bool[np.ndarray, "T V J"]]:
     """Any skeleton's undistorted key points as the 17 joints, float32.
 
@@ -154,7 +154,7 @@ def joints17(
         if not names or not set(names) <= set(index):
             continue
         chosen = [index[name] for name in names]
-        there[..., place] = seen[..., chosen].all(-1)
+        there[..., place] = valid[..., chosen].all(-1)
         sure[..., place] = confidence[..., chosen].min(-1)
         points[..., place, :] = key_points[..., chosen, :].mean(-2)
     spine = JOINTS.index("spine")
@@ -166,7 +166,7 @@ def joints17(
 
 
 def recognise(
-    where: object, key_points: Float[np.ndarray, "N K 2"], seen: Bool[np.ndarray, "N K"]
+    where: object, key_points: Float[np.ndarray, "N K 2"], valid: Bool[np.ndarray, "N K"]
 ) -> str:
     """The name of the skeleton of N people: of those with K joints the one whose bones are shortest
     in the images.
@@ -180,7 +180,7 @@ def recognise(
         raise GhptDataError(where, "skeleton", problem, f"Known: {known}.")
     if len(choices) == 1:
         return choices[0]
-    lengths = sorted((_bone_length(SKELETONS[name], key_points, seen), name) for name in choices)
+    lengths = sorted((_bone_length(SKELETONS[name], key_points, valid), name) for name in choices)
     (shortest, name) = lengths[0]
     (second, other) = lengths[1]
     if not shortest < _CLEARLY * second:
@@ -189,12 +189,12 @@ def recognise(
     return name
 
 
-def _bone_length(joints: tuple[str, ...], key_points: np.ndarray, seen: np.ndarray) -> float:
+def _bone_length(joints: tuple[str, ...], key_points: np.ndarray, valid: np.ndarray) -> float:
     """Mean over the bones of their median length, pixels; inf if none is ever seen."""
     bones = [[joints.index(a), joints.index(b)] for a, b in _BONES if a in joints and b in joints]
     a, b = np.array(bones).T
     length = np.where(
-        seen[:, a] & seen[:, b],
+        valid[:, a] & valid[:, b],
         np.linalg.norm(key_points[:, a] - key_points[:, b], axis=-1),
         np.nan,
     )

@@ -93,8 +93,8 @@ def _rotation(where: object, name: str, R: np.ndarray) -> np.ndarray:
     det = np.linalg.det(R)
     if error > 1e-3 or det < 0:
         problem = f"R is not a rotation (|R R^T - I| = {error:.3g}, det = {det:.3g})"
-        mend = "R must be the 3x3 world-to-camera rotation: without scale, not mirrored, not a Rodrigues vector."
-        raise GhptDataError(where, f"camera {name}, R", problem, mend)
+        hint = "R must be the 3x3 world-to-camera rotation: without scale, not mirrored, not a Rodrigues vector."
+        raise GhptDataError(where, f"camera {name}, R", problem, hint)
     if error < 1e-9:
         return R
     U, _, Vh = np.linalg.svd(R)
@@ -248,14 +248,14 @@ def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
     """
     with open_input(path) as handle:
         data = handle.read(largest + 1)
-    mend = "Check that this is the right file."
+    hint = "Check that this is the right file."
     if len(data) > largest:
-        raise GhptDataError(path, "", f"has more than {largest >> 20} MiB", mend)
+        raise GhptDataError(path, "", f"has more than {largest >> 20} MiB", hint)
     # before they are made: a file of 64 MiB could ask for 2 GiB of memory
     for sign, of_largest in ((b"{", _MOST_OBJECTS), (b"[", _MOST_LISTS), (b",", _MOST_VALUES)):
         most = of_largest * largest // _MAX_JSON
         if data.count(sign) > most:
-            raise GhptDataError(path, "", f"holds more than {most} times {sign.decode()!r}", mend)
+            raise GhptDataError(path, "", f"holds more than {most} times {sign.decode()!r}", hint)
 
     def refuse(constant: str) -> None:
         raise ValueError(f"{constant} is no JSON number")
@@ -320,13 +320,13 @@ def npy_header(
     Raises GhptDataError unless what follows is as long as the header claims (``size`` counts from
     the start).
     """
-    mend = "Write it with numpy.save, or copy it again."
+    hint = "Write it with numpy.save, or copy it again."
     start = handle.read(12)
     major = start[6] if start.startswith(b"\x93NUMPY") and len(start) == 12 else 0
     if major not in (1, 2):
-        raise GhptDataError(where, field, "is not a numpy array file (npy 1.0 or 2.0)", mend)
+        raise GhptDataError(where, field, "is not a numpy array file (npy 1.0 or 2.0)", hint)
     if int.from_bytes(start[8 : 10 if major == 1 else 12], "little") > _MAX_HEADER:
-        raise GhptDataError(where, field, f"has a header of more than {_MAX_HEADER} bytes", mend)
+        raise GhptDataError(where, field, f"has a header of more than {_MAX_HEADER} bytes", hint)
     handle.seek(8)
     read = (
         np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
@@ -336,14 +336,14 @@ def npy_header(
             warnings.simplefilter("error")
             shape, fortran, dtype = read(handle)
     except Exception as error:  # numpy lets through whatever Python's parser raises
-        raise GhptDataError(where, field, "has a damaged header", mend) from error
+        raise GhptDataError(where, field, "has a damaged header", hint) from error
     left = size - handle.tell()
     if dtype.hasobject and not pickled:
-        raise GhptDataError(where, field, "holds Python objects, which can run code", mend)
+        raise GhptDataError(where, field, "holds Python objects, which can run code", hint)
     if any(n < 0 for n in shape) or (
         not dtype.hasobject and math.prod(shape) * dtype.itemsize != left
     ):
         claimed = math.prod(shape) * dtype.itemsize
         problem = f"claims {claimed} bytes of {dtype} and holds {left}: it is truncated or damaged"
-        raise GhptDataError(where, field, problem, mend)
+        raise GhptDataError(where, field, problem, hint)
     return shape, "F" if fortran else "C", dtype

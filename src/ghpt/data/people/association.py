@@ -38,7 +38,7 @@ class _Views:
     index: Int[Tensor, "T V P"]
     """Of the detection; -1 where there is none."""
     points: Float[Tensor, "T V P J 2"]
-    seen: Bool[Tensor, "T V P J"]
+    valid: Bool[Tensor, "T V P J"]
     size: Float[Tensor, "T V P"]
     """Diagonal of the box around the joints, pixels."""
 
@@ -49,7 +49,7 @@ def associate(
     row: Int[np.ndarray, " N"],
     view: Int[np.ndarray, " N"],
     key_points: Float[np.ndarray, "N J 2"],
-    seen: Bool[np.ndarray, "N J"],
+    valid: Bool[np.ndarray, "N J"],
     confidence: Float[np.ndarray, "N J"],
 ) -> list[Int[np.ndarray, "T V"]]:
     """For each person, the best first, the index of their detection in each frame and view; -1
@@ -66,8 +66,8 @@ def associate(
     """
     if not len(row):
         return []
-    size = extent(key_points, seen)
-    sure = np.where(seen, confidence, 0).mean(-1)
+    size = extent(key_points, valid)
+    sure = np.where(valid, confidence, 0).mean(-1)
     quality = size * sure
     best = np.array(
         [quality[view == v].max(initial=0) for v in range(int(view.max(initial=0)) + 1)]
@@ -81,9 +81,9 @@ def associate(
     step = _chunk(table)
     for start in range(0, frames, step):
         part = table[start : start + step]
-        views = _views(part, key_points, seen, size)
+        views = _views(part, key_points, valid, size)
         found, of = _groups(cameras, views)
-        points, there = _bodies(cameras, found, key_points, seen)
+        points, there = _bodies(cameras, found, key_points, valid)
         members.append(found)
         bodies.append(points)
         known.append(there)
@@ -128,13 +128,13 @@ def _chunk(table: Int[np.ndarray, "T V P"]) -> int:
 
 
 def _views(
-    table: Int[np.ndarray, "T V P"], key_points: np.ndarray, seen: np.ndarray, size: np.ndarray
+    table: Int[np.ndarray, "T V P"], key_points: np.ndarray, valid: np.ndarray, size: np.ndarray
 ) -> _Views:
     there = table >= 0
     return _Views(
         torch.from_numpy(table),
         torch.from_numpy(key_points[table].astype(np.float64)),
-        torch.from_numpy(seen[table] & there[..., None]),
+        torch.from_numpy(valid[table] & there[..., None]),
         torch.from_numpy(np.maximum(size[table], 1e-9).astype(np.float64)),
     )
 
@@ -170,7 +170,7 @@ def _settled(
     """
     of = (frame[:, None], torch.arange(members.shape[1]), members)
     found = triangulate(
-        cameras, views.points[of], (views.seen[of] & (members >= 0)[..., None]).double()
+        cameras, views.points[of], (views.valid[of] & (members >= 0)[..., None]).double()
     )
     support = _support(cameras, found.points, found.ok, views, frame)
     support = torch.where(views.index[frame] < 0, 0.0, support)
@@ -195,8 +195,8 @@ def _support_of_pairs(cameras: Cameras, views: _Views) -> Float[Tensor, "T S V P
     of_view = pairs[:, None].expand(-1, len(who), -1).reshape(-1, 2)
     of_person = who[None].expand(len(pairs), -1, -1).reshape(-1, 2)
     pixels = views.points[:, of_view, of_person]
-    seen = views.seen[:, of_view, of_person]
-    two = triangulate(cameras.index(of_view), pixels, seen.double())
+    valid = views.valid[:, of_view, of_person]
+    two = triangulate(cameras.index(of_view), pixels, valid.double())
     frame = torch.arange(len(views.index))[:, None].expand(two.points.shape[:2]).reshape(-1)
     support = _support(cameras, two.points.flatten(0, 1), two.ok.flatten(0, 1), views, frame)
     return support.unflatten(0, two.points.shape[:2])
@@ -213,7 +213,7 @@ def _support(
     share too few.
     """
     shown, depth = project(cameras, bodies)
-    both = (known[:, None] & (depth > 0))[:, :, None] & views.seen[frame]
+    both = (known[:, None] & (depth > 0))[:, :, None] & views.valid[frame]
     apart = torch.linalg.vector_norm(shown[:, :, None] - views.points[frame], dim=-1)
     near = (1 - apart / (_FAR * views.size[frame])[..., None]).clamp(min=0)
     count = both.sum(-1)
@@ -223,9 +223,9 @@ def _support(
 
 
 def _bodies(
-    cameras: Cameras, members: Int[np.ndarray, "G V"], key_points: np.ndarray, seen: np.ndarray
+    cameras: Cameras, members: Int[np.ndarray, "G V"], key_points: np.ndarray, valid: np.ndarray
 ) -> tuple[Float[np.ndarray, "G J 3"], Bool[np.ndarray, "G J"]]:
-    used = seen[members] & (members >= 0)[..., None]
+    used = valid[members] & (members >= 0)[..., None]
     found = triangulate(
         cameras,
         torch.from_numpy(key_points[members].astype(np.float64)),

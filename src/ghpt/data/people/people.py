@@ -35,14 +35,14 @@ class KeyPoints:
     key_points: Float[np.ndarray, "T V K 2"]
     confidence: Float[np.ndarray, "T V K"]
     """In [0, 1]; 1 where the detector gives none."""
-    seen: Bool[np.ndarray, "T V K"]
+    valid: Bool[np.ndarray, "T V K"]
     rate_hz: float | None
     several: tuple[int, ...]
     """For each view the number of frames with more than one person, of whom one was followed."""
 
 
 @dataclass(frozen=True)
-class People:
+class Detections:
     """N detections of people in V views of T frames, in the pixels of the images as they were."""
 
     path: str
@@ -58,7 +58,7 @@ class People:
     """Number of the person, the same in all views; -1 where the files do not say."""
     key_points: Float[np.ndarray, "N K 2"]
     confidence: Float[np.ndarray, "N K"]
-    seen: Bool[np.ndarray, "N K"]
+    valid: Bool[np.ndarray, "N K"]
     rate_hz: float | None
 
     def counts(self) -> Int[np.ndarray, "T V"]:
@@ -71,7 +71,7 @@ class People:
         """The detections of these indices; -1 where nobody is taken."""
         there = chosen >= 0
         parts = []
-        for values in (self.key_points, self.confidence, self.seen):
+        for values in (self.key_points, self.confidence, self.valid):
             part = np.zeros((*chosen.shape, *values.shape[1:]), values.dtype)
             part[there] = values[chosen[there]]
             parts.append(part)
@@ -92,7 +92,7 @@ class People:
 
 
 @dataclass(frozen=True)
-class Detections:
+class ViewDetections:
     """What one view's files hold."""
 
     view: str
@@ -105,11 +105,11 @@ class Detections:
     identity: Int[np.ndarray, " N"]
 
 
-def everyone(points: KeyPoints) -> People:
+def as_people(points: KeyPoints) -> Detections:
     """One person's key points as the only detections."""
-    view, row = np.nonzero(points.seen.any(-1).T)
-    values = (x[row, view] for x in (points.key_points, points.confidence, points.seen))
-    return People(
+    view, row = np.nonzero(points.valid.any(-1).T)
+    values = (x[row, view] for x in (points.key_points, points.confidence, points.valid))
+    return Detections(
         points.path,
         points.views,
         points.joints,
@@ -123,8 +123,11 @@ def everyone(points: KeyPoints) -> People:
 
 
 def gather(
-    path: Path, found: Sequence[Detections], joints: tuple[str, ...] | None, skeleton: str | None
-) -> People:
+    path: Path,
+    found: Sequence[ViewDetections],
+    joints: tuple[str, ...] | None,
+    skeleton: str | None,
+) -> Detections:
     """The views' detections as one; ``joints`` if the files name them, which ``skeleton``
     overrules.
 
@@ -150,14 +153,14 @@ def gather(
             f"{v.view} {v.frames[0]} to {v.frames[-1]}" if len(v.frames) else f"{v.view} none"
             for v in found
         )
-        mend = "Number the frames of synchronised cameras alike."
-        raise GhptDataError(path, "frame numbers", f"no frame is in all views ({ranges})", mend)
+        hint = "Number the frames of synchronised cameras alike."
+        raise GhptDataError(path, "frame numbers", f"no frame is in all views ({ranges})", hint)
     full = [view for view in found if len(view.values)]
     values = np.concatenate([view.values for view in full])
-    seen = values[..., 2] > 0
+    valid = values[..., 2] > 0
     if skeleton is not None or joints is None:
-        joints = joints_for(path, skeleton or recognise(path, values[..., :2], seen), count)
-    return People(
+        joints = joints_for(path, skeleton or recognise(path, values[..., :2], valid), count)
+    return Detections(
         path=str(path),
         views=tuple(view.view for view in found),
         joints=joints,
@@ -167,7 +170,7 @@ def gather(
         identity=np.concatenate([view.identity for view in full]),
         key_points=values[..., :2],
         confidence=values[..., 2].clip(0, 1),
-        seen=seen,
+        valid=valid,
         rate_hz=None,
     )
 
@@ -177,7 +180,7 @@ def detections(
     view: str,
     frames: Sequence[int],
     found: Sequence[tuple[int, Float[np.ndarray, "K 3"]]],
-) -> Detections:
+) -> ViewDetections:
     """One view's people without identities: (frame number, joints) in any order, of the frames in
     ``frames``.
 
@@ -192,7 +195,7 @@ def detections(
     order = np.argsort(numbers, kind="stable")
     check_people(path, "keypoints", int(np.unique(numbers, return_counts=True)[1].max(initial=0)))
     values = np.stack([joints for _, joints in found])[order] if found else np.zeros((0, 0, 3))
-    return Detections(
+    return ViewDetections(
         view,
         np.unique(np.array(frames, np.int64)),
         numbers[order],

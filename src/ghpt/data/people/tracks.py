@@ -19,11 +19,11 @@ _LEAST_JOINTS = 4
 
 
 def extent(
-    points: Float[np.ndarray, "N J D"], seen: Bool[np.ndarray, "N J"]
+    points: Float[np.ndarray, "N J D"], valid: Bool[np.ndarray, "N J"]
 ) -> Float[np.ndarray, " N"]:
     """Diagonal of the box around what is seen; 0 for nothing."""
-    low = np.where(seen[..., None], points, np.inf).min(1)
-    high = np.where(seen[..., None], points, -np.inf).max(1)
+    low = np.where(valid[..., None], points, np.inf).min(1)
+    high = np.where(valid[..., None], points, -np.inf).max(1)
     return np.linalg.norm(
         np.where(np.isfinite(low), high - np.where(np.isfinite(low), low, 0), 0), axis=-1
     )

@@ -18,14 +18,14 @@ from ghpt.data.formats.names import Name, chosen_name
 from ghpt.data.formats.openpose import follow_views
 from ghpt.data.formats.skeletons import joints17
 from ghpt.data.people.association import associate
-from ghpt.data.people.people import KeyPoints, People
+from ghpt.data.people.people import Detections, KeyPoints
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINTS
 
 _log = logging.getLogger(__name__)
-_MEND = "Rename them, say which is which (match={view: camera}), or name the views to use (views=[...])."
+_HINT = "Rename them, say which is which (match={view: camera}), or name the views to use (views=[...])."
 _MOST_OUTSIDE = 0.25
 _NORMALISED = 1.5
 _NEARLY_ALL = 0.99
@@ -46,7 +46,7 @@ class Views:
     key_points: Float[np.ndarray, "T V J 2"]
     """Undistorted pixels, float32."""
     confidence: Float[np.ndarray, "T V J"]
-    seen: Bool[np.ndarray, "T V J"]
+    valid: Bool[np.ndarray, "T V J"]
     frame: Int[np.ndarray, " T"]
     rate_hz: float | None
 
@@ -56,7 +56,7 @@ class Views:
     def part(self, views: Sequence[int]) -> Views:
         """Some of the views, in this order."""
         at = list(views)
-        arrays = (self.key_points[:, at], self.confidence[:, at], self.seen[:, at])
+        arrays = (self.key_points[:, at], self.confidence[:, at], self.valid[:, at])
         return Views(self.cameras.select(at), *arrays, self.frame, self.rate_hz)
 
     def recording(self, name: str, cameras: Cameras) -> Recording:
@@ -70,15 +70,15 @@ class Views:
             cameras=cameras,
             key_points=self.key_points,
             confidence=self.confidence,
-            seen=self.seen,
+            valid=self.valid,
             truth=np.zeros((len(self), len(JOINTS), 3), np.float32),
-            truth_seen=np.zeros((len(self), len(JOINTS)), bool),
+            truth_valid=np.zeros((len(self), len(JOINTS)), bool),
             frame=self.frame,
         )
 
 
-def look_through(
-    points: KeyPoints | People,
+def undistort_and_match(
+    points: KeyPoints | Detections,
     cameras: CameraFile,
     match: Mapping[Name, Name] | None = None,
     views: Sequence[Name] | None = None,
@@ -93,21 +93,21 @@ def look_through(
     """
     points, at, ordered = as_one_person(points, cameras, match, views, person)
     pixels = np.zeros(points.key_points[:, at].shape, np.float32)
-    seen = points.seen[:, at].copy()
-    check_pixels(points.path, points.key_points[:, at], seen, ordered)
-    _check_sizes(points.path, points.key_points[:, at], seen, ordered)
+    valid = points.valid[:, at].copy()
+    check_pixels(points.path, points.key_points[:, at], valid, ordered)
+    _check_sizes(points.path, points.key_points[:, at], valid, ordered)
     for view in range(len(at)):
         K = ordered.K[view].numpy()
         lens = ordered.distortion[view].numpy()
-        pixels[:, view], seen[:, view] = undistorted(
-            points.key_points[:, at[view]], seen[:, view], K, lens
+        pixels[:, view], valid[:, view] = undistorted(
+            points.key_points[:, at[view]], valid[:, view], K, lens
         )
-    values = joints17(points.path, points.joints, pixels, points.confidence[:, at], seen)
+    values = joints17(points.path, points.joints, pixels, points.confidence[:, at], valid)
     return Views(ordered, *values, frame=points.frame, rate_hz=points.rate_hz)
 
 
 def as_one_person(
-    points: KeyPoints | People,
+    points: KeyPoints | Detections,
     cameras: CameraFile,
     match: Mapping[str, str] | None,
     views: Sequence[str] | None,
@@ -119,13 +119,13 @@ def as_one_person(
     pairs = matched(points.path, points.views, cameras, match or {}, views)
     at = [view for view, _ in pairs]
     ordered = cameras.select([camera for _, camera in pairs])
-    if isinstance(points, People):
+    if isinstance(points, Detections):
         points = points.pick(who(points, ordered, at, person))
     return points, at, ordered
 
 
 def who(
-    people: People, cameras: CameraFile, at: Sequence[int], person: int = 0
+    people: Detections, cameras: CameraFile, at: Sequence[int], person: int = 0
 ) -> Int[np.ndarray, "T V"]:
     """The index of one person's detection in each frame and view, -1 where there is none.
 
@@ -156,38 +156,40 @@ def who(
     return _person(people, [follow_views(people)], person)
 
 
-def _person(people: People, found: Sequence[np.ndarray], person: int) -> Int[np.ndarray, "T V"]:
+def _person(people: Detections, found: Sequence[np.ndarray], person: int) -> Int[np.ndarray, "T V"]:
     if not 0 <= person < len(found):
-        mend = f"Give a number below {len(found)}; 0 is who is seen most."
+        hint = f"Give a number below {len(found)}; 0 is who is seen most."
         raise GhptDataError(
             people.path,
             "person",
             f"there is no person {person}: {len(found)} can be told apart",
-            mend,
+            hint,
         )
     return found[person]
 
 
-def _across(people: People, cameras: CameraFile, at: Sequence[int]) -> list[Int[np.ndarray, "T V"]]:
+def _across(
+    people: Detections, cameras: CameraFile, at: Sequence[int]
+) -> list[Int[np.ndarray, "T V"]]:
     """Everybody who can be told apart across the views ``at``."""
     chosen = []
     pixels = []
-    seen = []
+    valid = []
     for place, view in enumerate(at):
         of = np.flatnonzero(people.view == view)
         K = cameras.K[place].numpy()
         lens = cameras.distortion[place].numpy()
-        points, there = undistorted(people.key_points[of], people.seen[of], K, lens)
+        points, there = undistorted(people.key_points[of], people.valid[of], K, lens)
         chosen.append(of)
         pixels.append(points)
-        seen.append(there)
+        valid.append(there)
     index = np.concatenate(chosen)
     values = joints17(
         people.path,
         people.joints,
         np.concatenate(pixels)[:, None],
         people.confidence[index][:, None],
-        np.concatenate(seen)[:, None],
+        np.concatenate(valid)[:, None],
     )
     points, sure, there = (value[:, 0] for value in values)
     place = np.repeat(np.arange(len(at)), [len(of) for of in chosen])
@@ -273,7 +275,7 @@ def _unmatched(
     where: str, views: Sequence[str], cameras: CameraFile, problem: str
 ) -> GhptDataError:
     sides = f"views: {', '.join(views)}; cameras of {cameras.path}: {', '.join('/'.join(n) for n in _names(cameras))}"
-    return GhptDataError(where, "views", f"{problem} ({sides})", _MEND)
+    return GhptDataError(where, "views", f"{problem} ({sides})", _HINT)
 
 
 def image_size(cameras: CameraFile) -> Float[np.ndarray, "V 2"]:
@@ -286,7 +288,7 @@ def image_size(cameras: CameraFile) -> Float[np.ndarray, "V 2"]:
 def check_pixels(
     where: str,
     pixels: Float[np.ndarray, "T V K 2"],
-    seen: Bool[np.ndarray, "T V K"],
+    valid: Bool[np.ndarray, "T V K"],
     cameras: CameraFile,
 ) -> None:
     """Raise GhptDataError for key points in [0, 1] or [-1, 1], as shares of the image, where pixels
@@ -294,7 +296,7 @@ def check_pixels(
     """
     size = image_size(cameras)
     for view, name in enumerate(cameras.names):
-        own = pixels[:, view][seen[:, view]]
+        own = pixels[:, view][valid[:, view]]
         own = own[np.isfinite(own).all(-1)]
         # a detector that gives (0, 0) for what it does not see says nothing of the unit
         if not len(own) or not own.any() or size[view].min() < 20 * _NORMALISED:
@@ -308,38 +310,38 @@ def check_pixels(
         scaled = f"multiply x by {width:.0f} and y by {height:.0f}"
         if signed:
             scaled = f"add 1, then multiply x by {width / 2:g} and y by {height / 2:g}"
-        mend = f"Give pixels: {scaled}; or detect again (OpenPose: --keypoint_scale 0)."
-        raise GhptDataError(where, f"view {name}", problem, mend)
+        hint = f"Give pixels: {scaled}; or detect again (OpenPose: --keypoint_scale 0)."
+        raise GhptDataError(where, f"view {name}", problem, hint)
 
 
-def _check_sizes(where: str, pixels: np.ndarray, seen: np.ndarray, cameras: CameraFile) -> None:
+def _check_sizes(where: str, pixels: np.ndarray, valid: np.ndarray, cameras: CameraFile) -> None:
     """Detectors place some joints beyond the image's edge; many there are those of an image of
     another size.
     """
     if cameras.size is None:
         return
     size = image_size(cameras)
-    share = _outside(pixels, seen, size)
-    turned = _outside(pixels, seen, size[:, ::-1])
+    share = _outside(pixels, valid, size)
+    turned = _outside(pixels, valid, size[:, ::-1])
     for view in np.flatnonzero(share > _MOST_OUTSIDE):
         width, height = size[view]
-        reach = pixels[:, view][seen[:, view]].max(0)
+        reach = pixels[:, view][valid[:, view]].max(0)
         image = (
             f"its image of {width:.0f} x {height:.0f}; they reach {reach[0]:.0f} x {reach[1]:.0f}"
         )
         problem = f"{share[view]:.0%} of the key points lie outside {image}"
-        mend = "Give the intrinsics of the resolution that the key points were detected in."
+        hint = "Give the intrinsics of the resolution that the key points were detected in."
         if turned[view] < 1 - _NEARLY_ALL:
             problem += f", as in an image of {height:.0f} x {width:.0f}: turned by 90 degrees, or x and y exchanged"
-            mend = "Detect in images that are turned as the calibration's, or calibrate the turned ones."
-        raise GhptDataError(where, f"view {cameras.names[view]}", problem, mend)
+            hint = "Detect in images that are turned as the calibration's, or calibrate the turned ones."
+        raise GhptDataError(where, f"view {cameras.names[view]}", problem, hint)
 
 
 def _outside(
     pixels: Float[np.ndarray, "T V K 2"],
-    seen: Bool[np.ndarray, "T V K"],
+    valid: Bool[np.ndarray, "T V K"],
     size: Float[np.ndarray, "V 2"],
 ) -> Float[np.ndarray, " V"]:
     """The share of each view's key points beyond images of this size."""
-    outside = seen & ((pixels < -0.5) | (pixels > size[:, None] - 0.5)).any(-1)
-    return outside.sum((0, 2)) / seen.sum((0, 2)).clip(1)
+    outside = valid & ((pixels < -0.5) | (pixels > size[:, None] - 0.5)).any(-1)
+    return outside.sum((0, 2)) / valid.sum((0, 2)).clip(1)

@@ -40,13 +40,13 @@ KINDS = tuple(name.removeprefix("right_").removeprefix("left_") for name in JOIN
 
 
 @dataclass(frozen=True)
-class Detections:
+class SimulatedDetections:
     """What one detector says about T frames in V views."""
 
     key_points: Float[np.ndarray, "T V J 2"]
     """Undistorted pixels, float32; 0 where not seen."""
     confidence: Float[np.ndarray, "T V J"]
-    seen: Bool[np.ndarray, "T V J"]
+    valid: Bool[np.ndarray, "T V J"]
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ class Processes:
     noise: Float[np.ndarray, "T J 2"]
     outlier: Float[np.ndarray, "T J"]
     direction: Float[np.ndarray, "T J 2"]
-    swap: Float[np.ndarray, "T G"]
+    flip: Float[np.ndarray, "T G"]
     miss: Float[np.ndarray, "T J"]
     confidence: Float[np.ndarray, "T J"]
 
@@ -123,7 +123,7 @@ class Detector:
         subject: str,
         take: str,
         familiar: bool = False,
-    ) -> Detections:
+    ) -> SimulatedDetections:
         """Detect a take (world, mm) in every view of the rig.
 
         A view's detections depend on the seed, the subject, the take and the camera's name, not on
@@ -137,7 +137,7 @@ class Detector:
         for view, name in enumerate(rig.names):
             processes = self.processes(len(points), rate_hz, generator(seed, "camera", take, name))
             views.append(self.view(points, shown, rig, view, processes, familiar))
-        return Detections(*(np.stack(field, axis=1) for field in zip(*views, strict=True)))
+        return SimulatedDetections(*(np.stack(field, axis=1) for field in zip(*views, strict=True)))
 
     def body_error(
         self, frames: int, rate_hz: float, seed: int, subject: str, take: str
@@ -167,7 +167,7 @@ class Detector:
             noise=shares[0] * white + shares[1] * quick + shares[2] * slow,
             outlier=process(rng, (joints,), frames, self.outlier_seconds * rate_hz),
             direction=process(rng, (joints, 2), frames, self.outlier_seconds * rate_hz),
-            swap=process(rng, (len(SWAPS),), frames, self.swap_seconds * rate_hz),
+            flip=process(rng, (len(SWAPS),), frames, self.swap_seconds * rate_hz),
             miss=process(rng, (joints,), frames, self.miss_seconds * rate_hz),
             confidence=process(rng, (joints,), frames, self.noise_seconds * rate_hz),
         )
@@ -219,20 +219,20 @@ class Detector:
         error = scale * (
             spread[..., None] * processes.noise + self._outliers(hidden, relative, processes)
         )
-        swapped = self._swap(raw, in_camera, person, processes)
-        found = swapped + pixels[..., None] * error
+        flipped = self._swap(raw, in_camera, person, processes)
+        found = flipped + pixels[..., None] * error
 
         size = np.linalg.norm(found - raw, axis=-1) / pixels
         missing = _rate(self.miss_rate, self.miss_rate_occluded, hidden)
         inside = ((found >= -0.5) & (found <= rig.size[view].numpy() - 0.5)).all(axis=-1)
-        seen = inside & in_front & (in_camera[..., 2] > 0.0) & (ndtr(processes.miss) > missing)
+        valid = inside & in_front & (in_camera[..., 2] > 0.0) & (ndtr(processes.miss) > missing)
         key_points, undone = _undistort(
             found, raw, ideal.numpy(), rig.cameras.K[view], rig.distortion[view]
         )
-        seen &= undone
-        key_points = np.where(seen[..., None], key_points, 0.0).astype(np.float32)
-        confidence = np.where(seen, self._confidence(size, processes), 0.0).astype(np.float32)
-        return key_points, confidence, seen
+        valid &= undone
+        key_points = np.where(valid[..., None], key_points, 0.0).astype(np.float32)
+        confidence = np.where(valid, self._confidence(size, processes), 0.0).astype(np.float32)
+        return key_points, confidence, valid
 
     def _outliers(
         self,
@@ -271,7 +271,7 @@ class Detector:
             rate = self.swap_rate * (
                 0.2 + 2.0 * np.exp(-((facing / 0.35) ** 2)) + 0.6 * (facing < 0)
             )
-            now = ndtr(processes.swap[:, group]) > 1.0 - rate
+            now = ndtr(processes.flip[:, group]) > 1.0 - rate
             for a, b in pairs:
                 raw[now, a], raw[now, b] = raw[now, b], raw[now, a]
         return raw

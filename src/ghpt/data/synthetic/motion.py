@@ -60,7 +60,13 @@ def move(
         _set_arm(angles, side, _arm(spec, spec[habit], time, rng))
     _set_trunk(angles, spec, time, rng)
     turn = keyframes(
-        rng, time, np.zeros((1, 1)), [1.0], np.deg2rad(spec["turn"]), spec["stance"], reach=1.2
+        rng,
+        time,
+        np.zeros((1, 1)),
+        [1.0],
+        np.deg2rad(spec["turn"]),
+        spec["stance"],
+        reach=1.2,
     )[:, 0]
 
     walking = _share_of_time(spec["walk"], time, rng)
@@ -197,7 +203,13 @@ def _share_of_time(
     if share in (0.0, 1.0):
         return np.full(len(time), share)
     return keyframes(
-        rng, time, np.array([[0.0], [1.0]]), [1.0 - share, share], 0.0, hold=2.5, reach=0.7
+        rng,
+        time,
+        np.array([[0.0], [1.0]]),
+        [1.0 - share, share],
+        0.0,
+        hold=2.5,
+        reach=0.7,
     )[:, 0]
 
 

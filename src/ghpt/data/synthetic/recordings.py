@@ -51,7 +51,7 @@ class Take:
     """Number of the first frame."""
 
 
-def embedded_recordings(
+def synthetic_recordings(
     data: str, split: str, seed: int, detector: Detector, cameras: Sequence[int] | None = None
 ) -> Iterator[Recording]:
     """The synthetic recordings of ``h36m``, of ``cmu1`` to ``cmu4``, or of ``panoptic`` with any HD
@@ -65,7 +65,7 @@ def embedded_recordings(
 
 
 def takes(data: str, split: str, seed: int, cameras: Sequence[int] | None = None) -> Iterator[Take]:
-    """The motions behind `embedded_recordings`."""
+    """The motions behind `synthetic_recordings`."""
     check(split in SPLITS, "split", f"is {split!r}", f"Choose from {', '.join(SPLITS)}.")
     known = (*ARRANGEMENTS, "panoptic")
     check(data in known, "data", f"is {data!r}", f"Choose from {', '.join(known)}.")
@@ -121,8 +121,8 @@ def _detect(take: Take, seed: int, detector: Detector) -> Recording:
         cameras=take.rig.cameras,
         key_points=found.key_points,
         confidence=found.confidence,
-        seen=found.seen,
+        valid=found.valid,
         truth=take.truth.astype(np.float32),
-        truth_seen=np.ones(take.truth.shape[:2], dtype=bool),
+        truth_valid=np.ones(take.truth.shape[:2], dtype=bool),
         frame=np.arange(take.first, take.first + len(take.truth)),
     )

@@ -20,19 +20,19 @@ from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.recording import Observations, PoseEstimate
 
 
-def person_size(
-    key_points: Float[Tensor, "*B V J 2"], seen: Bool[Tensor, "*B V J"]
+def person_scale(
+    key_points: Float[Tensor, "*B V J 2"], valid: Bool[Tensor, "*B V J"]
 ) -> Float[Tensor, "*B V"]:
     """Diagonal (pixels) of the box around the seen key points of each view; 0 where fewer than two
     are seen.
     """
-    seen = (seen & torch.isfinite(key_points).all(-1))[..., None]
-    largest = torch.where(seen, key_points, -torch.inf).amax(-2)
-    smallest = torch.where(seen, key_points, torch.inf).amin(-2)
-    return torch.where(seen.any(-2), largest - smallest, 0.0).norm(dim=-1)
+    valid = (valid & torch.isfinite(key_points).all(-1))[..., None]
+    largest = torch.where(valid, key_points, -torch.inf).amax(-2)
+    smallest = torch.where(valid, key_points, torch.inf).amin(-2)
+    return torch.where(valid.any(-2), largest - smallest, 0.0).norm(dim=-1)
 
 
 def otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
@@ -47,11 +47,11 @@ def otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
     return Triangulation(**chosen)
 
 
-def poses_of(result: Triangulation, batch: KeyPointBatch) -> PoseEstimate:
+def poses_of(result: Triangulation, batch: Observations) -> PoseEstimate:
     return PoseEstimate(result.points.to(batch.key_points.dtype), result.placed)
 
 
-def everywhere(value: float, batch: KeyPointBatch) -> Float[Tensor, " B"]:
+def everywhere(value: float, batch: Observations) -> Float[Tensor, " B"]:
     return torch.full(batch.sample.shape, value, dtype=torch.float64, device=batch.sample.device)
 
 
@@ -61,28 +61,28 @@ class Baseline(ABC):
     """
 
     @abstractmethod
-    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+    def triangulate(self, batch: Observations) -> Triangulation:
         """The batch's joints with their status."""
 
-    def reach(
-        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]
+    def inlier_threshold(
+        self, batch: Observations, points: Float[Tensor, "B J 3"]
     ) -> Float[Tensor, " B"] | None:
         """Largest residual of a view that counts as one that made the joint, as a fraction of the
         person's size, for the ``points`` that this found; None where all views do.
         """
         return None
 
-    def agreeing(
-        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
+    def inlier_views(
+        self, batch: Observations, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
     ) -> tuple[Bool[Tensor, "B V J"], Bool[Tensor, "B J"]]:
         """The views that made each of the ``points`` that are ``placed``, and whether two of them
         agree; all that see the joint where fewer than two are within reach.
         """
-        given = batch.seen & placed[:, None]
-        reach = self.reach(batch, points)
-        if reach is None:
+        given = batch.valid & placed[:, None]
+        inlier_threshold = self.inlier_threshold(batch, points)
+        if inlier_threshold is None:
             return given, placed
-        limit = reach[:, None] * person_size(batch.key_points, batch.seen)
+        limit = inlier_threshold[:, None] * person_scale(batch.key_points, batch.valid)
         near = given & (
             reprojection_error(batch.cameras, batch.key_points, points) <= limit[..., None]
         )
@@ -90,15 +90,15 @@ class Baseline(ABC):
         return torch.where(agreed[:, None], near, given), agreed
 
     @torch.no_grad()
-    def __call__(self, batch: KeyPointBatch) -> PoseEstimate:
+    def __call__(self, batch: Observations) -> PoseEstimate:
         return poses_of(self.triangulate(batch), batch)
 
 
 class Linear(Baseline):
     """All seen views with equal weights."""
 
-    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
-        return triangulate(batch.cameras, batch.key_points, batch.seen.to(batch.key_points.dtype))
+    def triangulate(self, batch: Observations) -> Triangulation:
+        return triangulate(batch.cameras, batch.key_points, batch.valid.to(batch.key_points.dtype))
 
 
 @dataclass(frozen=True)
@@ -112,8 +112,8 @@ class WeightedLinear(Baseline):
     def __post_init__(self) -> None:
         check_positive(power=self.power)
 
-    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
-        weights = torch.where(batch.seen, batch.confidence.clamp(min=0) ** self.power, 0.0)
+    def triangulate(self, batch: Observations) -> Triangulation:
+        weights = torch.where(batch.valid, batch.confidence.clamp(min=0) ** self.power, 0.0)
         return otherwise(
             triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch)
         )
@@ -140,18 +140,20 @@ class MEstimator(Baseline):
         )
         check_positive(scale=self.scale, iterations=self.iterations, tolerance=self.tolerance)
 
-    def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"]:
+    def inlier_threshold(
+        self, batch: Observations, points: Float[Tensor, "B J 3"]
+    ) -> Float[Tensor, " B"]:
         """The scale: a residual of that size has a quarter (Geman-McClure), half (Cauchy) or all
         (Huber) of the weight.
         """
         return everywhere(self.scale, batch)
 
-    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
-        scale = (self.scale * person_size(batch.key_points, batch.seen)).clamp(min=1e-12)
+    def triangulate(self, batch: Observations) -> Triangulation:
+        scale = (self.scale * person_scale(batch.key_points, batch.valid)).clamp(min=1e-12)
         return triangulate_robustly(
             batch.cameras,
             batch.key_points,
-            batch.seen,
+            batch.valid,
             scale,
             WEIGHTS[self.loss],
             self.iterations,

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from ghpt.errors import check
 from ghpt.geometry.cameras import reprojection_error
-from ghpt.models.estimators.classical import Baseline, person_size
-from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.models.estimators.classical import Baseline, person_scale
+from ghpt.recording import Observations, PoseEstimate
 from ghpt.skeleton import JOINTS, MIRROR
 
 LIMBS = tuple(
@@ -26,7 +26,7 @@ _HYPOTHESES = ((True, True), (True, False), (False, True))
 
 
 @dataclass(frozen=True)
-class Swaps:
+class LeftRightFlips:
     """How swaps are looked for.
 
     A pose's cost is the sum over views and limb joints of ``log(1 + r^2)``, r the reprojection
@@ -48,44 +48,44 @@ class Swaps:
 
 
 @torch.no_grad()
-def undo_swaps(
-    batch: KeyPointBatch, swaps: Swaps, estimate: PoseEstimate | None = None
-) -> tuple[KeyPointBatch, Bool[Tensor, "B V"]]:
+def undo_flips(
+    batch: Observations, flips: LeftRightFlips, estimate: PoseEstimate | None = None
+) -> tuple[Observations, Bool[Tensor, "B V"]]:
     """The batch with left and right put right, and in which views of which frames they were not.
 
     Only in frames with three views or more, and in fewer than half of these: of views that stand
-    two against two neither side is the swapped one. ``estimate``: what ``swaps.estimator`` makes of
+    two against two neither side is the swapped one. ``estimate``: what ``flips.estimator`` makes of
     the batch, if that is known; frames in which no view fits it badly cost nothing more.
     """
     exchanged = torch.zeros(
-        *batch.seen.shape[:2], len(LIMBS), dtype=torch.bool, device=batch.seen.device
+        *batch.valid.shape[:2], len(LIMBS), dtype=torch.bool, device=batch.valid.device
     )
-    most = (batch.seen.any(-1).sum(-1) - 1) // 2
+    most = (batch.valid.any(-1).sum(-1) - 1) // 2
     if not len(batch) or int(most.max()) < 1:
         return batch, exchanged.any(-1)
-    estimate = estimate or swaps.estimator(batch)
-    before = _costs(batch, estimate, swaps.scale)
+    estimate = estimate or flips.estimator(batch)
+    before = _costs(batch, estimate, flips.scale)
     # a view that is right in a pose that is nearly right is far from its mirror image
-    mirrored = _costs(_exchange(batch, ~exchanged), estimate, swaps.scale)
-    doubtful = ((before > swaps.gain / 2) & (mirrored < before + swaps.gain)).any(-1)
+    mirrored = _costs(_exchange(batch, ~exchanged), estimate, flips.scale)
+    doubtful = ((before > flips.gain / 2) & (mirrored < before + flips.gain)).any(-1)
     doubtful = torch.nonzero(doubtful & (most > 0))[:, 0]
-    for _ in range(swaps.rounds):
+    for _ in range(flips.rounds):
         if not len(doubtful):
             break
         own = exchanged[doubtful]
-        candidates = _candidates(own, before[doubtful], min(swaps.views, batch.seen.shape[1]))
+        candidates = _candidates(own, before[doubtful], min(flips.views, batch.valid.shape[1]))
         count = candidates.shape[1]
         hypotheses = _exchange(
             batch.rows(doubtful.repeat_interleave(count)), candidates.flatten(0, 1)
         )
-        costs = _costs(hypotheses, swaps.estimator(hypotheses), swaps.scale).unflatten(
+        costs = _costs(hypotheses, flips.estimator(hypotheses), flips.scale).unflatten(
             0, (-1, count)
         )
         allowed = candidates.any(-1).sum(-1) <= most[doubtful, None]
         best = torch.where(allowed, costs.sum(-1), torch.inf).argmin(-1)
         row = torch.arange(len(best), device=best.device)
         better = allowed[row, best] & (
-            before[doubtful].sum(-1) - costs[row, best].sum(-1) > swaps.gain
+            before[doubtful].sum(-1) - costs[row, best].sum(-1) > flips.gain
         )
         changed = doubtful[better]
         exchanged[changed] = candidates[row, best][better]
@@ -107,7 +107,7 @@ def _candidates(
     return exchanged[:, None] ^ one.flatten(1, 2)
 
 
-def _exchange(batch: KeyPointBatch, which: Bool[Tensor, "B V G"]) -> KeyPointBatch:
+def _exchange(batch: Observations, which: Bool[Tensor, "B V G"]) -> Observations:
     """The batch with the limbs of the views exchanged."""
     order = torch.arange(len(JOINTS), device=which.device).expand(*which.shape[:2], -1).clone()
     mirror = torch.tensor(MIRROR, device=which.device)
@@ -121,18 +121,20 @@ def _exchange(batch: KeyPointBatch, which: Bool[Tensor, "B V G"]) -> KeyPointBat
         batch,
         key_points=points,
         confidence=batch.confidence.gather(2, order),
-        seen=batch.seen.gather(2, order),
+        valid=batch.valid.gather(2, order),
     )
 
 
-def _costs(batch: KeyPointBatch, estimate: PoseEstimate, scale: float) -> Float[Tensor, "B V"]:
+def _costs(batch: Observations, estimate: PoseEstimate, scale: float) -> Float[Tensor, "B V"]:
     """Each view's share of its frame's cost: of the joints that it sees and the frame places, with
     their mirrors.
     """
-    size = (scale * person_size(batch.key_points, batch.seen).double()).clamp(min=1e-12)[..., None]
+    size = (scale * person_scale(batch.key_points, batch.valid).double()).clamp(min=1e-12)[
+        ..., None
+    ]
     error = reprojection_error(batch.cameras, batch.key_points, estimate.points) / size
     mirror = list(MIRROR)
     known = estimate.estimated & estimate.estimated[:, mirror]
-    counted = batch.seen & batch.seen[:, :, mirror] & known[:, None]
+    counted = batch.valid & batch.valid[:, :, mirror] & known[:, None]
     limbs = [joint for group in LIMBS for joint in group]
     return torch.where(counted, torch.log1p(error.clamp(max=1e6) ** 2), 0.0)[..., limbs].sum(-1)

@@ -13,8 +13,8 @@ from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
 from ghpt.geometry.normal_equations import usable_views
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.models.estimators.classical import Baseline, Linear, everywhere, otherwise, person_size
-from ghpt.recording import KeyPointBatch
+from ghpt.models.estimators.classical import Baseline, Linear, everywhere, otherwise, person_scale
+from ghpt.recording import Observations
 
 
 @dataclass(frozen=True)
@@ -31,17 +31,19 @@ class LoRansac(Baseline):
     def __post_init__(self) -> None:
         check_positive(threshold=self.threshold)
 
-    def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"]:
+    def inlier_threshold(
+        self, batch: Observations, points: Float[Tensor, "B J 3"]
+    ) -> Float[Tensor, " B"]:
         return everywhere(self.threshold, batch)
 
-    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
-        usable = batch.seen & usable_views(batch.cameras, batch.key_points)
-        size = person_size(batch.key_points, usable).double()
+    def triangulate(self, batch: Observations) -> Triangulation:
+        usable = batch.valid & usable_views(batch.cameras, batch.key_points)
+        size = person_scale(batch.key_points, usable).double()
         usable &= (size > 0)[..., None]
         # in units of the person's size one threshold holds for all views
         K = batch.cameras.K.double() / torch.where(size > 0, size, 1.0)[..., None, None]
         rays = (batch.key_points.double() / size.clamp(min=1e-12)[..., None, None]).cpu().numpy()
-        inliers = torch.zeros_like(batch.seen, device="cpu")
+        inliers = torch.zeros_like(batch.valid, device="cpu")
         options = pycolmap.EstimateTriangulationOptions()
         options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
         options.ransac.max_error = self.threshold

@@ -14,12 +14,12 @@ from torch import Tensor
 from ghpt.geometry.normal_equations import usable_views
 from ghpt.geometry.triangulation import Status, Triangulation
 from ghpt.models.estimators.classical import Baseline, poses_of
-from ghpt.models.estimators.flips import Swaps, undo_swaps
+from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.rejection import Rejection
-from ghpt.models.estimators.uncertainty import JointQuality, Quality
+from ghpt.models.estimators.uncertainty import JointUncertainty, UncertaintyModel
 from ghpt.models.estimators.view_weights import ViewWeights
 from ghpt.reconstruction import Reconstruction, State
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
 FAR = 20.0
 """A key point so many times as far from its view's median as the median one belongs to nobody."""
@@ -39,10 +39,10 @@ class Predictor(Protocol):
     ``fitted``.
     """
 
-    def fitted(self, batch: KeyPointBatch) -> Predictor:
+    def fitted(self, batch: Observations) -> Predictor:
         """The same with the noise level of these frames: a few hundred, spread over the recording."""
 
-    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
+    def __call__(self, batch: Observations) -> Reconstruction:
         """The batch's frames, with ``frame`` = ``batch.sample``; on the CPU."""
 
 
@@ -50,39 +50,43 @@ class Classical:
     """A classical estimator with what it can say of its joints.
 
     A view counts as one of those that made a joint if its residual is within the estimator's
-    ``reach``; where fewer than two views are, all that were given to it count, and the error and
-    covariance say so. ``reject``: which joints are REJECTED because no two views explain them;
-    null: none. ``swaps``: how exchanged sides are looked for and undone; null: they are not.
+    ``inlier_threshold``; where fewer than two views are, all that were given to it count, and the
+    error and covariance say so. ``reject``: which joints are REJECTED because no two views explain
+    them; null: none. ``flips``: how exchanged sides are looked for and undone; null: they are not.
     """
 
     def __init__(
-        self, estimator: Baseline, quality: Quality, swaps: Swaps | None, reject: Rejection | None
+        self,
+        estimator: Baseline,
+        uncertainty: UncertaintyModel,
+        flips: LeftRightFlips | None,
+        reject: Rejection | None,
     ) -> None:
         self.estimator = estimator
-        self.quality = quality
-        self.swaps = swaps
+        self.uncertainty = uncertainty
+        self.flips = flips
         self.reject = reject
 
-    def fitted(self, batch: KeyPointBatch) -> Classical:
-        clean, _, _, result = _prepared(batch, self.swaps, self.estimator)
-        views, _ = self.estimator.agreeing(clean, result.points, result.placed)
-        quality = self.quality.fitted(clean, result.points, views)
+    def fitted(self, batch: Observations) -> Classical:
+        clean, _, _, result = _prepared(batch, self.flips, self.estimator)
+        views, _ = self.estimator.inlier_views(clean, result.points, result.placed)
+        uncertainty = self.uncertainty.fitted(clean, result.points, views)
         reject = self.reject and self.reject.fitted(clean, result.points, result.placed)
-        return Classical(self.estimator, quality, self.swaps, reject)
+        return Classical(self.estimator, uncertainty, self.flips, reject)
 
     def rejecting_nothing(self) -> Classical:
         """The same, with all its joints: what it is compared with others by."""
-        return Classical(self.estimator, self.quality, self.swaps, None)
+        return Classical(self.estimator, self.uncertainty, self.flips, None)
 
     @torch.no_grad()
-    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
-        clean, spoilt, swapped, result = _prepared(batch, self.swaps, self.estimator)
+    def __call__(self, batch: Observations) -> Reconstruction:
+        clean, spoilt, flipped, result = _prepared(batch, self.flips, self.estimator)
         state = _states(result.status, spoilt)
         state = _rejected(self.reject, clean, result.points, state)
-        views, _ = self.estimator.agreeing(clean, result.points, state == State.OBSERVED)
-        found = self.quality(clean, result.points, views)
+        views, _ = self.estimator.inlier_views(clean, result.points, state == State.OBSERVED)
+        found = self.uncertainty(clean, result.points, views)
         score = torch.zeros(len(batch), dtype=torch.float32)
-        return _reconstruction(batch, result.points, state, views, found, score, swapped)
+        return _reconstruction(batch, result.points, state, views, found, score, flipped)
 
 
 class Learned:
@@ -90,80 +94,80 @@ class Learned:
 
     The views that made a joint are those on which the consensus of ``view_weights`` agrees, and
     error and covariance are theirs. The score is the mean logit of the hypotheses under their
-    weights, before ``limit_spread``, which centres each frame's. ``swaps`` and ``reject`` as in
+    weights, before ``cap_logit_std``, which centres each frame's. ``flips`` and ``reject`` as in
     Classical.
     """
 
     def __init__(
         self,
         view_weights: ViewWeights,
-        quality: Quality,
-        swaps: Swaps | None,
+        uncertainty: UncertaintyModel,
+        flips: LeftRightFlips | None,
         reject: Rejection | None,
     ) -> None:
         self.view_weights = view_weights
-        self.quality = quality
-        self.swaps = swaps
+        self.uncertainty = uncertainty
+        self.flips = flips
         self.reject = reject
 
-    def fitted(self, batch: KeyPointBatch) -> Learned:
-        clean, _, _, robust = _prepared(batch, self.swaps, self.view_weights.consensus)
+    def fitted(self, batch: Observations) -> Learned:
+        clean, _, _, robust = _prepared(batch, self.flips, self.view_weights.consensus)
         weighed = self.view_weights.weigh(clean, robust)
         found = weighed.triangulation
-        quality = self.quality.fitted(clean, found.points, weighed.views)
+        uncertainty = self.uncertainty.fitted(clean, found.points, weighed.views)
         reject = self.reject and self.reject.fitted(clean, found.points, found.placed)
-        return Learned(self.view_weights, quality, self.swaps, reject)
+        return Learned(self.view_weights, uncertainty, self.flips, reject)
 
     def rejecting_nothing(self) -> Learned:
         """The same, with all its joints: what it is compared with others by."""
-        return Learned(self.view_weights, self.quality, self.swaps, None)
+        return Learned(self.view_weights, self.uncertainty, self.flips, None)
 
     @torch.no_grad()
-    def __call__(self, batch: KeyPointBatch) -> Reconstruction:
-        clean, spoilt, swapped, robust = _prepared(batch, self.swaps, self.view_weights.consensus)
+    def __call__(self, batch: Observations) -> Reconstruction:
+        clean, spoilt, flipped, robust = _prepared(batch, self.flips, self.view_weights.consensus)
         weighed = self.view_weights.weigh(clean, robust)
         points = weighed.triangulation.points
         state = _states(weighed.triangulation.status, spoilt)
         state = _rejected(self.reject, clean, points, state)
         views = weighed.views & (state == State.OBSERVED)[:, None]
-        found = self.quality(clean, points, views)
+        found = self.uncertainty(clean, points, views)
         score = (weighed.weights * weighed.logits).sum(-1)
-        return _reconstruction(batch, points, state, views, found, score, swapped)
+        return _reconstruction(batch, points, state, views, found, score, flipped)
 
 
 def _prepared(
-    batch: KeyPointBatch, swaps: Swaps | None, estimator: Baseline
-) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"], Bool[Tensor, "B V"], Triangulation]:
+    batch: Observations, flips: LeftRightFlips | None, estimator: Baseline
+) -> tuple[Observations, Bool[Tensor, "B V J"], Bool[Tensor, "B V"], Triangulation]:
     """The batch to triangulate, what was taken out of it, in which views left and right were
     exchanged, and what ``estimator`` makes of the batch. It does so once where it is the one that
     looks for swaps.
     """
     clean, spoilt = cleaned(batch)
     result = estimator.triangulate(clean)
-    if swaps is None:
-        return clean, spoilt, torch.zeros_like(batch.seen[..., 0]), result
-    clean, swapped = undo_swaps(
-        clean, swaps, poses_of(result, clean) if estimator == swaps.estimator else None
+    if flips is None:
+        return clean, spoilt, torch.zeros_like(batch.valid[..., 0]), result
+    clean, flipped = undo_flips(
+        clean, flips, poses_of(result, clean) if estimator == flips.estimator else None
     )
-    rows = torch.nonzero(swapped.any(-1))[:, 0]
+    rows = torch.nonzero(flipped.any(-1))[:, 0]
     if len(rows):
         result = result.with_rows(rows, estimator.triangulate(clean.rows(rows)))
-    return clean, spoilt, swapped, result
+    return clean, spoilt, flipped, result
 
 
-def cleaned(batch: KeyPointBatch) -> tuple[KeyPointBatch, Bool[Tensor, "B V J"]]:
+def cleaned(batch: Observations) -> tuple[Observations, Bool[Tensor, "B V J"]]:
     """The batch without key points that no detection can be, and which those were: not finite, of a
     camera that is none, or ``FAR`` from all others of its view.
     """
-    usable = batch.seen & usable_views(batch.cameras, batch.key_points)
+    usable = batch.valid & usable_views(batch.cameras, batch.key_points)
     points = torch.where(usable[..., None], batch.key_points, torch.nan)
     offset = (points - points.nanmedian(-2, keepdim=True).values).abs().amax(-1)
     typical = offset.nanmedian(-1, keepdim=True).values.clamp(min=1.0)
     few = usable.sum(-1, keepdim=True) < 5
-    seen = usable & (few | ~(offset > FAR * typical))
+    valid = usable & (few | ~(offset > FAR * typical))
     return replace(
-        batch, seen=seen, key_points=torch.where(seen[..., None], batch.key_points, 0.0)
-    ), batch.seen & ~seen
+        batch, valid=valid, key_points=torch.where(valid[..., None], batch.key_points, 0.0)
+    ), batch.valid & ~valid
 
 
 def _states(status: Int8[Tensor, "B J"], spoilt: Bool[Tensor, "B V J"]) -> Int8[Tensor, "B J"]:
@@ -176,7 +180,7 @@ def _states(status: Int8[Tensor, "B J"], spoilt: Bool[Tensor, "B V J"]) -> Int8[
 
 def _rejected(
     reject: Rejection | None,
-    batch: KeyPointBatch,
+    batch: Observations,
     points: Float[Tensor, "B J 3"],
     state: Int8[Tensor, "B J"],
 ) -> Int8[Tensor, "B J"]:
@@ -189,17 +193,17 @@ def _rejected(
 
 
 def _reconstruction(
-    batch: KeyPointBatch,
+    batch: Observations,
     points: Float[Tensor, "B J 3"],
     state: Int8[Tensor, "B J"],
     views: Bool[Tensor, "B V J"],
-    found: JointQuality,
+    found: JointUncertainty,
     score: Float[Tensor, " B"],
-    swapped: Bool[Tensor, "B V"],
+    flipped: Bool[Tensor, "B V"],
 ) -> Reconstruction:
     placed = state == State.OBSERVED
     points = torch.where(placed[..., None], points, 0.0).double()
     error = found.error.float()
     covariance = found.covariance.float()
-    fields = (batch.sample, points, state, error, views, covariance, score.float(), swapped)
+    fields = (batch.sample, points, state, error, views, covariance, score.float(), flipped)
     return Reconstruction(*(x.cpu() for x in fields))

@@ -22,9 +22,9 @@ from ghpt.geometry.triangulation import (
     in_parts,
     triangulate_subsets,
 )
-from ghpt.models.estimators.classical import Baseline, everywhere, person_size
+from ghpt.models.estimators.classical import Baseline, everywhere, person_scale
 from ghpt.randomness import key, uniform
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
 
 @dataclass(frozen=True)
@@ -44,22 +44,24 @@ class Ransac(Baseline):
     def __post_init__(self) -> None:
         check_positive(threshold=self.threshold, pairs=self.pairs)
 
-    def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"]:
+    def inlier_threshold(
+        self, batch: Observations, points: Float[Tensor, "B J 3"]
+    ) -> Float[Tensor, " B"]:
         return everywhere(self.threshold, batch)
 
-    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
-        rig = flat_cameras(batch.cameras, batch.seen.shape[:1])
-        size = person_size(batch.key_points, batch.seen)
+    def triangulate(self, batch: Observations) -> Triangulation:
+        rig = flat_cameras(batch.cameras, batch.valid.shape[:1])
+        size = person_scale(batch.key_points, batch.valid)
         pairs = self._pairs(batch)
 
         def part(rows: slice) -> tuple[Tensor, ...]:
             own = rig if len(rig.t) == 1 else rig.index(rows)
             candidates = _Candidates(
-                own, batch.key_points[rows], batch.seen[rows], size[rows], pairs[rows]
+                own, batch.key_points[rows], batch.valid[rows], size[rows], pairs[rows]
             )
             return candidates.fields(self._inliers(candidates))
 
-        frames, views, joints = batch.seen.shape
+        frames, views, joints = batch.valid.shape
         return Triangulation(
             *in_parts(part, torch.Size((frames, max(views, pairs.shape[1]), joints)))
         )
@@ -69,24 +71,24 @@ class Ransac(Baseline):
             candidates.residual.new_full((candidates.residual.shape[-1],), self.threshold)
         )
 
-    def _pairs(self, batch: KeyPointBatch) -> Bool[Tensor, "B P J V"]:
+    def _pairs(self, batch: Observations) -> Bool[Tensor, "B P J V"]:
         """Pairs of seen views: each pair of the rig if they are few, else random ones."""
-        frames, views, joints = batch.seen.shape
-        device = batch.seen.device
+        frames, views, joints = batch.valid.shape
+        device = batch.valid.device
         if views * (views - 1) // 2 <= self.pairs:
             one, other = torch.triu_indices(views, views, offset=1, device=device)
             eye = torch.eye(views, dtype=torch.bool, device=device)
             return (eye[one] | eye[other])[None, :, None].expand(frames, -1, joints, -1)
-        seen = batch.seen.mT[:, None]
-        count = seen.sum(-1)
+        valid = batch.valid.mT[:, None]
+        count = valid.sum(-1)
         draw = uniform(
             key(self.seed, "ransac", batch.sample, device=device), (self.pairs, joints, 2)
         )
         one = (draw[..., 0] * count).long()
         other = (draw[..., 1] * (count - 1)).long()
         other = other + (other >= one)
-        place = seen.cumsum(-1) - 1
-        return seen & ((place == one[..., None]) | (place == other[..., None]))
+        place = valid.cumsum(-1) - 1
+        return valid & ((place == one[..., None]) | (place == other[..., None]))
 
 
 @dataclass(frozen=True)
@@ -112,16 +114,18 @@ class AdaptiveRansac(Ransac):
             0 < self.quantile < 1, "quantile", f"is {self.quantile}", "It must be between 0 and 1."
         )
 
-    def reach(self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"]) -> Float[Tensor, " B"]:
-        size = person_size(batch.key_points, batch.seen).clamp(min=1e-12)[..., None]
+    def inlier_threshold(
+        self, batch: Observations, points: Float[Tensor, "B J 3"]
+    ) -> Float[Tensor, " B"]:
+        size = person_scale(batch.key_points, batch.valid).clamp(min=1e-12)[..., None]
         residual = reprojection_error(batch.cameras, batch.key_points, points) / size
-        return self._reach(residual.permute(1, 2, 0), batch.seen.permute(1, 2, 0))
+        return self._reach(residual.permute(1, 2, 0), batch.valid.permute(1, 2, 0))
 
     def _reach(
-        self, residual: Float[Tensor, "V J B"], seen: Bool[Tensor, "V J B"]
+        self, residual: Float[Tensor, "V J B"], valid: Bool[Tensor, "V J B"]
     ) -> Float[Tensor, " B"]:
         """From residuals of the points, as fractions of the person's size."""
-        counted = (seen & (seen.sum(0) >= 2) & ~residual.isnan()).flatten(0, 1)
+        counted = (valid & (valid.sum(0) >= 2) & ~residual.isnan()).flatten(0, 1)
         ordered = torch.where(counted, residual.flatten(0, 1), torch.inf).sort(dim=0).values
         place = (self.quantile * (counted.sum(0) - 1).clamp(min=0)).long()
         noise = ordered.gather(0, place[None])[0]
@@ -152,16 +156,16 @@ class _Candidates:
         self,
         cameras: Cameras,
         key_points: Float[Tensor, "B V J 2"],
-        seen: Bool[Tensor, "B V J"],
+        valid: Bool[Tensor, "B V J"],
         size: Float[Tensor, "B V"],
         pairs: Bool[Tensor, "B P J V"],
     ) -> None:
         whole = Cameras(
-            *(x.expand(len(seen), *x.shape[1:]) for x in (cameras.K, cameras.R, cameras.t))
+            *(x.expand(len(valid), *x.shape[1:]) for x in (cameras.K, cameras.R, cameras.t))
         )
-        points, ok = triangulate_subsets(whole, key_points, seen, pairs)
-        self.seen = seen.permute(1, 2, 0)
-        self.system = System(cameras, key_points, self.seen)
+        points, ok = triangulate_subsets(whole, key_points, valid, pairs)
+        self.valid = valid.permute(1, 2, 0)
+        self.system = System(cameras, key_points, self.valid)
         self.square = torch.where(
             self.system.used, size.double().clamp(min=1e-12).mT[:, None] ** 2, 0.0
         )
@@ -215,7 +219,7 @@ class _Candidates:
         ok = robust[1] == Status.OK
         if ok.all():
             return robust
-        linear = system.fields(*self.of_all_views, system.used, (self.seen & ~system.used).any(0))
+        linear = system.fields(*self.of_all_views, system.used, (self.valid & ~system.used).any(0))
         return tuple(
             torch.where(ok[..., None] if a.ndim > ok.ndim else ok, a, b)
             for a, b in zip(robust, linear, strict=True)

@@ -11,12 +11,12 @@ from torch import Tensor
 from ghpt.errors import check
 from ghpt.geometry.normal_equations import local_cameras, minors, products, views_of, weighted_sum
 from ghpt.geometry.triangulation import flat_cameras
-from ghpt.models.estimators.classical import person_size
-from ghpt.recording import KeyPointBatch
+from ghpt.models.estimators.classical import person_scale
+from ghpt.recording import Observations
 
 
 @dataclass(frozen=True)
-class JointQuality:
+class JointUncertainty:
     """Of each joint of B frames; 0 where it has no position or fewer than two views."""
 
     error: Float[Tensor, "B J"]
@@ -26,22 +26,22 @@ class JointQuality:
 
 
 @dataclass(frozen=True)
-class Quality:
+class UncertaintyModel:
     """Covariance = noise variance x (sum over the used views of J^T J / size^2)^-1 + shared^2.
 
     J is the derivative of the view's pixels by the position, ``size`` the person's in the view
-    (``person_size``). ``noise``: deviation of a pixel coordinate as a fraction of the size; null:
+    (``person_scale``). ``noise``: deviation of a pixel coordinate as a fraction of the size; null:
     each batch's own (``pooled_noise``). A joint's own residuals count as their 2 V - 3 degrees of
     freedom, the pooled noise as ``prior``: few views say little about their noise. ``shared``:
     deviation (mm) of what all views have in common, and no residual shows: where a detector takes
     the joint to be.
 
     With conf/estimator/default.yaml and adaptive RANSAC 76, 98 and 99 % of the true positions of
-    embedded Human3.6M lie within the ellipsoids of 50, 90 and 95 % for people that the detector was
-    trained on (too cautious), 49, 88 and 93 % for others. On embedded Panoptic, whose joints are
-    defined 19 mm elsewhere, 18, 48 and 55 %: there shared = 11 fits. Views are taken to be weighted
-    by ``size``^-2, as linear triangulation and so adaptive RANSAC weights them where focal lengths
-    are equal.
+    synthetic Human3.6M lie within the ellipsoids of 50, 90 and 95 % for people that the detector
+    was trained on (too cautious), 49, 88 and 93 % for others. On synthetic Panoptic, whose joints
+    are defined 19 mm elsewhere, 18, 48 and 55 %: there shared = 11 fits. Views are taken to be
+    weighted by ``size``^-2, as linear triangulation and so adaptive RANSAC weights them where focal
+    lengths are equal.
     """
 
     noise: float | None
@@ -59,16 +59,16 @@ class Quality:
         check(self.shared >= 0, "shared", f"is {self.shared}", "It must be >= 0.")
 
     def fitted(
-        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
-    ) -> Quality:
+        self, batch: Observations, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
+    ) -> UncertaintyModel:
         """The same with the noise of these frames."""
         _, relative, _ = self._fit(batch, points, views)
         return replace(self, noise=float(pooled_noise(relative, views)))
 
     @torch.no_grad()
     def __call__(
-        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
-    ) -> JointQuality:
+        self, batch: Observations, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
+    ) -> JointUncertainty:
         """``views``: those that made each joint; a joint without a position has none."""
         square, relative, normal = self._fit(batch, points, views)
         count = views.sum(1)
@@ -81,17 +81,17 @@ class Quality:
         covariance = _inverse(normal) * variance[..., None]
         covariance = covariance + self.shared**2 * covariance.new_tensor([1.0, 0, 0, 1, 0, 1])
         error = (square.sum(1) / count.clamp(min=1)).sqrt()
-        return JointQuality(
+        return JointUncertainty(
             torch.where(made, error, 0.0), torch.where(made[..., None], covariance, 0.0)
         )
 
     def _fit(
-        self, batch: KeyPointBatch, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
+        self, batch: Observations, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
     ) -> tuple[Float[Tensor, "B V J"], Float[Tensor, "B V J"], Float[Tensor, "B J 6"]]:
         """Squared residuals in pixels and over the size (0 in views that are not used), and the sum
         of J^T J / size^2.
         """
-        rig = flat_cameras(batch.cameras, batch.seen.shape[:1])
+        rig = flat_cameras(batch.cameras, batch.valid.shape[:1])
         local, origin = local_cameras(rig)
         used = views.permute(1, 2, 0)
         seen_by = views_of(local, batch.key_points, used)
@@ -101,7 +101,7 @@ class Quality:
         depth = torch.where(used & (depth > 0), depth, torch.inf)
         over, down = ((r[0] * x + r[1] * y + r[2] * z - r[3]) / depth for r in (a, b))
         square = over**2 + down**2
-        size = person_size(batch.key_points, batch.seen).double().mT[:, None].clamp(min=1e-12)
+        size = person_scale(batch.key_points, batch.valid).double().mT[:, None].clamp(min=1e-12)
         weight = 1 / (depth * size) ** 2
         normal = weighted_sum(products(a, b)[:, :6], weight)
         return square.permute(2, 0, 1), (square / size**2).permute(2, 0, 1), normal.permute(2, 1, 0)

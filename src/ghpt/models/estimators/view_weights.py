@@ -22,12 +22,12 @@ from torch import Tensor
 
 from ghpt.errors import check
 from ghpt.geometry.triangulation import Triangulation, triangulate
+from ghpt.models.aggregation import cap_logit_std, softmax_weights
 from ghpt.models.estimators.classical import Baseline, otherwise
 from ghpt.models.estimators.ransac import Ransac
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.problem import PoseHypotheses
-from ghpt.models.selection import limit_spread, softmax_weights
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
 
 @dataclass(frozen=True)
@@ -59,24 +59,24 @@ class ViewWeights(Baseline):
         self.consensus = consensus
         self.power = power
 
-    def triangulate(self, batch: KeyPointBatch) -> Triangulation:
+    def triangulate(self, batch: Observations) -> Triangulation:
         return self.weigh(batch).triangulation
 
     @torch.no_grad()
-    def weigh(self, batch: KeyPointBatch, robust: Triangulation | None = None) -> Weighed:
+    def weigh(self, batch: Observations, robust: Triangulation | None = None) -> Weighed:
         """The joints and all that they were made of. ``robust``: what ``consensus`` makes of the
         batch, if that is known.
         """
         model = self.model
         problem = self.model.problem
         robust = robust or self.consensus.triangulate(batch)
-        views, _ = self.consensus.agreeing(batch, robust.points, robust.placed)
-        agreed = replace(batch, seen=views)
+        views, _ = self.consensus.inlier_views(batch, robust.points, robust.placed)
+        agreed = replace(batch, valid=views)
         hypotheses = problem.generate(agreed, model.hypotheses, model.keys("view weights", batch))
-        logits = model.scorer(problem.describe(hypotheses))
-        weights = softmax_weights(limit_spread(logits, model.spread), model.temperature)
+        logits = model.scorer(problem.featurize(hypotheses))
+        weights = softmax_weights(cap_logit_std(logits, model.logit_std_cap), model.temperature)
         probability = torch.einsum("bh,bhjv->bvj", weights.double(), hypotheses.views.double())
-        reach = self.consensus.reach(batch, robust.points)
-        power = self.power * (self.consensus.threshold / reach[:, None, None]).sqrt()
+        inlier_threshold = self.consensus.inlier_threshold(batch, robust.points)
+        power = self.power * (self.consensus.threshold / inlier_threshold[:, None, None]).sqrt()
         result = triangulate(batch.cameras, batch.key_points, views * probability**power)
         return Weighed(otherwise(result, robust), views, hypotheses, logits, weights)

@@ -64,12 +64,12 @@ class _Selection:
         self,
         estimate: PoseEstimate,
         truth: Float[Tensor, "B J 3"],
-        truth_seen: Bool[Tensor, "B J"],
+        truth_valid: Bool[Tensor, "B J"],
         action: Int[Tensor, " B"],
         subject: Int[Tensor, " B"],
     ) -> None:
         for metric in (self.absolute, self.relative, self.aligned):
-            metric.update(estimate, truth, truth_seen, action)
+            metric.update(estimate, truth, truth_valid, action)
         self.prior.update(estimate, subject)
 
 
@@ -104,11 +104,11 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
         subject = subject_of[chunk.recording]
         for name in names:
             estimate = chunk.estimates[name]
-            whole[name].update(estimate, chunk.truth, chunk.truth_seen, action, subject)
+            whole[name].update(estimate, chunk.truth, chunk.truth_valid, action, subject)
             if sound:
                 kept = PoseEstimate(estimate.points[keep], estimate.estimated[keep])
                 sound[name].update(
-                    kept, chunk.truth[keep], chunk.truth_seen[keep], action[keep], subject[keep]
+                    kept, chunk.truth[keep], chunk.truth_valid[keep], action[keep], subject[keep]
                 )
     selections = {name: _selection(whole[name], actions, subjects) for name in names}
     for name, metrics in sound.items():

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ghpt.data.formats.stored_npz import Member, read_rows
 from ghpt.errors import GhptDataError
-from ghpt.models.rows import MEND, WEIGHTS, Layout, RowWriter, check_arrays, read_tables, row_count
+from ghpt.models.rows import HINT, WEIGHTS, Layout, RowWriter, check_arrays, read_tables, row_count
 from ghpt.recording import PoseEstimate, Recording
 from ghpt.skeleton import JOINTS
 
@@ -42,7 +42,7 @@ class PredictionWriter:
         rows: Int[Tensor, " B"],
         estimates: Mapping[str, PoseEstimate],
         truth: Float[Tensor, "B J 3"],
-        truth_seen: Bool[Tensor, "B J"],
+        truth_valid: Bool[Tensor, "B J"],
         recording: Int[Tensor, " B"],
         frame: Int[Tensor, " B"],
         weights: Mapping[str, Float[Tensor, " B"]],
@@ -52,11 +52,11 @@ class PredictionWriter:
         """
         self._rows.check(estimates, weights)
         values: dict[str, Tensor] = {
-            "truth_seen": truth_seen,
+            "truth_seen": truth_valid,
             "recording": recording,
             "frame": frame,
         }
-        values["truth"] = truth.masked_fill(~truth_seen[..., None], torch.nan)
+        values["truth"] = truth.masked_fill(~truth_valid[..., None], torch.nan)
         for name, estimate in estimates.items():
             estimated = estimate.estimated & estimate.points.isfinite().all(-1)
             values[f"estimated_{name}"] = estimated
@@ -68,9 +68,9 @@ class PredictionWriter:
     ) -> None:
         """Make the file ``path``.
 
-        ``meta``: ``data``, ``source`` ("embedded" or the path of the data), ``split``, ``seed`` and
-        ``provenance``, as plain data. The same content gives the same bytes. Raises GhptError if a
-        row is missing.
+        ``meta``: ``data``, ``source`` ("synthetic" or the path of the data), ``split``, ``seed``
+        and ``provenance``, as plain data. The same content gives the same bytes. Raises GhptError
+        if a row is missing.
         """
         tables = {
             **{
@@ -87,7 +87,7 @@ class PredictionChunk(NamedTuple):
 
     estimates: dict[str, PoseEstimate]
     truth: Float[Tensor, "B J 3"]
-    truth_seen: Bool[Tensor, "B J"]
+    truth_valid: Bool[Tensor, "B J"]
     recording: Int[Tensor, " B"]
     frame: Int[Tensor, " B"]
     weights: dict[str, Float[Tensor, " B"]]
@@ -121,7 +121,7 @@ class Predictions:
         recording = rows["recording"].long()
         if ((recording < 0) | (recording >= len(self.recording_name))).any():
             raise GhptDataError(
-                self.path, "recording", "names a recording that is not listed", MEND
+                self.path, "recording", "names a recording that is not listed", HINT
             )
         estimates = {}
         for name in self.names:
@@ -130,10 +130,10 @@ class Predictions:
             estimates[name] = PoseEstimate(
                 torch.where(estimated[..., None], points, 0.0), estimated
             )
-        seen = rows["truth_seen"] & rows["truth"].isfinite().all(-1)
-        truth = torch.where(seen[..., None], rows["truth"], 0.0)
+        valid = rows["truth_seen"] & rows["truth"].isfinite().all(-1)
+        truth = torch.where(valid[..., None], rows["truth"], 0.0)
         weights = {summary: rows[f"weights_{summary}"] for summary in WEIGHTS}
-        return PredictionChunk(estimates, truth, seen, recording, rows["frame"], weights)
+        return PredictionChunk(estimates, truth, valid, recording, rows["frame"], weights)
 
     def chunks(self, size: int) -> Iterator[PredictionChunk]:
         """All rows, ``size`` at a time."""
@@ -152,9 +152,9 @@ def open_predictions(path: str | Path) -> Predictions:
     texts = ("recording_name", "recording_subject", "recording_action", "joint_name")
     members, tables, meta, names = read_tables(path, texts)
     if tables["joint_name"] != JOINTS:
-        raise GhptDataError(path, "joint_name", "is not the 17 joints in ghpt's order", MEND)
+        raise GhptDataError(path, "joint_name", "is not the 17 joints in ghpt's order", HINT)
     check_arrays(path, members, _layout(names, len(JOINTS)), row_count(members, "frame"))
     recordings = [tables[name] for name in texts[:3]]
     if len({len(table) for table in recordings}) != 1:
-        raise GhptDataError(path, "recording_name", "subjects and actions are not as many", MEND)
+        raise GhptDataError(path, "recording_name", "subjects and actions are not as many", HINT)
     return Predictions(path, meta, names, *recordings, members)

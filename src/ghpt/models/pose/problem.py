@@ -13,7 +13,7 @@ from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.models.pose.features import body_part_lengths, normalised_coordinates
-from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.recording import Observations, PoseEstimate
 from ghpt.skeleton import BONES, JOINTS
 
 
@@ -46,21 +46,21 @@ class PoseTriangulation:
         self.feature_size = len(JOINTS) * 3 * coordinates + len(BONES) * lengths
 
     @torch.no_grad()
-    def generate(self, batch: KeyPointBatch, count: int, keys: Int[Tensor, " B"]) -> PoseHypotheses:
+    def generate(self, batch: Observations, count: int, keys: Int[Tensor, " B"]) -> PoseHypotheses:
         """Joint by joint a uniformly random subset of at least two seen views, triangulated.
 
         Where a subset is degenerate (parallel rays, a point behind a camera), all seen views stand
         in for it, so that every hypothesis has every joint that the frame determines.
         """
-        whole = triangulate(batch.cameras, batch.key_points, batch.seen.double())
-        views = random_subsets(batch.seen, count, keys)
-        points, ok = triangulate_subsets(batch.cameras, batch.key_points, batch.seen, views)
+        whole = triangulate(batch.cameras, batch.key_points, batch.valid.double())
+        views = random_subsets(batch.valid, count, keys)
+        points, ok = triangulate_subsets(batch.cameras, batch.key_points, batch.valid, views)
         points = torch.where(ok[..., None], points, whole.points[:, None])
-        views = torch.where(ok[..., None], views, batch.seen.mT[:, None])
+        views = torch.where(ok[..., None], views, batch.valid.mT[:, None])
         return PoseHypotheses(points.float(), views, whole.ok)
 
     @torch.no_grad()
-    def describe(self, hypotheses: PoseHypotheses) -> Float[Tensor, "B H D"]:
+    def featurize(self, hypotheses: PoseHypotheses) -> Float[Tensor, "B H D"]:
         """Normalised coordinates and body part lengths, mm."""
         estimated = hypotheses.estimated[:, None].expand(hypotheses.points.shape[:-1])
         kinds = [
@@ -73,7 +73,7 @@ class PoseTriangulation:
         ]
         return torch.cat(kinds, dim=-1)
 
-    def combine(self, hypotheses: PoseHypotheses, weights: Float[Tensor, "B H"]) -> PoseEstimate:
+    def aggregate(self, hypotheses: PoseHypotheses, weights: Float[Tensor, "B H"]) -> PoseEstimate:
         """The weighted average of the poses, taken about the pool's mean so that float32 keeps its
         digits.
         """
@@ -81,21 +81,21 @@ class PoseTriangulation:
         offset = torch.einsum("bh,bhjc->bjc", weights.to(centre.dtype), hypotheses.points - centre)
         return PoseEstimate(centre[:, 0] + offset, hypotheses.estimated)
 
-    def expand(self, hypotheses: PoseHypotheses) -> PoseEstimate:
+    def as_estimates(self, hypotheses: PoseHypotheses) -> PoseEstimate:
         estimated = hypotheses.estimated[:, None].expand(hypotheses.points.shape[:-1])
         return PoseEstimate(hypotheses.points, estimated)
 
     def error(
-        self, estimate: PoseEstimate, batch: KeyPointBatch
+        self, estimate: PoseEstimate, batch: Observations
     ) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
         """Pelvis-relative MPJPE (eq:mpjpe) over the joints that are estimated and have a truth, mm."""
         extra = (None,) * (estimate.points.dim() - 3)
         truth = batch.truth[:, *extra]
-        truth_seen = batch.truth_seen[:, *extra]
+        truth_valid = batch.truth_valid[:, *extra]
         errors, counted = joint_errors(
             estimate,
             truth.expand_as(estimate.points),
-            truth_seen.expand_as(estimate.estimated),
+            truth_valid.expand_as(estimate.estimated),
             "relative",
         )
         number = counted.sum(dim=-1)

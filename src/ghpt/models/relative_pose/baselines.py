@@ -21,16 +21,16 @@ from torch import Tensor
 
 from ghpt.errors import check, check_positive
 from ghpt.geometry.epipolar import MINIMUM, eight_point, pose_in_front, sampson_error
-from ghpt.models.estimators.classical import person_size
+from ghpt.models.estimators.classical import person_scale
 from ghpt.randomness import key, uniform
 from ghpt.recording import PairBatch, RelativePoseEstimate
 
 
 def size_in_image(batch: PairBatch) -> Float[Tensor, " B"]:
     """The person's size in the pair's views, in normalised image coordinates; 0 where it has none."""
-    K, pixels, seen = (batch.of_pair(x) for x in (batch.cameras.K, batch.key_points, batch.seen))
+    K, pixels, valid = (batch.of_pair(x) for x in (batch.cameras.K, batch.key_points, batch.valid))
     focal = (K[..., 0, 0] + K[..., 1, 1]).double() / 2
-    size = person_size(pixels.double(), seen) / focal[..., None]
+    size = person_scale(pixels.double(), valid) / focal[..., None]
     size = torch.where(size > 0, size, torch.nan).flatten(1)
     none = torch.full((len(size), 1), torch.nan, dtype=size.dtype, device=size.device)
     return torch.cat((size, none), dim=1).nanmedian(-1).values.nan_to_num(0.0)

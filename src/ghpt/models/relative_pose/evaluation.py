@@ -22,11 +22,11 @@ from ghpt.metrics.relative_pose import (
     translation_deg,
     translation_error,
 )
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.relative_pose.predictions import PairChunk, PairPredictions
-from ghpt.models.selection import SELECTIONS
 
 FORMAT_VERSION = 1
-NAMES = (*SELECTIONS, "eight_point", "ransac", "usac_magsac", "usac_accurate", "poselib", "rig")
+NAMES = (*AGGREGATIONS, "eight_point", "ransac", "usac_magsac", "usac_accurate", "poselib", "rig")
 """The order of every table: the selections, then the baselines."""
 ERRORS = ("E_R", "E_t", "E_2D", "E_3D", "rotation_deg", "translation_deg")
 """Section 4.5's four, and the angles in degrees."""

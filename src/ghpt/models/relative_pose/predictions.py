@@ -19,7 +19,7 @@ from ghpt.data.datasets.pairs import RigOfSplit
 from ghpt.data.formats.stored_npz import Member, read_rows
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.rows import MEND, WEIGHTS, Layout, RowWriter, check_arrays, read_tables, row_count
+from ghpt.models.rows import HINT, WEIGHTS, Layout, RowWriter, check_arrays, read_tables, row_count
 from ghpt.recording import RelativePoseEstimate
 
 PROBLEM = "camera"
@@ -132,11 +132,11 @@ class PairPredictions:
         pair = rows["pair"].long()
         rigs, views = self.cameras.K.shape[:2]
         if ((rig < 0) | (rig >= rigs)).any():
-            raise GhptDataError(self.path, "rig", "names a rig that is not listed", MEND)
+            raise GhptDataError(self.path, "rig", "names a rig that is not listed", HINT)
         if ((pair < 0) | (pair >= views)).any() or (pair[:, 0] == pair[:, 1]).any():
-            raise GhptDataError(self.path, "pair", f"is not two of the {views} views", MEND)
+            raise GhptDataError(self.path, "pair", f"is not two of the {views} views", HINT)
         if not (rows["truth_R"].isfinite().all() and rows["truth_t"].isfinite().all()):
-            raise GhptDataError(self.path, "truth_R", "holds values that are not finite", MEND)
+            raise GhptDataError(self.path, "truth_R", "holds values that are not finite", HINT)
         estimates = {}
         for name in self.names:
             R = rows[f"R_{name}"]
@@ -166,7 +166,7 @@ def open_pairs(path: str | Path) -> PairPredictions:
     members, tables, meta, names = read_tables(path, ("rig_name", "camera_name"))
     if meta.get("problem") != PROBLEM:
         raise GhptDataError(
-            path, "meta.problem", f"is {meta.get('problem')!r}, not {PROBLEM!r}", MEND
+            path, "meta.problem", f"is {meta.get('problem')!r}, not {PROBLEM!r}", HINT
         )
     check_arrays(path, members, _layout(names), row_count(members, "draw"))
     rigs = len(tables["rig_name"])
@@ -179,12 +179,12 @@ def open_pairs(path: str | Path) -> PairPredictions:
             or members[name][1:] != (np.dtype("<f8"), shape)
             or not math.prod(shape)
         ):
-            raise GhptDataError(path, name, f"is not <f8 of shape {shape}", MEND)
+            raise GhptDataError(path, name, f"is not <f8 of shape {shape}", HINT)
         arrays[name] = torch.from_numpy(read_rows(path, members[name], 0, rigs))
         if not arrays[name].isfinite().all():
-            raise GhptDataError(path, name, "holds values that are not finite", MEND)
+            raise GhptDataError(path, name, "holds values that are not finite", HINT)
     if members["camera_name"].shape != (rigs, views):
-        raise GhptDataError(path, "camera_name", f"is not of shape {(rigs, views)}", MEND)
+        raise GhptDataError(path, "camera_name", f"is not of shape {(rigs, views)}", HINT)
     flat = tables["camera_name"]
     camera_names = tuple(flat[i * views : (i + 1) * views] for i in range(rigs))
     cameras = Cameras(arrays["rig_K"], arrays["rig_R"], arrays["rig_t"])

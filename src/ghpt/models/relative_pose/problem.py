@@ -116,7 +116,7 @@ class RelativePose:
         return RelativePoseHypotheses(R, t * length[..., None], estimated, a, b, both)
 
     @torch.no_grad()
-    def describe(self, hypotheses: RelativePoseHypotheses) -> Float[Tensor, "B H D"]:
+    def featurize(self, hypotheses: RelativePoseHypotheses) -> Float[Tensor, "B H D"]:
         """The distances (mm) between corresponding rays, sorted: D evenly spaced quantiles of them,
         so that missing joints and another number of frames change nothing but their precision.
         """
@@ -126,7 +126,7 @@ class RelativePose:
         distances = ray_distances(h.R, direction, h.a, h.b).float() * length.float()
         return quantiles(distances, h.both[:, None].expand_as(distances), self.feature_size)
 
-    def combine(
+    def aggregate(
         self, hypotheses: RelativePoseHypotheses, weights: Float[Tensor, "B H"]
     ) -> RelativePoseEstimate:
         """Weighted average of the rotations' quaternions and of the translations.
@@ -144,7 +144,7 @@ class RelativePose:
             R, total * length / torch.where(norm > 0, norm, 1.0), hypotheses.estimated
         )
 
-    def expand(self, hypotheses: RelativePoseHypotheses) -> RelativePoseEstimate:
+    def as_estimates(self, hypotheses: RelativePoseHypotheses) -> RelativePoseEstimate:
         estimated = hypotheses.estimated[:, None].expand(hypotheses.t.shape[:-1])
         return RelativePoseEstimate(hypotheses.R, hypotheses.t, estimated)
 

@@ -149,7 +149,7 @@ class BodyScale(Scale):
     @torch.no_grad()
     def __call__(self, estimate: RelativePoseEstimate, batch: PairBatch) -> Float[Tensor, "*B"]:
         key_points = batch.of_pair(batch.key_points)
-        seen = batch.of_pair(batch.seen)
+        valid = batch.of_pair(batch.valid)
         K = batch.pair_cameras().K.double()
         lengths = torch.tensor(self.lengths, dtype=torch.float64)
         scales = [
@@ -158,7 +158,7 @@ class BodyScale(Scale):
                 estimate.t[i].double(),
                 K[i],
                 key_points[i],
-                seen[i],
+                valid[i],
                 lengths,
             )
             for i in range(
@@ -178,11 +178,11 @@ class BodyScale(Scale):
         t: Float[Tensor, "*H 3"],
         K: Float[Tensor, "2 3 3"],
         key_points: Float[Tensor, "2 M J 2"],
-        seen: Bool[Tensor, "2 M J"],
+        valid: Bool[Tensor, "2 M J"],
         lengths: Float[Tensor, " L"],
     ) -> Float[Tensor, "*H"]:
         leading = R.shape[:-2]
-        shape = seen.shape[1:]
+        shape = valid.shape[1:]
         world = torch.eye(3, dtype=R.dtype, device=R.device).expand_as(R), torch.zeros_like(t)
         cameras = Cameras(
             K.expand(*leading, 2, 3, 3),
@@ -190,7 +190,7 @@ class BodyScale(Scale):
             torch.stack((world[1], t), dim=-2),
         )
         pixels = key_points.double().flatten(1, 2)
-        weights = seen.all(0).flatten().double().expand(*leading, 2, -1)
+        weights = valid.all(0).flatten().double().expand(*leading, 2, -1)
         result = triangulate(cameras, pixels.expand(*leading, *pixels.shape), weights)
         return body_scale(
             result.points.unflatten(-2, shape), result.ok.unflatten(-1, shape), lengths
@@ -204,8 +204,8 @@ class BodyHeight(BodyScale):
 
     def __init__(self, mm: float) -> None:
         low, high = HUMAN
-        mend = f"Give the person's height in millimetres, {low:g} to {high:g}."
-        check(low <= mm <= high, "mm", f"is {mm}, which is nobody's height", mend)
+        hint = f"Give the person's height in millimetres, {low:g} to {high:g}."
+        check(low <= mm <= high, "mm", f"is {mm}, which is nobody's height", hint)
         self.lengths = tuple(mm * length for length in average_lengths())
 
 
@@ -213,8 +213,8 @@ class SegmentLengths(BodyScale):
     """Measured lengths (mm) by name: ``SEGMENTS``, or without the side for both (``thigh: 430``)."""
 
     def __init__(self, lengths: Mapping[str, float]) -> None:
-        mend = f"Choose from {', '.join(SEGMENTS)}, or leave out right_ or left_ for both."
-        check(len(lengths) > 0, "lengths", "is empty", mend)
+        hint = f"Choose from {', '.join(SEGMENTS)}, or leave out right_ or left_ for both."
+        check(len(lengths) > 0, "lengths", "is empty", hint)
         found = dict.fromkeys(SEGMENTS, 0.0)
         for name, mm in lengths.items():
             own = [
@@ -222,7 +222,7 @@ class SegmentLengths(BodyScale):
                 for s in SEGMENTS
                 if s == name or s.removeprefix("right_").removeprefix("left_") == name
             ]
-            check(bool(own), "lengths", f"names {name!r}, which is no part of the body", mend)
+            check(bool(own), "lengths", f"names {name!r}, which is no part of the body", hint)
             check(mm > 0, "lengths", f"says {name} is {mm}", "Give lengths in millimetres.")
             found |= dict.fromkeys(own, float(mm))
         self.lengths = tuple(found[name] for name in SEGMENTS)

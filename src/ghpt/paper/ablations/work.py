@@ -13,15 +13,15 @@ from ghpt.config import build
 from ghpt.data.datasets.frames import Frames
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
+from ghpt.models.aggregation import aggregation_weights, cap_logit_std
 from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.problem import PoseHypotheses
-from ghpt.models.selection import limit_spread, selection_weights
 from ghpt.paper.engine.work import CHECKPOINT
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 from ghpt.skeleton import JOINTS
 
-SELECTIONS = ("weight", "average", "best")
+AGGREGATIONS = ("weight", "average", "best")
 
 
 @torch.no_grad()
@@ -48,19 +48,19 @@ def errors(
     model: StochasticEstimator, frames: Frames, settings: list[tuple[int, float]], batch_size: int
 ) -> list[dict[str, float]]:
     """Pelvis-relative MPJPE (mm) of the selections under each setting."""
-    metrics = [{name: MPJPE("relative", 1, len(JOINTS)) for name in SELECTIONS} for _ in settings]
+    metrics = [{name: MPJPE("relative", 1, len(JOINTS)) for name in AGGREGATIONS} for _ in settings]
     for first in range(0, len(frames), batch_size):
         batch = frames[range(first, min(first + batch_size, len(frames)))]
         keys = model.keys("test", batch)
         pool = model.problem.generate(batch, max(h for h, _ in settings), keys)
-        logits = model.scorer(model.problem.describe(pool))
+        logits = model.scorer(model.problem.featurize(pool))
         for each, (count, temperature) in zip(metrics, settings, strict=True):
             part = PoseHypotheses(pool.points[:, :count], pool.views[:, :count], pool.estimated)
             update(
                 each,
                 model,
                 part,
-                limit_spread(logits[:, :count], model.spread),
+                cap_logit_std(logits[:, :count], model.logit_std_cap),
                 temperature,
                 batch,
                 keys,
@@ -76,12 +76,12 @@ def update(
     pool: PoseHypotheses,
     logits: Float[Tensor, "B H"],
     temperature: float,
-    batch: KeyPointBatch,
+    batch: Observations,
     keys: Int[Tensor, " B"],
 ) -> None:
     """Add a batch to the metric of each selection."""
-    error, _ = model.problem.error(model.problem.expand(pool), batch)
+    error, _ = model.problem.error(model.problem.as_estimates(pool), batch)
     for name, metric in metrics.items():
-        weights = selection_weights(name, logits, error.to(logits.dtype), temperature, keys)
-        estimate = model.problem.combine(pool, weights)
-        metric.update(estimate, batch.truth, batch.truth_seen, torch.zeros_like(batch.sample))
+        weights = aggregation_weights(name, logits, error.to(logits.dtype), temperature, keys)
+        estimate = model.problem.aggregate(pool, weights)
+        metric.update(estimate, batch.truth, batch.truth_valid, torch.zeros_like(batch.sample))

@@ -32,7 +32,7 @@ from ghpt.skeleton import JOINTS
 PARTS = {"R": (True, False), "t": (False, True), "both": (True, True)}
 """Which of a relative pose's rotation and translation is the estimated one."""
 KINDS = ("relative", "absolute")
-MEND = "Draw more frames: sizes.unknown_extrinsics.frames."
+HINT = "Draw more frames: sizes.unknown_extrinsics.frames."
 
 Extrinsics = tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]
 """Each camera after the first, ``x_i = R x_1 + t``; mm."""
@@ -68,7 +68,7 @@ def from_pairs(estimate: RelativePoseEstimate, batch: PairBatch, name: str) -> E
     """The poses of the pairs (1, i), in their order, and the first camera's own."""
     rows = torch.nonzero(batch.pair[:, 0] == 0)[:, 0]
     if not estimate.estimated[rows].all():
-        raise GhptDataError(f"draw {int(batch.draw[0])}", name, "a pair has no estimate", MEND)
+        raise GhptDataError(f"draw {int(batch.draw[0])}", name, "a pair has no estimate", HINT)
     eye = torch.eye(3, dtype=torch.float64)[None]
     zero = torch.zeros(1, 3, dtype=torch.float64)
     return torch.cat((eye, estimate.R[rows].double())), torch.cat((zero, estimate.t[rows].double()))
@@ -78,10 +78,10 @@ def from_rig(calibration: Any, batch: PairBatch) -> Extrinsics:
     """All views of a draw calibrated together; the one scale is the true one."""
     truth = batch.cameras.index(0)
     draw = int(batch.draw[0])
-    arrays = (x[0].transpose(0, 1) for x in (batch.key_points, batch.confidence, batch.seen))
+    arrays = (x[0].transpose(0, 1) for x in (batch.key_points, batch.confidence, batch.valid))
     found = calibration([str(view) for view in range(len(truth.K))], truth.K, *arrays, None, draw)
     if not found.calibrated.all():
-        raise GhptDataError(f"draw {draw}", "rig", "a camera is not calibrated", MEND)
+        raise GhptDataError(f"draw {draw}", "rig", "a camera is not calibrated", HINT)
     return with_true_scale(found.cameras, truth)
 
 
@@ -178,5 +178,5 @@ def pose_errors(model: StochasticEstimator, frames: Frames, batch_size: int) -> 
         batch = frames[range(first, min(first + batch_size, len(frames)))]
         estimate = model.test_step(batch, 0)[0]["weight"]
         for metric in metrics.values():
-            metric.update(estimate, batch.truth, batch.truth_seen, torch.zeros_like(batch.sample))
+            metric.update(estimate, batch.truth, batch.truth_valid, torch.zeros_like(batch.sample))
     return {kind: metric.compute().mean.item() for kind, metric in metrics.items()}

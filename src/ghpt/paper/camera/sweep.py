@@ -9,11 +9,11 @@ import torch
 
 from ghpt.config import build
 from ghpt.files import write_json
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.checkpoint import load_model
 from ghpt.models.collect import CollectPairs
 from ghpt.models.relative_pose.evaluation import errors_of_pair, pair_name
 from ghpt.models.relative_pose.predictions import open_pairs
-from ghpt.models.selection import SELECTIONS
 from ghpt.paper.engine.work import CHECKPOINT
 
 
@@ -28,7 +28,7 @@ def errors_of_draws(config: dict[str, Any], needs: dict[str, Path], folder: Path
     changes |= {"seed": config["seed"], "hypotheses": config["hypotheses"]}
     model = load_model(needs["model"] / CHECKPOINT, **changes)[0].eval()
     data = build(config["data"], "data")
-    data.serve(model.problem)
+    data.bind(model.problem)
     data.setup("test")
     pairs = data.frames["test"]
     views = len(pairs.rigs[0].names)
@@ -43,7 +43,7 @@ def errors_of_draws(config: dict[str, Any], needs: dict[str, Path], folder: Path
     }
     collect = CollectPairs(folder, build(config["camera_baselines"], "camera_baselines"), meta)
     collect.data = pairs
-    collect.open([*SELECTIONS, *collect.estimators])
+    collect.open([*AGGREGATIONS, *collect.estimators])
     with torch.no_grad():
         for first in range(0, len(pairs), data.batch_size):
             batch = pairs[range(first, min(first + data.batch_size, len(pairs)))]

@@ -111,7 +111,7 @@ def _section(results: Results) -> Section:
         other,
         _increases(results),
     ]
-    if results.words("cmu3").startswith("embedded") != words.startswith("embedded"):
+    if results.words("cmu3").startswith("synthetic") != words.startswith("synthetic"):
         words = f"{words}, CMU3 model trained on {results.words('cmu3')}"
     return Section(words, "\n\n".join(body), {}, compared, _claims(results), _explained(results))
 

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from ghpt.paper.engine.cells import Cell, read_json
 from ghpt.paper.engine.setup import Setup
-from ghpt.report.tables import NONE, markdown, words
+from ghpt.report.tables import NONE, display_name, markdown
 
 TOLERANCE = 0.05
 """A number that is worse than the paper's by more than this share of it is a miss."""
@@ -108,7 +108,7 @@ class Claim:
     """Section of the paper."""
     holds: bool | None
     """None where the data cannot tell: what others published of real images is no measure for
-    embedded data.
+    synthetic data.
     """
     by: str
     """By how much, with the paper's own numbers where it has them."""
@@ -123,7 +123,7 @@ class Section:
     """What an item shows."""
 
     data: str
-    """The data used, in words that tell embedded from real: goes into the heading."""
+    """The data used, in words that tell synthetic from real: goes into the heading."""
     body: str
     """Markdown. ``![caption](name.svg)`` shows ``figures["name"]``."""
     figures: Mapping[str, Figure] = field(default_factory=dict)
@@ -131,8 +131,8 @@ class Section:
     """Every number that the paper prints, for the summary and the list of misses."""
     claims: Sequence[Claim] = ()
     explained: str = ""
-    """What explains the misses of embedded data, and the claims that do not hold; shown where there
-    are any.
+    """What explains the misses of synthetic data, and the claims that do not hold; shown where
+    there are any.
     """
 
 
@@ -179,8 +179,8 @@ class Results:
         """Pelvis-relative MPJPE (mm) of a selection or baseline in a test cell."""
         return self.spread(name, "selections", selection, "mpjpe_relative")
 
-    def words(self, data: str) -> str:
-        return words(data, self.setup.source(data))
+    def display_name(self, data: str) -> str:
+        return display_name(data, self.setup.source(data))
 
     def on_real(self, data: str, holds: bool) -> bool | None:
         """A claim about what others published: only real data can tell."""

@@ -26,7 +26,7 @@ from ghpt.report.tables import markdown
 TITLE = "Generalizable Human Pose Triangulation: the paper's tables and figures again"
 PREFIX = {"table": "tab:", "figure": "fig:"}
 FOLDER = "figures"
-EMBEDDED = "embedded"
+SYNTHETIC = "synthetic"
 logging.getLogger("fontTools").setLevel(
     logging.WARNING
 )  # it tells every glyph that goes into a PDF
@@ -43,7 +43,7 @@ class Entry:
 
     @property
     def heading(self) -> str:
-        """Label, title and data: an embedded number can never be mistaken for a real one."""
+        """Label, title and data: a synthetic number can never be mistaken for a real one."""
         prefix = PREFIX.get(self.item.kind, "") if self.item.of_paper else ""
         return f"{prefix}{self.item.label}: {self.item.title} · {self.section.data}"
 
@@ -57,7 +57,7 @@ class Entry:
         if self.section.claims:
             parts.append(claims_table(self.section.claims))
         short = self.misses or [claim for claim in self.section.claims if claim.holds is False]
-        if short and self.section.explained and EMBEDDED in self.section.data:
+        if short and self.section.explained and SYNTHETIC in self.section.data:
             parts.append(f"**What explains the misses.** {self.section.explained}")
         return "\n\n".join(parts)
 
@@ -94,7 +94,7 @@ class Page:
             f"standard deviation over the seeds. A *miss* is more than {100 * TOLERANCE:.0f} % worse than the paper.",
             "## Summary",
             f"{held} of {len(self.claims)} claims hold; {compared - len(misses)} of {compared} numbers are not a miss. "
-            f"A claim with – is about what others published of real images, which {EMBEDDED} data cannot tell.",
+            f"A claim with – is about what others published of real images, which {SYNTHETIC} data cannot tell.",
             markdown(
                 ["table or figure", "numbers", "median difference", "misses", "claims that hold"],
                 [_summary_row(entry) for entry in self.entries],

@@ -12,7 +12,7 @@ from typing import Any
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 
-from ghpt.commands.train import typed
+from ghpt.commands.train import shell_override
 from ghpt.config import build, plain
 from ghpt.paper.engine.cells import Cell
 
@@ -39,7 +39,7 @@ class Setup:
 
     conf: Path
     roots: Mapping[str, str | None]
-    """``human36m`` and ``panoptic``: folder of the real data set, None for the embedded one."""
+    """``human36m`` and ``panoptic``: folder of the real data set, None for the synthetic one."""
     overrides: Mapping[str, Sequence[str]]
     """``train``: of every training, in the words of train.py's command line; ``test``: of every
     test.
@@ -52,16 +52,16 @@ class Setup:
         return self.roots["human36m" if data == "h36m" else "panoptic"]
 
     def source(self, data: str) -> str:
-        """As metrics.json has it: ``embedded``, or the path of the real data."""
+        """As metrics.json has it: ``synthetic``, or the path of the real data."""
         root = self.root(data)
-        return "embedded" if root is None else str(Path(root).expanduser().resolve())
+        return "synthetic" if root is None else str(Path(root).expanduser().resolve())
 
     def words(self, data: str, *overrides: str) -> tuple[str, ...]:
         """What a command line says of the data and the seed."""
         root = self.root(data)
         return (
             f"data={data}",
-            *([] if root is None else [typed("data.root", root)]),
+            *([] if root is None else [shell_override("data.root", root)]),
             f"seed={self.seed}",
             *overrides,
         )
@@ -155,4 +155,4 @@ def _of_source(data: Mapping[str, Any]) -> dict[str, Any]:
 def _files(conf: Path, words: tuple[str, ...]) -> dict[str, Any]:
     """The key of each split: it changes when a file of the real data set does."""
     data = build(compose(conf, "test", words)["data"], "data")
-    return {split: data.key(split) for split in ("train", "validation", "test")}
+    return {split: data.cache_key(split) for split in ("train", "validation", "test")}

@@ -67,7 +67,7 @@ def _quantitative(results: Results) -> Section:
     ]
     header = ["MPJPE, mm", *(QUANTITATIVE_COLUMNS[action] for action in QUANTITATIVE), "Avg"]
     text = (
-        "The published rows are other systems' on real images. The embedded actions carry Human3.6M's names and are "
+        "The published rows are other systems' on real images. The synthetic actions carry Human3.6M's names and are "
         "synthetic motions: their numbers compare methods, not actions with the paper's."
     )
     mean = ours[-1].mean
@@ -89,7 +89,7 @@ def _quantitative(results: Results) -> Section:
 
 
 _ACTIONS = (
-    "Embedded motion and self-occlusion of an action are not those of the recorded one, so single actions differ in "
+    "Synthetic motion and self-occlusion of an action are not those of the recorded one, so single actions differ in "
     "both directions; the mean is what was fitted in its learning-free rows."
 )
 
@@ -153,7 +153,7 @@ def _explained_hypotheses(results: Results) -> str:
         for data in SELF
     )
     return (
-        "The embedded detector was fitted to the learning-free rows (random, average, best, worst; RANSAC on "
+        "The synthetic detector was fitted to the learning-free rows (random, average, best, worst; RANSAC on "
         "Human3.6M), so these agree by construction and the learned rows are results. There our scorer tells "
         f"hypotheses apart more sharply than the paper's: on Human3.6M *most* has {h36m['most']} mm, {h36m['least']} "
         f"mm has *least*; on Panoptic *stochastic* ({panoptic['stochastic']}) is better than *random* "
@@ -224,13 +224,13 @@ def _limitation(results: Results) -> Section:
         f"{train:.1f}, {validation:.1f}, {test:.1f} mm (13.8, 14.2, 29.1)",
     )
     note = (
-        "The embedded detector is twice as precise on training and validation subjects by design, for the paper's was "
+        "The synthetic detector is twice as precise on training and validation subjects by design, for the paper's was "
         "trained on them."
     )
     text = comparison(rows, "split of Human3.6M")
-    embedded = results.setup.root("h36m") is None
+    synthetic = results.setup.root("h36m") is None
     return Section(
-        results.words("h36m"), f"{text}\n\n{note}" if embedded else text, {}, rows, [claim]
+        results.words("h36m"), f"{text}\n\n{note}" if synthetic else text, {}, rows, [claim]
     )
 
 

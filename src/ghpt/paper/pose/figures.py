@@ -63,7 +63,9 @@ def _qualitative(results: Results) -> Section:
 
 def _relative_errors(chunk: PredictionChunk, name: str) -> Float[np.ndarray, " N"]:
     """Pelvis-relative MPJPE (mm) of each frame; NaN where a joint is missing."""
-    errors, counted = joint_errors(chunk.estimates[name], chunk.truth, chunk.truth_seen, "relative")
+    errors, counted = joint_errors(
+        chunk.estimates[name], chunk.truth, chunk.truth_valid, "relative"
+    )
     return torch.where(counted.all(-1), errors.mean(-1), torch.nan).numpy()
 
 

@@ -83,7 +83,7 @@ def _generalization(results: Results) -> Section:
     averages = [results.relative(f"{test} on {test}", "average").mean for test in PANOPTIC]
     weights = [results.relative(f"{a} on {b}").mean for a, b in product(ARRANGEMENTS, PANOPTIC)]
     explained = (
-        f"The pools differ: where the paper's plain average has 25.9 mm on Panoptic, the embedded one has "
+        f"The pools differ: where the paper's plain average has 25.9 mm on Panoptic, the synthetic one has "
         f"{min(averages):.1f} to {max(averages):.1f}, nearly all of it a difference in the definition of the joints "
         f"that no selection can remove; our learned numbers are {min(weights):.1f} to {max(weights):.1f} mm."
     )

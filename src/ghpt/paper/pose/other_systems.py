@@ -130,7 +130,7 @@ def _remelli(results: Results) -> Section:
 
 
 _EXPLAINED_LEVEL = (
-    "The level is that of the embedded Panoptic (see tab:generalization-evaluation); the drops, which this table is "
+    "The level is that of the synthetic Panoptic (see tab:generalization-evaluation); the drops, which this table is "
     "about, do not depend on it."
 )
 
@@ -204,7 +204,7 @@ def _sota(results: Results) -> Section:
     ]
     explained = (
         "The paper's RANSAC on Panoptic, 39.5 mm, is worse than the worst hypothesis of its own pools (31.0 mm), so it "
-        f"can hardly be of the same detections; on the embedded ones it has {ransac:.1f} mm."
+        f"can hardly be of the same detections; on the synthetic ones it has {ransac:.1f} mm."
     )
     data = four(results)
     body = f"{text}\n\n{markdown(['method', 'paper, mm', 'ours, mm', 'difference'], rows)}"

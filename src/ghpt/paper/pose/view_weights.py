@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from itertools import product
 
-from ghpt.models.selection import SELECTIONS
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.paper.engine.item import Claim, Item, Results, Section, signed
 from ghpt.paper.pose.generalization import PANOPTIC, four, grid
 from ghpt.paper.published import ARRANGEMENTS
@@ -19,7 +19,7 @@ DIGITS = 2
 def best_classical(results: Results, test: str) -> tuple[str, float]:
     """Name and error (mm) of the best classical estimator on a test set; it knows no training set."""
     cell = f"{test} on {test}"
-    learned = (*SELECTIONS, "view_weights")
+    learned = (*AGGREGATIONS, "view_weights")
     names = [
         name for name in results.read(cell, "metrics.json")[0]["selections"] if name not in learned
     ]

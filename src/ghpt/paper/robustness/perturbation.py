@@ -17,11 +17,11 @@ from torch import Tensor
 from ghpt.errors import check
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import vector_to_matrix
-from ghpt.models.estimators.classical import person_size
+from ghpt.models.estimators.classical import person_scale
 from ghpt.randomness import bits, key, uniform
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 
-Perturbation = Callable[[KeyPointBatch, int], KeyPointBatch]
+Perturbation = Callable[[Observations, int], Observations]
 
 
 @dataclass(frozen=True)
@@ -38,8 +38,8 @@ class Outliers:
     def __post_init__(self) -> None:
         _check_share(self.rate)
 
-    def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
-        draw = uniform(_keys(batch, seed, "outliers"), (batch.seen.shape[-1], 3))
+    def __call__(self, batch: Observations, seed: int) -> Observations:
+        draw = uniform(_keys(batch, seed, "outliers"), (batch.valid.shape[-1], 3))
         length = torch.where(
             draw[..., 0] < self.rate,
             self.shortest + (self.longest - self.shortest) * draw[..., 1],
@@ -57,8 +57,8 @@ class Noise:
 
     deviation: float
 
-    def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
-        draw = _normal(_keys(batch, seed, "noise"), (batch.seen.shape[-1], 2))
+    def __call__(self, batch: Observations, seed: int) -> Observations:
+        draw = _normal(_keys(batch, seed, "noise"), (batch.valid.shape[-1], 2))
         return _moved(batch, self.deviation * draw)
 
 
@@ -71,9 +71,9 @@ class MissingDetections:
     def __post_init__(self) -> None:
         _check_share(self.rate)
 
-    def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
-        draw = uniform(_keys(batch, seed, "missing detections"), (batch.seen.shape[-1],))
-        return replace(batch, seen=batch.seen & (draw >= self.rate))
+    def __call__(self, batch: Observations, seed: int) -> Observations:
+        draw = uniform(_keys(batch, seed, "missing detections"), (batch.valid.shape[-1],))
+        return replace(batch, valid=batch.valid & (draw >= self.rate))
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class MissingViews:
 
     count: int
 
-    def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
+    def __call__(self, batch: Observations, seed: int) -> Observations:
         gone = _order(batch, seed, "missing views").argsort(dim=-1) < self.count
-        return replace(batch, seen=batch.seen & ~gone[..., None])
+        return replace(batch, valid=batch.valid & ~gone[..., None])
 
 
 @dataclass(frozen=True)
@@ -93,11 +93,12 @@ class FewerCameras:
 
     count: int
 
-    def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
+    def __call__(self, batch: Observations, seed: int) -> Observations:
         chosen = _order(batch, seed, "cameras")[:, : self.count]
         row = torch.arange(len(batch), device=chosen.device)[:, None]
         kept = {
-            name: getattr(batch, name)[row, chosen] for name in ("key_points", "confidence", "seen")
+            name: getattr(batch, name)[row, chosen]
+            for name in ("key_points", "confidence", "valid")
         }
         return replace(batch, cameras=batch.cameras.index((row, chosen)), **kept)
 
@@ -110,7 +111,7 @@ class RotatedCameras:
 
     degrees: float
 
-    def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
+    def __call__(self, batch: Observations, seed: int) -> Observations:
         axis = _directions(_keys(batch, seed, "rotated cameras"))
         turn = vector_to_matrix(torch.deg2rad(torch.tensor(self.degrees, dtype=axis.dtype)) * axis)
         K = batch.cameras.K
@@ -125,7 +126,7 @@ class ShiftedCameras:
 
     millimetres: float
 
-    def __call__(self, batch: KeyPointBatch, seed: int) -> KeyPointBatch:
+    def __call__(self, batch: Observations, seed: int) -> Observations:
         shift = self.millimetres * _directions(_keys(batch, seed, "shifted cameras"))
         K = batch.cameras.K
         R = batch.cameras.R
@@ -137,26 +138,26 @@ def _check_share(rate: float) -> None:
     check(0 <= rate <= 1, "rate", f"is {rate}", "Give a share between 0 and 1.")
 
 
-def _keys(batch: KeyPointBatch, seed: int, purpose: str) -> Int[Tensor, "B V"]:
+def _keys(batch: Observations, seed: int, purpose: str) -> Int[Tensor, "B V"]:
     device = batch.sample.device
-    camera = torch.arange(batch.seen.shape[1], device=device)
+    camera = torch.arange(batch.valid.shape[1], device=device)
     return key(
         seed, purpose, *torch.broadcast_tensors(batch.sample[:, None], camera), device=device
     )
 
 
-def _order(batch: KeyPointBatch, seed: int, purpose: str) -> Int[Tensor, "B V"]:
+def _order(batch: Observations, seed: int, purpose: str) -> Int[Tensor, "B V"]:
     """A random order of each frame's views."""
     keys = key(seed, purpose, batch.sample, device=batch.sample.device)
-    return bits(keys, (batch.seen.shape[1],)).argsort(dim=-1)
+    return bits(keys, (batch.valid.shape[1],)).argsort(dim=-1)
 
 
-def _moved(batch: KeyPointBatch, offset: Float[Tensor, "B V J 2"]) -> KeyPointBatch:
+def _moved(batch: Observations, offset: Float[Tensor, "B V J 2"]) -> Observations:
     """Seen detections moved by ``offset``, in the person's size in the view."""
-    seen: Bool[Tensor, "B V J"] = batch.seen
-    size = person_size(batch.key_points, seen).to(offset.dtype)[..., None, None]
+    valid: Bool[Tensor, "B V J"] = batch.valid
+    size = person_scale(batch.key_points, valid).to(offset.dtype)[..., None, None]
     moved = (batch.key_points + size * offset).to(batch.key_points.dtype)
-    return replace(batch, key_points=torch.where(seen[..., None], moved, batch.key_points))
+    return replace(batch, key_points=torch.where(valid[..., None], moved, batch.key_points))
 
 
 def _normal(keys: Int[Tensor, "*B"], shape: tuple[int, ...]) -> Float[Tensor, "..."]:

@@ -12,11 +12,11 @@ import torch
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
+from ghpt.models.aggregation import aggregation_weights
 from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
-from ghpt.models.selection import selection_weights
 from ghpt.paper.engine.work import CHECKPOINT
-from ghpt.recording import KeyPointBatch, PoseEstimate
+from ghpt.recording import Observations, PoseEstimate
 from ghpt.report.poses import estimators
 from ghpt.skeleton import JOINTS
 
@@ -26,7 +26,7 @@ OF_POOL = ("weight", "average", "most", "best")
 LEARNED = (*OF_POOL, "view_weights")
 """Every estimator that is not classical."""
 
-Estimator = Callable[[KeyPointBatch], PoseEstimate]
+Estimator = Callable[[Observations], PoseEstimate]
 
 
 @torch.no_grad()
@@ -56,7 +56,7 @@ def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
                 )
                 for metric in metrics.values():
                     metric.update(
-                        estimate, batch.truth, batch.truth_seen, torch.zeros_like(batch.sample)
+                        estimate, batch.truth, batch.truth_valid, torch.zeros_like(batch.sample)
                     )
     content = [{name: _numbers(metrics) for name, metrics in errors.items()} for errors in levels]
     write_json(folder / "result.json", {"frames": len(frames), "levels": content})
@@ -64,17 +64,17 @@ def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
 
 def together(
     model: StochasticEstimator, others: Mapping[str, Estimator]
-) -> Callable[[KeyPointBatch], dict[str, PoseEstimate]]:
+) -> Callable[[Observations], dict[str, PoseEstimate]]:
     """The model's selections and the other estimators on a batch, by name."""
 
-    def estimate(batch: KeyPointBatch) -> dict[str, PoseEstimate]:
+    def estimate(batch: Observations) -> dict[str, PoseEstimate]:
         keys = model.keys("test", batch)
         pool = model.pool(batch, keys)
         weights = {
-            n: selection_weights(n, pool.logits, pool.errors, model.temperature, keys)
+            n: aggregation_weights(n, pool.logits, pool.errors, model.temperature, keys)
             for n in OF_POOL
         }
-        of_pool = {name: model.problem.combine(pool.hypotheses, w) for name, w in weights.items()}
+        of_pool = {name: model.problem.aggregate(pool.hypotheses, w) for name, w in weights.items()}
         return of_pool | {name: estimator(batch) for name, estimator in others.items()}
 
     return estimate

@@ -5,13 +5,13 @@ import torch
 
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.estimators.flips import Swaps, undo_swaps
+from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.ransac import AdaptiveRansac
 from ghpt.skeleton import MIRROR
 from scenes import random_scene
 
 ROBUST = AdaptiveRansac(threshold=0.02, pairs=24, seed=0, adapt=5.0, quantile=0.55, rounds=4)
-SWAPS = Swaps(ROBUST, scale=0.04, gain=6.0, rounds=3, views=4)
+SWAPS = LeftRightFlips(ROBUST, scale=0.04, gain=6.0, rounds=3, views=4)
 
 
 def good(views=4, frames=300):
@@ -19,9 +19,9 @@ def good(views=4, frames=300):
     return scene.noisy(4, 0).batch()
 
 
-def swapped(batch, share=0.05):
+def flipped(batch, share=0.05):
     """At most one view of a frame with its sides exchanged, ``share`` of all views."""
-    frames, views, _ = batch.seen.shape
+    frames, views, _ = batch.valid.shape
     generator = torch.Generator().manual_seed(0)
     hit = torch.rand(frames, 1, generator=generator) < share * views
     hit = hit & (torch.randint(views, (frames, 1), generator=generator) == torch.arange(views))
@@ -34,8 +34,8 @@ def swapped(batch, share=0.05):
 @pytest.mark.parametrize(("views", "share"), [(3, 0.98), (4, 0.98), (7, 0.98)])
 def test_nearly_all_swaps_are_found_and_nearly_none_invented(views, share):
     batch = good(views)
-    bad, hit = swapped(batch)
-    mended, found = undo_swaps(bad, SWAPS)
+    bad, hit = flipped(batch)
+    mended, found = undo_flips(bad, SWAPS)
     assert (found & hit).sum() >= share * hit.sum()
     assert (found & ~hit).sum() <= 0.005 * (~hit).sum()
     right = (found == hit).all(1)
@@ -49,7 +49,7 @@ def test_nearly_all_swaps_are_found_and_nearly_none_invented(views, share):
 
 def test_good_views_stay_as_they_are():
     batch = good()
-    mended, found = undo_swaps(batch, SWAPS)
+    mended, found = undo_flips(batch, SWAPS)
     assert found.double().mean() <= 0.001
     assert (ROBUST(mended).points - batch.truth).norm(dim=-1).mean() <= (
         ROBUST(batch).points - batch.truth
@@ -57,37 +57,37 @@ def test_good_views_stay_as_they_are():
 
 
 def test_two_views_cannot_tell():
-    bad, _ = swapped(good(2, 50), share=0.3)
-    mended, found = undo_swaps(bad, SWAPS)
+    bad, _ = flipped(good(2, 50), share=0.3)
+    mended, found = undo_flips(bad, SWAPS)
     assert not found.any()
     assert torch.equal(mended.key_points, bad.key_points)
 
 
 def test_what_is_not_seen_moves_with_its_key_point():
-    bad, hit = swapped(good())
-    seen = bad.seen.clone()
+    bad, hit = flipped(good())
+    valid = bad.valid.clone()
     frame, view = (int(x[0]) for x in torch.nonzero(hit, as_tuple=True))
-    seen[frame, view, 0] = False
+    valid[frame, view, 0] = False
     confidence = bad.confidence.clone()
     confidence[frame, view, 1] = 0.25
-    mended, found = undo_swaps(replace(bad, seen=seen, confidence=confidence), SWAPS)
+    mended, found = undo_flips(replace(bad, valid=valid, confidence=confidence), SWAPS)
     assert found[frame, view]
-    assert not mended.seen[frame, view, MIRROR[0]]
-    assert mended.seen[frame, view, 0]
+    assert not mended.valid[frame, view, MIRROR[0]]
+    assert mended.valid[frame, view, 0]
     assert mended.confidence[frame, view, MIRROR[1]] == 0.25
 
 
 def test_the_order_of_the_views_is_nothing():
-    bad, _ = swapped(good(5, 60))
+    bad, _ = flipped(good(5, 60))
     order = torch.tensor([3, 1, 4, 0, 2])
     cameras = Cameras(*(x[:, order] for x in (bad.cameras.K, bad.cameras.R, bad.cameras.t)))
-    fields = {name: getattr(bad, name)[:, order] for name in ("key_points", "confidence", "seen")}
+    fields = {name: getattr(bad, name)[:, order] for name in ("key_points", "confidence", "valid")}
     assert torch.equal(
-        undo_swaps(replace(bad, cameras=cameras, **fields), SWAPS)[1],
-        undo_swaps(bad, SWAPS)[1][:, order],
+        undo_flips(replace(bad, cameras=cameras, **fields), SWAPS)[1],
+        undo_flips(bad, SWAPS)[1][:, order],
     )
 
 
 def test_impossible_settings_are_refused():
     with pytest.raises(GhptConfigError):
-        Swaps(ROBUST, scale=0.0, gain=6.0, rounds=3, views=4)
+        LeftRightFlips(ROBUST, scale=0.0, gain=6.0, rounds=3, views=4)

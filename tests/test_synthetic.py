@@ -9,7 +9,7 @@ import torch
 import yaml
 
 from ghpt.data.synthetic.detector import Detector
-from ghpt.data.synthetic.recordings import HUMAN36M_SUBJECTS, embedded_recordings
+from ghpt.data.synthetic.recordings import HUMAN36M_SUBJECTS, synthetic_recordings
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import project
 from ghpt.skeleton import BONES, JOINT
@@ -23,7 +23,7 @@ DETECTOR = {
 
 def first(data: str, split: str = "test", seed: int = 0, count: int = 1, cameras=None):
     detector = DETECTOR["human36m" if data == "h36m" else "panoptic"]
-    return list(islice(embedded_recordings(data, split, seed, detector, cameras), count))
+    return list(islice(synthetic_recordings(data, split, seed, detector, cameras), count))
 
 
 @pytest.fixture(scope="module")
@@ -41,11 +41,11 @@ def test_recordings_are_complete(human36m):
             == recording.truth.dtype
             == np.float32
         )
-        assert recording.seen.dtype == recording.truth_seen.dtype == bool
+        assert recording.valid.dtype == recording.truth_valid.dtype == bool
         assert np.isfinite(recording.key_points).all()
-        assert recording.truth_seen.all()
-        assert recording.seen.sum(axis=1).min() >= 0
-        assert (recording.seen.sum(axis=1) >= 2).mean() > 0.97
+        assert recording.truth_valid.all()
+        assert recording.valid.sum(axis=1).min() >= 0
+        assert (recording.valid.sum(axis=1) >= 2).mean() > 0.97
         assert ((recording.confidence >= 0) & (recording.confidence <= 1)).all()
     assert [r.name for r in human36m] == ["S9/Directions-1", "S9/Directions-2", "S9/Discussion-1"]
 
@@ -53,7 +53,7 @@ def test_recordings_are_complete(human36m):
 def test_key_points_are_near_the_projected_truth(human36m):
     for recording in human36m + first("cmu3"):
         ideal, _ = project(recording.cameras, torch.from_numpy(recording.truth).double())
-        error = np.linalg.norm(recording.key_points - ideal.numpy(), axis=-1)[recording.seen]
+        error = np.linalg.norm(recording.key_points - ideal.numpy(), axis=-1)[recording.valid]
         assert 1.0 < np.median(error) < 12.0
         assert np.mean(error > 100) < 0.01
 
@@ -125,7 +125,7 @@ def test_people_stand_on_panoptics_floor_with_y_down():
 )
 def test_bad_choices_are_named_at_once(data, split, cameras, error, word):
     with pytest.raises(error, match=word):
-        embedded_recordings(data, split, 0, DETECTOR["panoptic"], cameras)
+        synthetic_recordings(data, split, 0, DETECTOR["panoptic"], cameras)
 
 
 def test_the_learning_free_rows_of_the_paper_come_out():

@@ -4,7 +4,12 @@ import torch
 
 from ghpt import randomness
 from ghpt.errors import GhptConfigError
-from ghpt.models.selection import SELECTIONS, limit_spread, selection_weights, softmax_weights
+from ghpt.models.aggregation import (
+    AGGREGATIONS,
+    aggregation_weights,
+    cap_logit_std,
+    softmax_weights,
+)
 
 
 def pool(items=50, count=40):
@@ -13,23 +18,23 @@ def pool(items=50, count=40):
     return logits, errors, randomness.key(0, "pool", torch.arange(items))
 
 
-@pytest.mark.parametrize("name", SELECTIONS)
+@pytest.mark.parametrize("name", AGGREGATIONS)
 def test_weights_sum_to_one_and_do_not_depend_on_batch_mates(name):
     logits, errors, keys = pool()
-    weights = selection_weights(name, logits, errors, 1.5, keys)
+    weights = aggregation_weights(name, logits, errors, 1.5, keys)
     torch.testing.assert_close(weights.sum(-1), torch.ones(len(logits)))
     for i in (0, 7):
         one = slice(i, i + 1)
         assert torch.equal(
-            selection_weights(name, logits[one], errors[one], 1.5, keys[one]), weights[one]
+            aggregation_weights(name, logits[one], errors[one], 1.5, keys[one]), weights[one]
         )
 
 
-@pytest.mark.parametrize("name", SELECTIONS)
+@pytest.mark.parametrize("name", AGGREGATIONS)
 def test_selected_error_lies_between_best_and_worst(name):
     logits, errors, keys = pool()
     expected = {
-        n: (selection_weights(n, logits, errors, 1.5, keys) * errors).sum(-1)
+        n: (aggregation_weights(n, logits, errors, 1.5, keys) * errors).sum(-1)
         for n in (name, "best", "worst")
     }
     torch.testing.assert_close(expected["best"], errors.amin(-1))
@@ -40,7 +45,7 @@ def test_selected_error_lies_between_best_and_worst(name):
 
 def test_most_and_least_are_the_extreme_logits():
     logits, errors, keys = pool()
-    most, least = (selection_weights(n, logits, errors, 1.0, keys) for n in ("most", "least"))
+    most, least = (aggregation_weights(n, logits, errors, 1.0, keys) for n in ("most", "least"))
     assert torch.equal(most.argmax(-1), logits.argmax(-1))
     assert torch.equal(least.argmax(-1), logits.argmin(-1))
 
@@ -49,10 +54,10 @@ def test_temperature_limits():
     logits, errors, keys = pool()
     cold, hot = softmax_weights(logits, 1e-4), softmax_weights(logits, 1e6)
     torch.testing.assert_close(
-        cold, selection_weights("most", logits, errors, 1.0, keys), atol=1e-3, rtol=0
+        cold, aggregation_weights("most", logits, errors, 1.0, keys), atol=1e-3, rtol=0
     )
     torch.testing.assert_close(
-        hot, selection_weights("average", logits, errors, 1.0, keys), atol=1e-5, rtol=0
+        hot, aggregation_weights("average", logits, errors, 1.0, keys), atol=1e-5, rtol=0
     )
 
 
@@ -64,7 +69,7 @@ def test_stochastic_follows_the_weights_and_random_is_uniform():
         ("stochastic", torch.softmax(logits[0] / 1.5, -1)),
         ("random", torch.full((count,), 0.25)),
     ):
-        share = selection_weights(name, logits, -logits, 1.5, keys).mean(0)
+        share = aggregation_weights(name, logits, -logits, 1.5, keys).mean(0)
         assert (share - expected).abs().max() < 4 * np.sqrt(0.25 / draws)
 
 
@@ -82,18 +87,18 @@ def test_gumbel_noise_draws_from_the_softmax():
 def test_unknown_selection_says_what_exists():
     logits, errors, keys = pool(2, 3)
     with pytest.raises(GhptConfigError, match="weight, average"):
-        selection_weights("mean", logits, errors, 1.0, keys)
+        aggregation_weights("mean", logits, errors, 1.0, keys)
 
 
 def test_a_limited_spread_keeps_the_order_and_small_differences():
     logits, _, _ = pool()
-    wide, narrow = limit_spread(100 * logits, 1.0), limit_spread(0.01 * logits, 1.0)
+    wide, narrow = cap_logit_std(100 * logits, 1.0), cap_logit_std(0.01 * logits, 1.0)
     torch.testing.assert_close(wide.std(-1, correction=0), torch.ones(len(logits)))
     assert torch.equal(wide.argsort(-1), logits.argsort(-1))
     torch.testing.assert_close(
         narrow.diff(dim=-1), 0.01 * logits.diff(dim=-1), atol=1e-6, rtol=1e-4
     )
-    assert torch.equal(limit_spread(logits, None), logits)
+    assert torch.equal(cap_logit_std(logits, None), logits)
     one = torch.zeros(3, 1, requires_grad=True)
-    limit_spread(one, 1.0).sum().backward()
+    cap_logit_std(one, 1.0).sum().backward()
     assert torch.isfinite(one.grad).all()

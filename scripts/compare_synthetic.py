@@ -1,7 +1,7 @@
-"""Set the embedded motion and detector beside real ones, as the Markdown tables of
-docs/embedded.md.
+"""Set the synthetic motion and detector beside real ones, as the Markdown tables of
+docs/synthetic.md.
 
-    python scripts/compare_embedded.py [--shared ../shared/data]
+    python scripts/compare_synthetic.py [--shared ../shared/data]
 
 Only summary numbers of the real recordings are derived; nothing of them is copied.
 """
@@ -24,11 +24,11 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
 from ghpt.data.synthetic.detector import Detector
-from ghpt.data.synthetic.recordings import embedded_recordings, takes
+from ghpt.data.synthetic.recordings import synthetic_recordings, takes
 from ghpt.geometry import lens
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.models.estimators.classical import MEstimator
-from ghpt.recording import KeyPointBatch
+from ghpt.recording import Observations
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -168,10 +168,10 @@ def caliscope(shared: Path) -> Detected:
         )
         raw[at] = float(line["img_loc_x"]), float(line["img_loc_y"])
     sizes = np.array([entry["size"] for entry in entries])[:, None]
-    seen = ((raw >= 0) & (raw <= sizes - 1)).all(axis=-1)
+    valid = ((raw >= 0) & (raw <= sizes - 1)).all(axis=-1)
     rotations = np.array([entry["rotation"] for entry in entries])
     return _undistorted(
-        entries, rotations, np.nan_to_num(raw), np.ones(seen.shape), seen, 30.0, False
+        entries, rotations, np.nan_to_num(raw), np.ones(valid.shape), valid, 30.0, False
     )
 
 
@@ -180,7 +180,7 @@ def _undistorted(
     rotations: np.ndarray,
     raw: np.ndarray,
     confidence: np.ndarray,
-    seen: np.ndarray,
+    valid: np.ndarray,
     rate_hz: float,
     confident: bool,
 ) -> Detected:
@@ -194,7 +194,7 @@ def _undistorted(
         x.unflatten(1, pixels.shape[1:3]).transpose(0, 1).numpy() for x in (undone, exists)
     )
     cameras = Cameras(K, torch.from_numpy(rotations), 1000.0 * t)
-    return Detected(rate_hz, cameras, [(undone, confidence, seen & exists)], confident)
+    return Detected(rate_hz, cameras, [(undone, confidence, valid & exists)], confident)
 
 
 def embedded_detections(data: str) -> Detected:
@@ -203,14 +203,14 @@ def embedded_detections(data: str) -> Detected:
     columns = [JOINT[name] for name in COMMON]
     some = [
         r
-        for i, r in enumerate(embedded_recordings(data, "test", 0, detector))
+        for i, r in enumerate(synthetic_recordings(data, "test", 0, detector))
         if data != "h36m" or i % 4 == 0
     ]
     some = [
         recording for recording in some if recording.subject == some[0].subject or data != "h36m"
     ]
     clips = [
-        (r.key_points[:, :, columns], r.confidence[:, :, columns], r.seen[:, :, columns])
+        (r.key_points[:, :, columns], r.confidence[:, :, columns], r.valid[:, :, columns])
         for r in some
     ]
     return Detected(some[0].rate_hz, some[0].cameras, clips, True)
@@ -265,11 +265,11 @@ def detector_rows(detected: Detected) -> dict[str, str]:
     """
     errors, ranks, seen_share = [], [], []
     pairs: dict[float, list[np.ndarray]] = {0.1: [], 0.5: [], 1.0: []}
-    for key_points, confidence, seen in detected.clips:
-        residual = _residual(detected.cameras, key_points, confidence, seen)
+    for key_points, confidence, valid in detected.clips:
+        residual = _residual(detected.cameras, key_points, confidence, valid)
         length = np.linalg.norm(residual, axis=-1)
         errors.append(length[np.isfinite(length)])
-        seen_share.append(seen)
+        seen_share.append(valid)
         limit = np.nanpercentile(np.abs(residual), 95)
         for seconds, found in pairs.items():
             lag = round(seconds * detected.rate_hz)
@@ -299,19 +299,19 @@ def detector_rows(detected: Detected) -> dict[str, str]:
 
 
 def _residual(
-    cameras: Cameras, key_points: np.ndarray, confidence: np.ndarray, seen: np.ndarray
+    cameras: Cameras, key_points: np.ndarray, confidence: np.ndarray, valid: np.ndarray
 ) -> np.ndarray:
     """T V J 2 in statures; NaN where not seen or seen in fewer than 3 views."""
     frames, joints = len(key_points), key_points.shape[2]
-    batch = KeyPointBatch(
+    batch = Observations(
         sample=torch.arange(frames),
         recording=torch.zeros(frames, dtype=torch.int64),
         cameras=Cameras(*(x.expand(frames, *x.shape) for x in (cameras.K, cameras.R, cameras.t))),
         key_points=torch.from_numpy(key_points),
         confidence=torch.from_numpy(confidence),
-        seen=torch.from_numpy(seen),
+        valid=torch.from_numpy(valid),
         truth=torch.zeros(frames, joints, 3),
-        truth_seen=torch.zeros(frames, joints, dtype=torch.bool),
+        truth_valid=torch.zeros(frames, joints, dtype=torch.bool),
     )
     points = MEstimator(loss="geman_mcclure", scale=0.01, iterations=50, tolerance=0.1)(
         batch
@@ -330,7 +330,7 @@ def _residual(
     focal = (cameras.K[:, 0, 0] * cameras.K[:, 1, 1]).sqrt()
     size = (focal * stature / shoulders).numpy()[..., None, None]
     residual = (key_points - pixels.numpy()) / size
-    return np.where((seen & (seen.sum(axis=1, keepdims=True) >= 3))[..., None], residual, np.nan)
+    return np.where((valid & (valid.sum(axis=1, keepdims=True) >= 3))[..., None], residual, np.nan)
 
 
 def _percentiles(values: np.ndarray, at: tuple[int, ...], digits: int) -> str:
@@ -361,15 +361,15 @@ def main() -> None:
     motions = {
         "CMU mocap": cmu_mocap(shared),
         "Panoptic 171026_pose3": range_of_motion(shared),
-        "embedded h36m": embedded_motion("h36m"),
-        "embedded panoptic": embedded_motion("cmu3"),
+        "synthetic h36m": embedded_motion("h36m"),
+        "synthetic panoptic": embedded_motion("cmu3"),
     }
     print(markdown({name: motion_rows(motion) for name, motion in motions.items()}), end="\n\n")
     detections = {
         "OpenPose (pose2sim_single)": pose2sim(shared),
         "MediaPipe (caliscope)": caliscope(shared),
-        "embedded h36m": embedded_detections("h36m"),
-        "embedded cmu3": embedded_detections("cmu3"),
+        "synthetic h36m": embedded_detections("h36m"),
+        "synthetic cmu3": embedded_detections("cmu3"),
     }
     print(markdown({name: detector_rows(detected) for name, detected in detections.items()}))
 

@@ -10,23 +10,26 @@ from torch import Tensor
 from ghpt import randomness
 from ghpt.errors import GhptConfigError
 
-SELECTIONS = ("weight", "average", "most", "least", "stochastic", "random", "best", "worst")
+AGGREGATIONS = ("weight", "average", "most", "least", "stochastic", "random", "best", "worst")
 """Names as in metrics.json; best and worst look at the truth and are not available in use."""
 
 
-def limit_spread(logits: Float[Tensor, "B H"], spread: float | None) -> Float[Tensor, "B H"]:
-    """Centre each pool's logits and shrink them where their standard deviation exceeds ``spread``
-    (None: as they are).
+def cap_logit_std(
+    logits: Float[Tensor, "B H"], logit_std_cap: float | None
+) -> Float[Tensor, "B H"]:
+    """Centre each pool's logits and shrink them where their standard deviation exceeds
+    ``logit_std_cap`` (None: as they are).
 
     Not in the paper, whose scores lie between 0 and 1 and so cannot differ much either. Without a
     limit the weights collapse onto one or two hypotheses, and a scorer is surest of itself on poses
     unlike those that it was trained on.
     """
-    if spread is None:
+    if logit_std_cap is None:
         return logits
     centred = logits - logits.mean(dim=-1, keepdim=True)
     return centred * (
-        spread / centred.square().mean(dim=-1, keepdim=True).clamp_min(spread**2).sqrt()
+        logit_std_cap
+        / centred.square().mean(dim=-1, keepdim=True).clamp_min(logit_std_cap**2).sqrt()
     )
 
 
@@ -39,14 +42,14 @@ def softmax_weights(
     return torch.softmax((logits if noise is None else logits + noise) / temperature, dim=-1)
 
 
-def selection_weights(
+def aggregation_weights(
     name: str,
     logits: Float[Tensor, "B H"],
     errors: Float[Tensor, "B H"],
     temperature: float,
     keys: Int[Tensor, " B"],
 ) -> Float[Tensor, "B H"]:
-    """Weights that sum to 1 over the pool and, given to ``Problem.combine``, make the named
+    """Weights that sum to 1 over the pool and, given to ``Problem.aggregate``, make the named
     selection.
 
     ``errors`` is used by best and worst alone, ``keys`` by stochastic and random.
@@ -66,6 +69,6 @@ def selection_weights(
         index = scores.argmax(dim=-1) if name in ("most", "best") else scores.argmin(dim=-1)
     else:
         raise GhptConfigError(
-            "selection", f"{name!r} is unknown", f"Existing: {', '.join(SELECTIONS)}."
+            "selection", f"{name!r} is unknown", f"Existing: {', '.join(AGGREGATIONS)}."
         )
     return F.one_hot(index, count).to(logits.dtype)
