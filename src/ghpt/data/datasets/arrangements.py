@@ -13,7 +13,7 @@ from ghpt.data.datasets.store import file_stamps
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import synthetic_recordings
 from ghpt.errors import GhptDataError, check
-from ghpt.recording import Recording
+from ghpt.observations import Recording
 
 
 class Synthetic(TypedDict):

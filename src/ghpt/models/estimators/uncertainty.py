@@ -12,7 +12,7 @@ from ghpt.errors import check
 from ghpt.geometry.normal_equations import local_cameras, minors, products, views_of, weighted_sum
 from ghpt.geometry.triangulation import flat_cameras
 from ghpt.models.estimators.classical import person_scale
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 
 @dataclass(frozen=True)

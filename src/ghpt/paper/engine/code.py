@@ -21,7 +21,7 @@ DECIDES = (
     "metrics",
     "calibration",
     "randomness.py",
-    "recording.py",
+    "observations.py",
     "skeleton.py",
     "commands/train.py",
     "commands/test.py",
