@@ -11,7 +11,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.pose.evaluation import evaluate
 from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
-from ghpt.observations import PoseEstimate, Recording
+from ghpt.observations import PoseEstimate, Recording, Truth
 from ghpt.report import figures
 from ghpt.report.tensorboard import SHOWN, write_events
 from ghpt.skeleton import JOINT, JOINTS, PELVIS
