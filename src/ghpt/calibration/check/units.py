@@ -50,8 +50,8 @@ def decide_unit(
     if cameras.unit_known or cameras.t is None:
         return cameras
     found = estimator.triangulate(batch)
-    placed = found.placed
-    explained = _EXPLAINS.explained(batch, found.points, found.placed)
+    placed = found.has_position
+    explained = _EXPLAINS.explained(batch, found.points, found.has_position)
     if float(explained.sum()) < _AGREE * float(placed.sum()):
         return cameras
     height = float(stature(found.points, explained)) / cameras.unit_mm
