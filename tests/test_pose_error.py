@@ -82,9 +82,7 @@ def test_zero_where_it_should_be():
     moved = PoseEstimate(truth.points + torch.tensor([5.0, 7.0, -9.0]), everywhere)
     similar = PoseEstimate(0.5 * truth.points.double() @ turn.mT + 77, everywhere)
     assert joint_errors(moved, truth, "absolute")[0].min() > 12
-    assert (
-        joint_errors(moved, truth, "relative")[0].max() < 1e-3
-    )  # the float32 of the input
+    assert joint_errors(moved, truth, "relative")[0].max() < 1e-3  # the float32 of the input
     assert joint_errors(similar, truth, "relative")[0][:, SIX_JOINTS].mean() > 100
     assert joint_errors(similar, truth, "aligned")[0].max() < 1e-6
 
@@ -106,14 +104,10 @@ def test_frames_that_fix_no_frame_do_not_count():
     estimate, truth, _ = frames(4, missing=0.0)
     no_pelvis = estimate.estimated.clone()
     no_pelvis[:, PELVIS] = False
-    assert not joint_errors(
-        PoseEstimate(estimate.points, no_pelvis), truth, "relative"
-    )[1].any()
+    assert not joint_errors(PoseEstimate(estimate.points, no_pelvis), truth, "relative")[1].any()
     two = torch.zeros_like(truth.valid)
     two[:, :2] = True
-    errors, counted = joint_errors(
-        PoseEstimate(estimate.points, two), truth, "aligned"
-    )
+    errors, counted = joint_errors(PoseEstimate(estimate.points, two), truth, "aligned")
     assert not counted.any()
     assert (errors == 0).all()
 
@@ -122,9 +116,7 @@ def test_three_joints_are_enough_to_align():
     estimate, truth, _ = frames(1, missing=0.0)
     three = torch.zeros_like(truth.valid)
     three[:, [2, 9, 16]] = True
-    errors, counted = joint_errors(
-        PoseEstimate(estimate.points, three), truth, "aligned"
-    )
+    errors, counted = joint_errors(PoseEstimate(estimate.points, three), truth, "aligned")
     assert torch.equal(counted, three)
     assert errors[three].max() > 1  # the noise has changed the triangle's shape
 

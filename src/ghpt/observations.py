@@ -180,10 +180,7 @@ class PairTruth(Batch):
 
     def relative_pose(self) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:
         """Return R and t (mm) of ``x_b = R x_a + t``."""
-        a = self.cameras.index((slice(None), 0))
-        b = self.cameras.index((slice(None), 1))
-        R = b.R @ a.R.mT
-        return R, b.t - (R @ a.t[..., None])[..., 0]
+        return self.cameras.relative_pose(0, 1)
 
 
 def select_views(

@@ -64,7 +64,7 @@ class ViewWeights(Baseline):
         batch, if that is known.
         """
         robust = robust or self.consensus.triangulate(batch)
-        views, _ = self.consensus.inlier_views(batch, robust.points, robust.placed)
+        views, _ = self.consensus.inlier_views(batch, robust.points, robust.has_position)
         agreed = replace(batch, valid=views)
         pool = self.model.sample(agreed, "view weights")
         weights = pool.weights().double()
