@@ -145,7 +145,6 @@ def test_uneven_processes_give_the_number_of_one(kind):
 def test_nothing_to_average_is_nan():
     metric = MPJPE("absolute", 1, 17)
     nowhere, no_points = torch.zeros(0, 17, dtype=torch.bool), torch.zeros(0, 17, 3)
-    metric.update(
-        PoseEstimate(no_points, nowhere), no_points, nowhere, torch.zeros(0, dtype=torch.int64)
-    )
+    estimate = PoseEstimate(no_points, nowhere)
+    metric.update(estimate, Truth(no_points, nowhere), torch.zeros(0, dtype=torch.int64))
     assert metric.compute().mean.isnan()
