@@ -17,7 +17,7 @@ from ghpt.data.formats.stored_npz import Member, add_member, members_of, read_ro
 from ghpt.errors import GhptDataError
 from ghpt.export.stream import PIECE, Chunks, pieces
 from ghpt.files import atomic_write
-from ghpt.reconstruction import About, Reconstruction, State
+from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
 
 FORMAT_VERSION = 2
 _POINTS = {1: "<f4", 2: "<f8"}
@@ -26,6 +26,8 @@ _HINT = "Predict this recording again, or copy the file again"
 _TEXTS = ("meta", "joints", "camera_names")
 
 
+_FIELDS = {"swapped": "flipped"}
+"""The fields of ``Reconstruction`` whose arrays have another name in the file."""
 _Layout = dict[str, tuple[str, tuple[int, ...]]]
 
 
@@ -81,12 +83,12 @@ def _meta(about: About) -> dict[str, Any]:
     return (
         meta
         | {field: getattr(about, field) for field in plain}
-        | {"states": {s.name.lower(): int(s) for s in State}}
+        | {"states": {s.name.lower(): int(s) for s in FILE_STATES}}
     )
 
 
 def _masked(piece: Reconstruction) -> dict[str, torch.Tensor]:
-    values = {name: getattr(piece, name).cpu() for name in _layout(1, 1)}
+    values = {name: getattr(piece, _FIELDS.get(name, name)).cpu() for name in _layout(1, 1)}
     observed = values["state"] == State.OBSERVED
     values["points"] = torch.where(
         (values["state"] <= State.FILLED)[..., None], values["points"], torch.nan
@@ -178,11 +180,11 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
 
 def _read(path: Path, members: dict[str, Member], start: int, stop: int) -> Reconstruction:
     rows = {
-        name: torch.from_numpy(read_rows(path, members[name], start, stop))
+        _FIELDS.get(name, name): torch.from_numpy(read_rows(path, members[name], start, stop))
         for name in _layout(1, 1)
     }
     state = rows["state"]
-    if ((state < 0) | (state > max(State))).any():
+    if ((state < 0) | (state > max(FILE_STATES))).any():
         raise GhptDataError(path, "state", "holds a number that is no state", _HINT)
     placed = (state <= State.FILLED)[..., None].expand_as(rows["points"])
     if not rows["points"][placed].isfinite().all():

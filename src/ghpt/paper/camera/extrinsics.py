@@ -40,8 +40,7 @@ Extrinsics = tuple[Float[Tensor, "V 3 3"], Float[Tensor, "V 3"]]
 
 def relative(cameras: Cameras) -> Extrinsics:
     """The cameras as poses after the first one."""
-    R = cameras.R @ cameras.R[0].mT
-    return R, cameras.t - (R @ cameras.t[0, :, None])[..., 0]
+    return cameras.relative_pose(0, slice(None))
 
 
 def replaced(truth: Cameras, estimate: Extrinsics, use_R: bool, use_t: bool) -> Cameras:
