@@ -14,10 +14,9 @@ from ghpt.data.datasets.frames import Frames
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.aggregation import aggregation_weights, cap_logit_std
-from ghpt.models.checkpoint import load_model
+from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.problem import PoseHypotheses
-from ghpt.paper.engine.actions import CHECKPOINT
 from ghpt.recording import Observations
 from ghpt.skeleton import JOINTS
 
@@ -33,7 +32,7 @@ def evaluate(config: dict[str, Any], dependencies: dict[str, Path], folder: Path
     result.json: set -> for each setting selection -> pelvis-relative MPJPE (mm). A smaller pool is
     the beginning of a larger one, the same that test.py draws with so many hypotheses.
     """
-    model, _ = load_model(dependencies["model"] / CHECKPOINT, seed=config["seed"])
+    model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
     model.eval()
     settings = [(h or model.hypotheses, t or model.temperature) for h, t in config["settings"]]
     result = {}
