@@ -11,8 +11,8 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import Row, form_equations, solve_symmetric, weighted_sum
+from ghpt.geometry.state import State
 from ghpt.geometry.triangulation import (
-    Status,
     System,
     Triangulation,
     flat_cameras,
@@ -91,7 +91,7 @@ class _Iteration:
         result = robust.with_fallback(linear.ok & robust.ok, linear)
         converged = robust.ok & (step <= self.tolerance)
         unsettled = linear.ok & ~converged
-        status = result.status.masked_fill(unsettled, int(Status.NOT_CONVERGED))
+        status = result.status.masked_fill(unsettled, int(State.NOT_CONVERGED))
         return replace(result, status=status)
 
     def _reweight(

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
@@ -30,6 +29,7 @@ from ghpt.geometry.normal_equations import (
     view_equations,
     weighted_sum,
 )
+from ghpt.geometry.state import State
 
 NO_DEPTH = 1e-9
 """A depth below this fraction of |t| is rounding: the rays met in the camera's own centre."""
@@ -39,30 +39,6 @@ _ONE_CENTRE = 1e-12
 
 _AT_ONCE = 2**15
 """Key points that are worked on at once: few enough to stay in a processor's cache."""
-
-
-class Status(IntEnum):
-    """Why a joint has no point.
-
-    It is the first that applies, in the order NONFINITE_INPUT, FEW_VIEWS, PARALLEL, BEHIND,
-    NOT_CONVERGED.
-    """
-
-    OK = 0
-    FEW_VIEWS = 1
-    """Fewer than two views are used."""
-    PARALLEL = 2
-    """The used rays do not fix a point: parallel, along their baseline, or from one and the same
-    centre.
-    """
-    BEHIND = 3
-    """The point is not in front of every used camera."""
-    NONFINITE_INPUT = 4
-    """A used key point, weight or camera is not finite, absurdly large (``LARGEST``) or not a
-    camera at all (R not a rotation, focal length not positive).
-    """
-    NOT_CONVERGED = 5
-    """An iterative estimator stopped at its limit; the point is its last."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +51,7 @@ class Triangulation:
     points: Float[Tensor, "*B J 3"]
     """World frame, mm, float64; 0 where not ``ok``."""
     status: Int8[Tensor, "*B J"]
+    """Values of ``State``."""
     angle: Float[Tensor, "*B J"]
     """Radians in [0, pi/2]: the arc sine of the root mean square, over the pairs of used views, of
     the sine between their rays. For two views it is the (acute) angle between the two rays.
@@ -87,12 +64,12 @@ class Triangulation:
 
     @property
     def ok(self) -> Bool[Tensor, "*B J"]:
-        return self.status == Status.OK
+        return self.status == State.OBSERVED
 
     @property
-    def placed(self) -> Bool[Tensor, "*B J"]:
-        """The joints that have a point."""
-        return self.ok | (self.status == Status.NOT_CONVERGED)
+    def has_position(self) -> Bool[Tensor, "*B J"]:
+        """The joints that have a point: those that are ``ok`` or did not converge."""
+        return self.status <= State.FILLED
 
     def with_rows(self, rows: Int[Tensor, " b"], part: Triangulation) -> Triangulation:
         """Return a copy with ``part`` in these rows of the first dimension."""
@@ -269,14 +246,14 @@ class System:
         parallel = torch.isinf(cond) | _share_centre(self.local, distance, used)
         # the last of these that applies
         status = torch.zeros_like(count, dtype=torch.int8)
-        status = status.masked_fill(behind, int(Status.BEHIND))
-        status = status.masked_fill(parallel, int(Status.PARALLEL))
-        status = status.masked_fill(count < 2, int(Status.FEW_VIEWS))
-        status = status.masked_fill(rejected, int(Status.NONFINITE_INPUT))
-        ok = status == Status.OK
+        status = status.masked_fill(behind, int(State.BEHIND))
+        status = status.masked_fill(parallel, int(State.PARALLEL))
+        status = status.masked_fill(count < 2, int(State.FEW_VIEWS))
+        status = status.masked_fill(rejected, int(State.BAD_INPUT))
+        ok = status == State.OBSERVED
         position = solution + self.origin.mT[:, None]
         world = torch.where(ok, position, 0.0)
-        has_depth = ok | (status == Status.BEHIND)
+        has_depth = ok | (status == State.BEHIND)
         nearest = torch.where(has_depth, _smallest(depth, used), 0.0)
         angle = _ray_angle(self.local, self.views, used, count)
         # the components of a point are neighbours in memory
