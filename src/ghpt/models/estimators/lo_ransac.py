@@ -11,7 +11,7 @@ from torch import Tensor
 
 from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
-from ghpt.geometry.normal_equations import usable_views
+from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.estimators.classical import Baseline, Linear, everywhere, otherwise, person_scale
 from ghpt.observations import Observations
@@ -37,7 +37,7 @@ class LoRansac(Baseline):
         return everywhere(self.threshold, batch)
 
     def triangulate(self, batch: Observations) -> Triangulation:
-        usable = batch.valid & usable_views(batch.cameras, batch.key_points)
+        usable = batch.valid & valid_key_points(batch.cameras, batch.key_points)
         size = person_scale(batch.key_points, usable).double()
         usable &= (size > 0)[..., None]
         # in units of the person's size one threshold holds for all views

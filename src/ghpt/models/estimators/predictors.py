@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from ghpt.geometry.normal_equations import usable_views
+from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation
 from ghpt.models.estimators.classical import Baseline, poses_of
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
@@ -151,7 +151,7 @@ def cleaned(batch: Observations) -> tuple[Observations, Bool[Tensor, "B V J"]]:
     """The batch without key points that no detection can be, and which those were: not finite, of a
     camera that is none, or ``FAR`` from all others of its view.
     """
-    usable = batch.valid & usable_views(batch.cameras, batch.key_points)
+    usable = batch.valid & valid_key_points(batch.cameras, batch.key_points)
     points = torch.where(usable[..., None], batch.key_points, torch.nan)
     offset = (points - points.nanmedian(-2, keepdim=True).values).abs().amax(-1)
     typical = offset.nanmedian(-1, keepdim=True).values.clamp(min=1.0)

@@ -11,9 +11,8 @@ from ghpt.config import build
 from ghpt.data.datasets.frames import Frames
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
-from ghpt.models.checkpoint import load_model
+from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
-from ghpt.paper.engine.actions import CHECKPOINT
 from ghpt.skeleton import JOINTS
 
 AGGREGATIONS = ("weight", "average", "best")
@@ -28,7 +27,7 @@ def evaluate(config: dict[str, Any], dependencies: dict[str, Path], folder: Path
     result.json: set -> for each setting selection -> pelvis-relative MPJPE (mm). A smaller pool is
     the beginning of a larger one, the same that test.py draws with so many hypotheses.
     """
-    model, _ = load_model(dependencies["model"] / CHECKPOINT, seed=config["seed"])
+    model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
     model.eval()
     settings = [(h or model.hypotheses, t or model.temperature) for h, t in config["settings"]]
     result = {}

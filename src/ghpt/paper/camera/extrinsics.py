@@ -21,11 +21,10 @@ from ghpt.errors import GhptDataError
 from ghpt.files import write_json
 from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.pose_error import MPJPE
-from ghpt.models.checkpoint import load_model
+from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.relative_pose.evaluation import camera_after
 from ghpt.observations import PairObservations, RelativePoseEstimate
-from ghpt.paper.engine.actions import CHECKPOINT
 from ghpt.paper.engine.tasks import read_json
 from ghpt.skeleton import JOINTS
 
@@ -107,7 +106,7 @@ def estimate_extrinsics(
             "hypotheses": config["hypotheses"],
             "problem.frames": config["frames"],
         }
-        model = load_model(dependencies["model"] / CHECKPOINT, **changes)[0].eval()
+        model = load_model(dependencies["model"] / LAST, **changes)[0].eval()
     else:
         estimator = build(config["estimator"], "estimator")
         scale = build(config["scale"], "scale")
@@ -141,7 +140,7 @@ def poses_from_extrinsics(
     result.json: part of `PARTS` (or ``known``) -> kind -> MPJPE (mm) of ``weight``.
     """
     changes = {"seed": config["seed"], "hypotheses": config["hypotheses"]}
-    model = load_model(dependencies["model"] / CHECKPOINT, **changes)[0].eval()
+    model = load_model(dependencies["model"] / LAST, **changes)[0].eval()
     data = build(config["data"], "data")
     data.setup("test")
     frames = {"known": data.frames["test"]}

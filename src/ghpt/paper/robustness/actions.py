@@ -12,10 +12,9 @@ import torch
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
-from ghpt.models.checkpoint import load_model
+from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
-from ghpt.paper.engine.actions import CHECKPOINT
 from ghpt.report.poses import estimators
 from ghpt.skeleton import JOINTS
 
@@ -39,7 +38,7 @@ def curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -
     data = build(config["data"], "data")
     data.setup("test")
     frames = data.frames["test"]
-    model, _ = load_model(dependencies["model"] / CHECKPOINT, seed=config["seed"])
+    model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
     everybody = together(model.eval(), estimators(config, model))
     perturbations = build(config["perturbations"], "perturbations")
     levels: list[dict[str, dict[str, MPJPE]]] = [{} for _ in perturbations]
