@@ -281,7 +281,6 @@ def lay_out(runner: Page, models: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, typed, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(testing, "REPORTS", dict(testing.REPORTS))
     monkeypatch.setattr(registry, "PARTS", copy.deepcopy(registry.PARTS))
     runner = Page(tmp_path, typed, monkeypatch)
     for block in documented.blocks(page):

@@ -37,7 +37,6 @@ def child(folder: str, frames: int) -> None:
     import numpy as np
 
     import toys
-    from ghpt.commands.test import test
 
     class Longer(toys.ToyData):
         def generate(self, split):
@@ -48,7 +47,7 @@ def child(folder: str, frames: int) -> None:
                 )
 
         def cache_key(self, split):
-            return super().key(split) | {"frames": frames}
+            return super().cache_key(split) | {"frames": frames}
 
     toys.Longer = Longer
     data = toys.DATA | {
@@ -72,7 +71,7 @@ def child(folder: str, frames: int) -> None:
             time.sleep(0.005)
 
     threading.Thread(target=watch, daemon=True).start()
-    metrics = test(config, Path(folder) / str(frames))
+    metrics = toys.run_test(config, Path(folder) / str(frames)).metrics
     print(json.dumps({"peak": peak[0], "frames": metrics["frames"]}))
 
 

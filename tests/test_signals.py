@@ -11,7 +11,6 @@ from pathlib import Path
 import pytest
 
 import ghpt
-import ghpt.commands.test as testing
 import toys
 from ghpt import provenance as origin
 from ghpt.commands import predict as prediction
@@ -218,7 +217,7 @@ def test_a_stopped_test_leaves_no_rows(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Linear, "__call__", stopped)
     with pytest.raises(SystemExit) as stop:
-        testing.test(settings, tmp_path / "test")
+        toys.run_test(settings, tmp_path / "test")
     assert stop.value.code == 143
     assert handlers == [handler]  # Lightning's would have several processes wait for each other
     assert not {".predictions", "predictions.npz", "metrics.json"} & set(

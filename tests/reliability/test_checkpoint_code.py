@@ -156,21 +156,17 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.data.formats.key_points.read_people": {"path": str(ckpt)},
         "ghpt.data.datasets.store.open_store": {"folder": folder},
         "ghpt.data.datasets.store.cache_root": {},
-        "ghpt.models.pose.predictions.open_predictions": {"path": str(ckpt)},
+        "ghpt.models.predictions.open_predictions": {"path": str(ckpt), "schema": None},
         "ghpt.models.checkpoint.read_checkpoint": {"path": str(ckpt)},
         "ghpt.models.checkpoint.load_model": {"path": str(ckpt), "trust": ["evil_module"]},
         # ours, which write and delete
         "ghpt.files.sweep_temporaries": {"folder": folder},
         "ghpt.files.atomic_write": {"path": f"{folder}/keep.txt"},
         "ghpt.files.atomic_folder": {"path": folder},
-        "ghpt.models.pose.evaluation.write_metrics": {"path": f"{folder}/keep.txt", "metrics": {}},
+        "ghpt.files.write_json": {"path": f"{folder}/keep.txt", "content": {}},
         "ghpt.report.tables.write_report": {"path": f"{folder}/keep.txt", "metrics": {}},
         "ghpt.report.tensorboard.write_parts": {"folder": f"{folder}/events", "parts": {}},
-        "ghpt.models.pose.predictions.PredictionWriter": {
-            "folder": folder,
-            "count": 1,
-            "names": ["weight"],
-        },
+        "ghpt.models.rows.RowWriter": {"folder": folder, "count": 1, "layout": {}},
         "ghpt.data.datasets.store.write_store": {
             "folder": f"{folder}/store",
             "recordings": [],
@@ -193,7 +189,7 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.commands.jobs.first_of_several_ends": {},
         "ghpt.commands.train.make_trainer": {"settings": {"logger": False}},
         "ghpt.commands.train.train": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
-        "ghpt.commands.test.test": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
+        "ghpt.commands.test.test": {"settings": {}, "output": {"_target_": "ghpt.files.Path"}},
         "ghpt.paper.engine.tasks.read_json": {"path": {"_target_": "ghpt.files.Path"}},
         "ghpt.paper.engine.setup.compose": {
             "conf": {"_target_": "ghpt.files.Path"},

@@ -12,7 +12,6 @@ import pytest
 import torch
 
 import toys
-from ghpt.commands.test import test as run_test
 from ghpt.commands.train import train
 from ghpt.models.checkpoint import read_checkpoint
 
@@ -77,7 +76,7 @@ def predictions_of(checkpoint, folder, threads, **data):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        run_test(config, folder)
+        toys.run_test(config, folder)
     finally:
         torch.set_num_threads(before)
     return arrays(folder)

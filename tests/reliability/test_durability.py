@@ -112,9 +112,8 @@ def save_checkpoint(folder: Path) -> None:
 
 
 def save_rows(folder: Path) -> None:
-    writer = RowWriter(folder / ".rows", 3, "frames", ["linear"], {"x": ("<f4", (2,))})
-    weights = {name: torch.zeros(3) for name in ("entropy", "max", "effective")}
-    writer.write(torch.tensor([2, 0, 1]), {"x": torch.ones(3, 2)}, weights)
+    writer = RowWriter(folder / ".rows", 3, {"x": ("<f4", (2,))})
+    writer.write(torch.tensor([2, 0, 1]), {"x": torch.ones(3, 2)})
     writer.finish(folder / "predictions.npz", {}, {}, members_of)
 
 

@@ -109,7 +109,7 @@ def train(config: dict[str, Any], output: Path) -> dict[str, float]:
             saver,
             best_checkpoint(output),
             LogHyperparameters(about | _flat(config["model"], "model")),
-            *progress(config),
+            *progress(config["progress_bar"]),
         ],
         enable_progress_bar=config["progress_bar"],
         num_sanity_val_steps=0,
@@ -163,8 +163,9 @@ def make_trainer(settings: dict[str, Any], **ours: Any) -> L.Trainer:
         ) from error
 
 
-def progress(config: dict[str, Any]) -> list[L.Callback]:
-    return [Progress()] if config["progress_bar"] else []
+def progress(shown: bool) -> list[L.Callback]:
+    """Return the callbacks of the progress bar."""
+    return [Progress()] if shown else []
 
 
 def display_path(path: Path) -> str:

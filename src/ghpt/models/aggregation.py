@@ -2,6 +2,10 @@
 pool.
 """
 
+from __future__ import annotations
+
+from dataclasses import dataclass
+
 import torch
 import torch.nn.functional as F
 from jaxtyping import Float, Int
@@ -9,6 +13,7 @@ from torch import Tensor
 
 from ghpt import randomness
 from ghpt.errors import GhptConfigError
+from ghpt.observations import Batch
 
 AGGREGATIONS = ("weight", "average", "most", "least", "stochastic", "random", "best", "worst")
 """Names as in metrics.json; best and worst look at the truth and are not available in use."""
@@ -77,3 +82,24 @@ def aggregation_weights(
             "selection", f"{name!r} is unknown", f"Existing: {', '.join(AGGREGATIONS)}."
         )
     return F.one_hot(index, count).to(logits.dtype)
+
+
+@dataclass(frozen=True)
+class WeightSummary(Batch):
+    """How concentrated the weights over each pool are."""
+
+    entropy: Float[Tensor, " B"]
+    """Nats."""
+    max: Float[Tensor, " B"]
+    """The largest weight."""
+    effective: Float[Tensor, " B"]
+    """1 / sum of squares: the hypotheses in effect."""
+
+
+def summarize(weights: Float[Tensor, "B H"]) -> WeightSummary:
+    """Return how concentrated weights are that sum to 1."""
+    return WeightSummary(
+        entropy=torch.special.entr(weights).sum(dim=-1),
+        max=weights.amax(dim=-1),
+        effective=1 / weights.square().sum(dim=-1),
+    )

@@ -1,22 +1,27 @@
-"""DataModules that serve the 2D key points of a camera arrangement, synthetic or real (``root``)."""
+"""DataModules of the 2D key points of a camera arrangement, synthetic or real (``root``)."""
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning as L
-import numpy as np
 
-from ghpt import randomness
-from ghpt.data.datasets.frames import BatchOrder, FrameLoader, Frames, trainable
-from ghpt.data.datasets.pairs import Pairs, PairSettings
+from ghpt.data.datasets.frames import (
+    BatchOrder,
+    FrameLoader,
+    SampleSet,
+    Sampling,
+    draw_frames,
+)
 from ghpt.data.datasets.store import prepared
 from ghpt.errors import GhptDataError, check
 from ghpt.observations import Labelled, LabelledRecording
 
 SPLITS = ("train", "validation", "test")
+
+Draw = Callable[[Sequence[LabelledRecording], Sampling], SampleSet]
+"""Draws the samples of a split from its recordings."""
 
 
 class KeyPointDataModule(L.LightningDataModule):
@@ -70,14 +75,13 @@ class KeyPointDataModule(L.LightningDataModule):
         self.evaluate = evaluate
         self.batch_size = batch_size
         self.workers = workers
-        self.pairs: PairSettings | None = None
-        self.frames: dict[str, Frames | Pairs] = {}
+        self.draw: Draw = draw_frames
+        self.frames: dict[str, SampleSet] = {}
+        """The samples of each role: train, validation, test."""
 
     def bind(self, problem: Any) -> None:
-        """Serve what ``problem`` takes: pairs of cameras where it has ``PairSettings`` (``pairs``),
-        else frames.
-        """
-        self.pairs = getattr(problem, "pairs", None)
+        """Serve the samples that a problem draws from recordings, in place of frames."""
+        self.draw = problem.dataset
 
     @property
     def source(self) -> str:
@@ -101,7 +105,17 @@ class KeyPointDataModule(L.LightningDataModule):
     def setup(self, stage: str) -> None:
         for role, split in self._roles(stage).items():
             if role not in self.frames:
-                self.frames[role] = self._choose(self.recordings(split), role == "train")
+                self.frames[role] = self.draw(self.recordings(split), self._sampling(role))
+
+    def _sampling(self, role: str) -> Sampling:
+        return Sampling(
+            source=self.source,
+            split=f"{self.name} {role}",
+            seed=self.seed,
+            train_samples=self.train_samples if role == "train" else None,
+            stride=self.stride,
+            least_joints=self.least_joints,
+        )
 
     def _roles(self, stage: str) -> dict[str, str]:
         """What the stage needs: role -> split."""
@@ -127,38 +141,6 @@ class KeyPointDataModule(L.LightningDataModule):
                 self.source, f"{self.name} {split}", "the split has no frames", hint
             )
         return recordings
-
-    def _choose(self, recordings: Sequence[LabelledRecording], training: bool) -> Frames | Pairs:
-        if self.pairs is not None:
-            return Pairs(
-                recordings, self.pairs, self.seed, self.train_samples if training else None
-            )
-        return Frames(recordings, self._random(recordings) if training else self._every(recordings))
-
-    def _every(self, recordings: Sequence[LabelledRecording]) -> np.ndarray:
-        """Every ``stride``-th frame of each recording."""
-        starts = np.cumsum([0] + [len(r) for r in recordings])
-        return np.concatenate([np.arange(a, b, self.stride) for a, b in pairwise(starts)])
-
-    def _random(self, recordings: Sequence[LabelledRecording]) -> np.ndarray:
-        """``train_samples`` random frames that can teach."""
-        order = randomness.permutation(
-            self.seed, "training samples", 0, sum(map(len, recordings))
-        ).numpy()
-        chosen = np.empty(0, dtype=np.int64)
-        for first in range(0, len(order), 4 * self.train_samples):
-            some = order[first : first + 4 * self.train_samples]
-            chosen = np.concatenate([chosen, some[trainable(recordings, some, self.least_joints)]])
-            if len(chosen) >= self.train_samples:
-                break
-        if not len(chosen):
-            raise GhptDataError(
-                self.source,
-                f"{self.name} train",
-                f"no frame has a true pelvis and {self.least_joints} joints seen in two views",
-                "Lower data.least_joints, or check the detections.",
-            )
-        return chosen[: self.train_samples]
 
     def train_dataloader(self) -> FrameLoader:
         return self._loader("train", seed=self.seed, done=lambda: self.trainer.global_step)

@@ -2,19 +2,27 @@
 subset of views.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ghpt.config import build
+from ghpt.data.datasets.frames import Frames
 from ghpt.errors import check
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.metrics.pose_error import joint_errors
+from ghpt.models.pose.evaluation import evaluate_poses
 from ghpt.models.pose.features import body_part_lengths, normalised_coordinates
-from ghpt.models.problem import Hypotheses
-from ghpt.observations import Observations, PoseEstimate, Truth
+from ghpt.models.pose.schema import POSES, PosePredictions, PoseSample, PoseTables
+from ghpt.models.predictions import with_nan
+from ghpt.models.problem import BaselineSettings, Hypotheses, Problem
+from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
+from ghpt.report.report import Report
 from ghpt.skeleton import BONES, JOINTS
 
 
@@ -32,10 +40,16 @@ class PoseHypotheses(Hypotheses):
     """The joints that the frame's views determine; the others are in no hypothesis."""
 
 
-class PoseTriangulation:
-    """Generate, describe, combine and measure 3D poses."""
+class PoseTriangulation(Problem):
+    """3D poses, each triangulated from random views; compared by MPJPE.
+
+    ``coordinates`` and ``lengths``: whether the scorer sees the normalised coordinates, and the
+    lengths of the bones.
+    """
 
     measures = "MPJPE relative to the pelvis"
+    schema = POSES
+    headline = "mpjpe_relative"
 
     def __init__(self, coordinates: bool, lengths: bool) -> None:
         check(
@@ -99,3 +113,34 @@ class PoseTriangulation:
         number = counted.sum(dim=-1)
         mean = torch.where(counted, errors, 0.0).sum(dim=-1) / number.clamp_min(1)
         return mean, (number > 0).flatten(1).all(dim=1) if extra else number > 0
+
+    def baselines(
+        self, settings: BaselineSettings, model: Any
+    ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
+        """Return the model's view weights, where there are settings for them, and the rest."""
+        learned = {}
+        if settings.view_weights:
+            view_weights = build(settings.view_weights, "view_weights")
+            learned["view_weights"] = view_weights(model)
+        return learned | build(settings.baselines, "baselines")
+
+    def sample(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
+        """Return the frames' true poses, recordings and numbers."""
+        observations = batch.observations
+        frame = torch.from_numpy(dataset.frame_numbers(observations.index.tolist()))
+        truth = batch.truth
+        return PoseSample(with_nan(truth), truth.valid, observations.recording, frame)
+
+    def tables(self, dataset: Frames) -> PoseTables:
+        """Return the recordings."""
+        return PoseTables.from_recordings(dataset.recordings)
+
+    def metrics(self, predictions: PosePredictions) -> dict[str, Any]:
+        """Return the content of metrics.json."""
+        return evaluate_poses(predictions)
+
+    def report(self) -> Report:
+        """Return tables and figures of the errors; imported here, since drawing is slow to import."""
+        from ghpt.report.tensorboard import REPORT
+
+        return REPORT

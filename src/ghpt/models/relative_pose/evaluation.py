@@ -23,7 +23,7 @@ from ghpt.metrics.relative_pose import (
     translation_error,
 )
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.models.relative_pose.predictions import PairChunk, PairPredictions
+from ghpt.models.relative_pose.schema import PairChunk, PairPredictions
 
 FORMAT_VERSION = 1
 NAMES = (*AGGREGATIONS, "eight_point", "ransac", "usac_magsac", "usac_accurate", "poselib", "rig")
@@ -69,7 +69,7 @@ def evaluate_pairs(predictions: PairPredictions) -> dict[str, Any]:
         "format_version": FORMAT_VERSION,
         **{key: meta.get(key) for key in ("data", "source", "split", "problem", "frames")},
         "draws": len(np.unique(draw)),
-        "cameras": list(predictions.camera_name[0]),
+        "cameras": predictions.tables.camera_name[0].tolist(),
         **{key: meta.get(key) for key in ("seed", "provenance")},
         "selections": selections,
     }
@@ -87,19 +87,20 @@ def pair_errors(
     inf where it was not estimated or no point counts.
     """
     estimate = chunk.estimates[name]
-    truth = _pair_cameras(predictions, chunk.rig, chunk.pair)
-    points = predictions.points[chunk.rig]
+    sample = chunk.sample
+    truth = _pair_cameras(predictions, sample.rig, sample.pair)
+    points = predictions.tables.points[sample.rig]
     whole = _with_target(truth, estimate.R, estimate.t)
     errors = {
-        "E_R": quaternion_error(estimate.R, chunk.truth_R),
-        "E_t": translation_error(estimate.t, chunk.truth_t),
+        "E_R": quaternion_error(estimate.R, sample.truth_R),
+        "E_t": translation_error(estimate.t, sample.truth_t),
         "E_2D": _mean_over_points(*error_2d(whole, truth, points)),
         "E_3D": _mean_over_points(*error_3d(whole, truth, points)),
-        "rotation_deg": rotation_deg(estimate.R, chunk.truth_R),
-        "translation_deg": translation_deg(estimate.t, chunk.truth_t),
+        "rotation_deg": rotation_deg(estimate.R, sample.truth_R),
+        "translation_deg": translation_deg(estimate.t, sample.truth_t),
     }
     for part, (R, t) in zip(
-        ALONE, ((estimate.R, chunk.truth_t), (chunk.truth_R, estimate.t)), strict=True
+        ALONE, ((estimate.R, sample.truth_t), (sample.truth_R, estimate.t)), strict=True
     ):
         mixed = _with_target(truth, R, t)
         errors[f"E_2D {part}"] = _mean_over_points(*error_2d(mixed, truth, points))
@@ -131,7 +132,7 @@ def _pair_cameras(
     predictions: PairPredictions, rig: Int[Tensor, " B"], pair: Int[Tensor, "B 2"]
 ) -> Cameras:
     """The true reference and target cameras, leading dimensions B 2."""
-    return predictions.cameras.index((rig[:, None], pair))
+    return predictions.tables.cameras.index((rig[:, None], pair))
 
 
 def _with_target(truth: Cameras, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"]) -> Cameras:
@@ -158,8 +159,8 @@ def _all_errors(
     pair = []
     draw = []
     for chunk in predictions.chunks(_CHUNK):
-        pair.append(chunk.pair)
-        draw.append(chunk.draw)
+        pair.append(chunk.sample.pair)
+        draw.append(chunk.sample.draw)
         for name in names:
             for error, values in pair_errors(predictions, chunk, name).items():
                 parts[name].setdefault(error, []).append(values)

@@ -4,8 +4,9 @@ correspondences.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +14,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt import randomness
-from ghpt.data.datasets.pairs import PairSettings
+from ghpt.config import build
+from ghpt.data.datasets.frames import Sampling
+from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.errors import check
 from ghpt.geometry.cameras import project
 from ghpt.geometry.epipolar import (
@@ -27,8 +30,17 @@ from ghpt.geometry.epipolar import (
     robust_weights,
 )
 from ghpt.geometry.rotations import average_rotation
-from ghpt.models.problem import Hypotheses
-from ghpt.observations import PairObservations, PairTruth, RelativePoseEstimate
+from ghpt.models.problem import BaselineSettings, Hypotheses, Problem
+from ghpt.models.relative_pose.evaluation import evaluate_pairs
+from ghpt.models.relative_pose.schema import PAIRS, PairPredictions, PairSample, RigTables
+from ghpt.observations import (
+    Labelled,
+    LabelledRecording,
+    PairObservations,
+    PairTruth,
+    RelativePoseEstimate,
+)
+from ghpt.report.report import Report
 
 CHEIRALITY = 256
 """Correspondences, evenly over all, that tell which of four poses has them in front: more would
@@ -54,8 +66,8 @@ class RelativePoseHypotheses(Hypotheses):
     """The joints that both cameras see."""
 
 
-class RelativePose:
-    """Generate, describe, combine and measure relative camera poses.
+class RelativePose(Problem):
+    """Relative poses of two cameras, each from random correspondences; compared by E_3D.
 
     ``frames``, ``draws``, ``points``: see ``PairSettings``. ``sample``: T, the correspondences of a
     hypothesis; at most half of those that both cameras see, but 8 at least. ``refine``: how often
@@ -66,6 +78,8 @@ class RelativePose:
     """
 
     measures = "E_3D"
+    schema = PAIRS
+    headline = "E_3D"
 
     def __init__(
         self,
@@ -182,6 +196,47 @@ class RelativePose:
         return error, visible.any(-1) & (
             estimate.estimated.all(-1) if extra else estimate.estimated
         )
+
+    def dataset(self, recordings: Sequence[LabelledRecording], sampling: Sampling) -> Pairs:
+        """Return pairs of cameras with random frames of their rig."""
+        return Pairs(recordings, self.pairs, sampling.seed, sampling.train_samples)
+
+    def baselines(
+        self, settings: BaselineSettings, model: Any
+    ) -> Mapping[str, Callable[[PairObservations], RelativePoseEstimate]]:
+        """Return the classical estimators."""
+        return build(settings.camera_baselines, "camera_baselines")
+
+    def from_baseline(
+        self, estimate: RelativePoseEstimate, observations: PairObservations
+    ) -> RelativePoseEstimate:
+        """Return the estimate with the length of t that the problem's ``scale`` gives it."""
+        length = self.scale(estimate, observations)
+        return replace(estimate, t=estimate.t * length[..., None])
+
+    def sample(self, batch: Labelled[PairObservations, PairTruth], dataset: Pairs) -> PairSample:
+        """Return the pairs' true relative poses, rigs, draws and views."""
+        R, t = batch.truth.relative_pose()
+        observations = batch.observations
+        return PairSample(R, t, observations.rig, observations.draw, observations.pair)
+
+    def tables(self, dataset: Pairs) -> RigTables:
+        """Return the true rigs."""
+        return RigTables.from_rigs(dataset.rigs)
+
+    def meta(self) -> dict[str, Any]:
+        """Return the number of frames of a pair."""
+        return {"frames": self.pairs.frames}
+
+    def metrics(self, predictions: PairPredictions) -> dict[str, Any]:
+        """Return the content of metrics.json."""
+        return evaluate_pairs(predictions)
+
+    def report(self) -> Report:
+        """Return tables and figures of the errors; imported here, since drawing is slow to import."""
+        from ghpt.report.pair_tensorboard import REPORT
+
+        return REPORT
 
 
 def random_subsets(
