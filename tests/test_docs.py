@@ -1,7 +1,6 @@
 """Every command and every piece of code in the documentation runs."""
 
 import argparse
-import copy
 import importlib.util
 import re
 import runpy
@@ -21,7 +20,6 @@ from ghpt.commands import calibrate, predict, train
 from ghpt.commands import cameras as doctor
 from ghpt.commands.overrides import check_overrides
 from ghpt.data.synthetic import recordings as synthetic
-from ghpt.models import registry
 
 MAINS = {
     "train.py": (train.COMMAND, {"last.ckpt", "best.ckpt"}),
@@ -104,9 +102,6 @@ class Page:
         elif named:
             path = self.folder / named[1]
             self.write(path, block.text)
-            package = sys.modules[".".join(path.parent.relative_to(self.folder / "src").parts)]
-            self.monkeypatch.setattr(package, "__path__", [*package.__path__, str(path.parent)])
-            self.monkeypatch.delitem(sys.modules, f"{package.__name__}.{path.stem}", raising=False)
         else:
             exec(compile("\n" * (block.line - 1) + block.text, where, "exec"), self.names)
 
@@ -281,7 +276,7 @@ def lay_out(runner: Page, models: Path) -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, typed, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(registry, "PARTS", copy.deepcopy(registry.PARTS))
+    monkeypatch.syspath_prepend(tmp_path)
     runner = Page(tmp_path, typed, monkeypatch)
     for block in documented.blocks(page):
         assert block.language or not re.search(r"^python ", block.text, re.MULTILINE), (

@@ -121,6 +121,13 @@ class Schema(Generic[EstimateT, SampleT, TablesT]):
         return columns | self.sample.columns | _with_names(_SUMMARY, "weights_{field}")
 
 
+def frame_schema(
+    problem: str, estimate: type[EstimateT], columns: Layout
+) -> Schema[EstimateT, TrueJoints, Tables]:
+    """Return the schema of a problem of frames: beside its estimates, the frames' true joints."""
+    return Schema(problem, Record(estimate, columns), TRUE_JOINTS, Tables)
+
+
 def _with_names(record: Record[Any], template: str) -> dict[str, Column]:
     return {template.format(field=name): column for name, column in record.columns.items()}
 
