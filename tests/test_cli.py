@@ -80,7 +80,7 @@ def test_train_then_test_as_typed(command, tmp_path):
         "train.log",
     ]
     assert re.search(
-        r"Validation on synthetic \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
+        r"Validation on synthetic toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
         said,
     )
     assert said.replace("\n", "") in re.sub(

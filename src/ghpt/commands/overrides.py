@@ -14,7 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
 from ghpt.config import suggest
 from ghpt.errors import GhptConfigError
@@ -35,8 +35,8 @@ class Source:
     """A folder of a user's own files, which go before those in ``folder``."""
 
 
-def compose(source: Source, words: Sequence[str], with_hydra: bool = False) -> DictConfig:
-    """Return the configuration that the words of a command line make of the yaml files."""
+def compose(source: Source, words: Sequence[str], with_hydra: bool = False) -> Any:
+    """Return the DictConfig that the words of a command line make of the yaml files."""
     overrides = [_parse(word) for word in words]
     with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
         search_path = _search_path(source, overrides)
