@@ -10,11 +10,12 @@ from typing import Any, TypedDict
 from ghpt.config import build, suggest
 from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.data.datasets.store import prepared
-from ghpt.data.formats.camera_files import CameraFile, read_cameras
+from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import KeyPoints, read_key_points
 from ghpt.data.formats.names import Name
 from ghpt.errors import GhptConfigError
-from ghpt.recording import Recording
+from ghpt.geometry.cameras import CameraSet
+from ghpt.observations import LabelledRecording
 
 
 class InputSettings(TypedDict):
@@ -33,7 +34,7 @@ class InputSettings(TypedDict):
     data: dict[str, Any]
 
 
-def own_cameras(config: Mapping[str, Any], example: str) -> CameraFile:
+def own_cameras(config: Mapping[str, Any], example: str) -> CameraSet:
     """The user's camera file. Raises GhptConfigError, with ``example``, if none is named."""
     if not config["cameras"]:
         raise GhptConfigError("cameras", "is missing", f"Name the file: cameras={example}")
@@ -47,7 +48,7 @@ def own_key_points(config: Mapping[str, Any]) -> KeyPoints:
     )
 
 
-def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, Recording]:
+def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, LabelledRecording]:
     """A recording of ``config["data"]`` by name; without a name S9/Walking-1 or the first."""
     data = build(config["data"], "data")
     made = {"source": data.source, "split": data.evaluate}

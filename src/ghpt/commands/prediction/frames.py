@@ -15,16 +15,14 @@ from torch import Tensor
 
 from ghpt.calibration.check.units import decide_unit
 from ghpt.commands.prediction.shards import Shards
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.people.views import Views
 from ghpt.errors import GhptDataError
 from ghpt.export import Evidence
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.normal_equations import local_cameras
 from ghpt.models.estimators.classical import Baseline
+from ghpt.observations import Observations
 from ghpt.reconstruction import Reconstruction
-from ghpt.recording import Observations
-from ghpt.skeleton import JOINTS
 
 _NEAR = 1e5
 """Distance (mm, along an axis) from the world's zero up to which a rig stays where it is.
@@ -38,7 +36,6 @@ MEASURED = 64
 """Frames by which the person tells the unit of length."""
 _STAMPED = 4096
 """Frames that are read at a time for the stamp."""
-_HINT = "Calibrate first (python calibrate.py keypoints=... cameras=...), and give the rig.toml that it writes."
 
 Seen = tuple[Float[np.ndarray, "N V J 2"], Float[np.ndarray, "N V J"], Bool[np.ndarray, "N V J"]]
 """Undistorted pixels (float32), confidences and what is seen, of the 17 joints."""
@@ -48,7 +45,7 @@ Seen = tuple[Float[np.ndarray, "N V J 2"], Float[np.ndarray, "N V J"], Bool[np.n
 class Detected:
     """The recording as the detector and the camera file have it."""
 
-    cameras: CameraFile
+    cameras: CameraSet
     """Of the views, in their order, in mm."""
     read: Callable[[Int[np.ndarray, " N"]], Seen]
     """Pixels through the lens, confidences and what is seen, of some rows, which rise."""
@@ -91,20 +88,18 @@ class Frames:
     def batch(self, rows: Int[np.ndarray, " N"]) -> Observations:
         """Some rows, before cameras in a world whose zero is ``origin``.
 
-        A frame's ``sample`` is its own number, so its random draws are the same in any batch.
+        A frame's ``index`` is its own number, so its random draws are the same in any batch.
         """
         key_points, confidence, valid = (torch.from_numpy(values) for values in self.read(rows))
         count = len(rows)
         rig = self.cameras.relative_to(self.origin)
         return Observations(
-            sample=torch.from_numpy(self.frame[rows]),
+            index=torch.from_numpy(self.frame[rows]),
             recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
             key_points=key_points,
             confidence=confidence,
             valid=valid,
-            truth=torch.zeros(count, len(JOINTS), 3),
-            truth_valid=torch.zeros(count, len(JOINTS), dtype=torch.bool),
         )
 
     def spread(self, most: int) -> Int[np.ndarray, " N"]:
@@ -152,7 +147,7 @@ def in_unit(frames: Frames, estimator: Baseline) -> Frames:
     return replace(frames, cameras=file.cameras, detected=replace(frames.detected, cameras=file))
 
 
-def calibrated(where: str, cameras: CameraFile) -> Cameras:
+def calibrated(where: str, cameras: CameraSet) -> Cameras:
     """The cameras that the views have. Raises GhptDataError unless they are two or more with
     extrinsics.
     """
@@ -160,10 +155,6 @@ def calibrated(where: str, cameras: CameraFile) -> Cameras:
         hint = "A place in space takes two views or more of the same moment."
         raise GhptDataError(
             where, "views", f"there is only {', '.join(cameras.names) or 'none'}", hint
-        )
-    if cameras.cameras is None:
-        raise GhptDataError(
-            cameras.path, "rotation, translation", "not all cameras have extrinsics", _HINT
         )
     return cameras.cameras
 

@@ -14,9 +14,10 @@ from ghpt.data.synthetic.body import random_body
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.motion import actions, move
 from ghpt.data.synthetic.random_processes import generator
-from ghpt.data.synthetic.rigs import ARRANGEMENTS, Rig, human36m_rig, panoptic_rig
+from ghpt.data.synthetic.rigs import ARRANGEMENTS, human36m_rig, panoptic_rig
 from ghpt.errors import check
-from ghpt.recording import Recording
+from ghpt.geometry.cameras import CameraSet
+from ghpt.observations import LabelledRecording
 
 SPLITS = ("train", "validation", "test")
 HUMAN36M_SUBJECTS = {
@@ -42,7 +43,7 @@ class Take:
     subject: str
     action: str
     rate_hz: float
-    rig: Rig
+    rig: CameraSet
     truth: Float[np.ndarray, "T J 3"]
     """World frame, mm."""
     familiar: bool
@@ -53,7 +54,7 @@ class Take:
 
 def synthetic_recordings(
     data: str, split: str, seed: int, detector: Detector, cameras: Sequence[int] | None = None
-) -> Iterator[Recording]:
+) -> Iterator[LabelledRecording]:
     """The synthetic recordings of ``h36m``, of ``cmu1`` to ``cmu4``, or of ``panoptic`` with any HD
     ``cameras``.
 
@@ -96,7 +97,7 @@ def _human36m(split: str, seed: int) -> Iterator[Take]:
                 yield Take(name, subject, action, HUMAN36M_RATE, rig, truth, split != "test", 0)
 
 
-def _panoptic(rig: Rig, split: str, seed: int) -> Iterator[Take]:
+def _panoptic(rig: CameraSet, split: str, seed: int) -> Iterator[Take]:
     first, last = (round(part * PANOPTIC_FRAMES) for part in PANOPTIC_PARTS[split])
     for subject in PANOPTIC_SUBJECTS:
         truth = motion(seed, subject, subject, "RangeOfMotion", PANOPTIC_FRAMES, PANOPTIC_RATE)[
@@ -108,11 +109,11 @@ def _panoptic(rig: Rig, split: str, seed: int) -> Iterator[Take]:
         )
 
 
-def _detect(take: Take, seed: int, detector: Detector) -> Recording:
+def _detect(take: Take, seed: int, detector: Detector) -> LabelledRecording:
     found = detector(
         take.truth, take.rig, take.rate_hz, seed, take.subject, take.name, take.familiar
     )
-    return Recording(
+    return LabelledRecording(
         name=take.name,
         subject=take.subject,
         action=take.action,

@@ -20,7 +20,7 @@ from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.recording import Observations, PoseEstimate
+from ghpt.observations import Observations, PoseEstimate
 
 
 def person_scale(
@@ -48,11 +48,11 @@ def otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
 
 
 def poses_of(result: Triangulation, batch: Observations) -> PoseEstimate:
-    return PoseEstimate(result.points.to(batch.key_points.dtype), result.placed)
+    return PoseEstimate(result.points.to(batch.key_points.dtype), result.has_position)
 
 
 def everywhere(value: float, batch: Observations) -> Float[Tensor, " B"]:
-    return torch.full(batch.sample.shape, value, dtype=torch.float64, device=batch.sample.device)
+    return torch.full(batch.index.shape, value, dtype=torch.float64, device=batch.index.device)
 
 
 class Baseline(ABC):

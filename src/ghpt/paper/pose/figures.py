@@ -9,9 +9,9 @@ from jaxtyping import Float
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.pose.predictions import PredictionChunk, Predictions, open_predictions
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Claim, Item, Results, Section
+from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.paper.pose.base_dataset import SELF, on_itself
 from ghpt.report.figures import pose_prior_bars, skeletons, up_axis
 from ghpt.report.tables import markdown, prior_table
@@ -30,12 +30,12 @@ def _qualitative(results: Results) -> Section:
     chunk = predictions.read(0, len(predictions))
     errors = {name: _relative_errors(chunk, name) for name in SHOWN}
     whole = np.flatnonzero(np.isfinite(sum(errors.values())))
-    up = up_axis(chunk.truth[::10].double().numpy())
+    up = up_axis(chunk.truth.points[::10].double().numpy())
     figures = {}
     for kind, quantile in QUANTILES.items():
         row = whole[np.argsort(errors["weight"][whole])[int(quantile * (len(whole) - 1))]]
         figures[f"qualitative-{kind}"] = skeletons(
-            chunk.truth[row].double().numpy(),
+            chunk.truth.points[row].double().numpy(),
             {name: chunk.estimates[name].points[row].double().numpy() for name in SHOWN},
             up,
             _heading(
@@ -63,9 +63,7 @@ def _qualitative(results: Results) -> Section:
 
 def _relative_errors(chunk: PredictionChunk, name: str) -> Float[np.ndarray, " N"]:
     """Pelvis-relative MPJPE (mm) of each frame; NaN where a joint is missing."""
-    errors, counted = joint_errors(
-        chunk.estimates[name], chunk.truth, chunk.truth_valid, "relative"
-    )
+    errors, counted = joint_errors(chunk.estimates[name], chunk.truth, "relative")
     return torch.where(counted.all(-1), errors.mean(-1), torch.nan).numpy()
 
 
@@ -138,11 +136,11 @@ def _ratio(a: Float[np.ndarray, " L"], b: Float[np.ndarray, " L"]) -> float:
     return float(np.exp(np.mean(np.log(a / b))))
 
 
-def _cells(setup: Setup) -> dict[str, Cell]:
+def _tasks(setup: Setup) -> dict[str, Task]:
     return on_itself(setup, "h36m")
 
 
-ITEMS = (
-    Item("qualitative", "figure", "Hypotheses beside the truth", _cells, _qualitative),
-    Item("pose-prior", "figure", "The human pose prior", _cells, _pose_prior),
+ARTEFACTS = (
+    Artefact("qualitative", "figure", "Hypotheses beside the truth", _tasks, _qualitative),
+    Artefact("pose-prior", "figure", "The human pose prior", _tasks, _pose_prior),
 )
