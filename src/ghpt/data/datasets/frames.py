@@ -4,7 +4,7 @@ from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from ghpt.observations import (
 from ghpt.skeleton import PELVIS
 
 
+@runtime_checkable
 class SampleSet(Protocol):
     """What is trained or tested on: a data set whose items are whole batches."""
 
