@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from ghpt.commands.train import train
+from toys import train
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE

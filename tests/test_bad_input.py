@@ -17,7 +17,7 @@ import pytest
 import torch
 
 import toys
-from ghpt.commands.train import train
+from toys import train
 from ghpt.config import build, plain
 from ghpt.errors import GhptConfigError, GhptDataError, GhptError
 from ghpt.files import atomic_write

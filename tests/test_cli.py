@@ -21,7 +21,9 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import ghpt.commands.test as testing
 import toys
-from ghpt.commands.train import COMMAND, shell_override, train
+from ghpt.commands.train import COMMAND
+from ghpt.commands.display import shell_override
+from toys import train
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator

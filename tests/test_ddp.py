@@ -19,7 +19,7 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import toys
-from ghpt.commands.train import train
+from toys import train
 from ghpt.config import plain
 from ghpt.models.checkpoint import read_checkpoint
 

@@ -78,7 +78,7 @@ def child(folder: str, frames: int) -> None:
 @pytest.mark.skipif(not STATUS.is_file(), reason="needs Linux's /proc")
 def test_testing_holds_one_batch_however_many_frames(tmp_path):
     import toys
-    from ghpt.commands.train import train
+    from toys import train
 
     train(toys.TRAIN, tmp_path)
     peaks = []

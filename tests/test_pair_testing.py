@@ -12,7 +12,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import toys
 from ghpt.commands.test import summary
-from ghpt.commands.train import train
+from toys import train
 from ghpt.config import plain
 from ghpt.errors import GhptConfigError
 from ghpt.models.aggregation import AGGREGATIONS

@@ -15,7 +15,7 @@ import pytest
 import torch
 
 import toys
-from ghpt.commands.train import train
+from toys import train
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.models.checkpoint import FIELD, load_model, read_checkpoint
 from ghpt.models.module import StochasticEstimator

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ghpt.commands.train import train
+from toys import train
 from ghpt.files import write_json
 from ghpt.paper.engine.artefact import Results, Section
 from ghpt.paper.engine.setup import Setup

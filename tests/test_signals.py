@@ -18,7 +18,7 @@ from ghpt.commands.app import Command
 from ghpt.commands.outputs import Files
 from ghpt.commands.prediction.frames import Frames
 from ghpt.commands.prediction.shards import MANIFEST, Shards
-from ghpt.commands.train import train
+from toys import train
 from ghpt.models.estimators.classical import Linear
 from ghpt.signals import stop as handler
 from ghpt.signals import stopped_by_signals

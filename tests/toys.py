@@ -78,6 +78,14 @@ TRAIN = {
 }
 
 
+def train(config: Mapping[str, Any], output: Path) -> dict[str, float]:
+    """Train as train.py does, with a plain configuration."""
+    from ghpt.commands.train import TrainSettings, train
+    from ghpt.config import settings
+
+    return train(settings(TrainSettings, config | {"output": str(output)}), output)
+
+
 def run_test(config: Mapping[str, Any], output: Path) -> Any:
     """Test as test.py does; of the configuration, which may be a training's, what a test takes."""
     from ghpt.commands.test import TestSettings, test

@@ -11,7 +11,7 @@ import warnings
 from pathlib import Path
 
 import toys
-from ghpt.commands.train import train
+from toys import train
 
 
 def main(folder: str, changes: str) -> None:

@@ -18,7 +18,7 @@ import ghpt.config
 import ghpt.models.checkpoint
 import toys
 from ghpt import files
-from ghpt.commands.train import train
+from toys import train
 from ghpt.config import build, locate
 from ghpt.errors import GhptCheckpointError
 from ghpt.models.checkpoint import FIELD, load_model
@@ -187,8 +187,8 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.commands.app._quieten": {},
         "ghpt.commands.jobs.take_signals": {},
         "ghpt.commands.jobs.first_of_several_ends": {},
-        "ghpt.commands.train.make_trainer": {"settings": {"logger": False}},
-        "ghpt.commands.train.train": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
+        "ghpt.commands.trainer.make_trainer": {"settings": {"logger": False}},
+        "ghpt.commands.train.train": {"settings": {}, "output": {"_target_": "ghpt.files.Path"}},
         "ghpt.commands.test.test": {"settings": {}, "output": {"_target_": "ghpt.files.Path"}},
         "ghpt.paper.engine.tasks.read_json": {"path": {"_target_": "ghpt.files.Path"}},
         "ghpt.paper.engine.setup.compose": {

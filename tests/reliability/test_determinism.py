@@ -12,7 +12,7 @@ import pytest
 import torch
 
 import toys
-from ghpt.commands.train import train
+from toys import train
 from ghpt.models.checkpoint import read_checkpoint
 
 SCRIPT = Path(__file__).with_name("run_toy.py")

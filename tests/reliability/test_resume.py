@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import toys
-from ghpt.commands.train import train
+from toys import train
 from ghpt.errors import GhptCheckpointError
 from ghpt.models.callbacks import SaveLast
 from ghpt.models.module import StochasticEstimator

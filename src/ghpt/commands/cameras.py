@@ -26,7 +26,7 @@ from ghpt.commands.app import Command
 from ghpt.commands.calibrate import people_note
 from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.train import display_path
+from ghpt.commands.display import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.key_points import KeyPoints
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig

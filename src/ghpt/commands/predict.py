@@ -34,7 +34,7 @@ from ghpt.commands.prediction.run import predicted
 from ghpt.commands.prediction.statistics import Estimate, counts, estimate_of, evaluate
 from ghpt.commands.prediction.stored import frames_of_stored, open_stored
 from ghpt.commands.prediction.verdict import Level
-from ghpt.commands.train import display_path
+from ghpt.commands.display import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.key_points import read_people
 from ghpt.data.formats.skeletons import joints17

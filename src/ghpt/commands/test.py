@@ -9,7 +9,8 @@ from typing import Any
 from ghpt.commands.app import Command
 from ghpt.commands.lost import told
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
-from ghpt.commands.train import display_path, make_trainer, progress
+from ghpt.commands.display import display_path
+from ghpt.commands.trainer import make_trainer, progress
 from ghpt.config import Target, build
 from ghpt.errors import GhptCheckpointError
 from ghpt.files import sweep_temporaries, write_json

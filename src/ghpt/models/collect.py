@@ -49,7 +49,7 @@ class CollectPredictions(Callback):
         for name, baseline in self.baselines.items():
             estimate = baseline(observations)
             estimates[name] = self.problem.from_baseline(estimate, observations)
-        sample = self.problem.sample(batch, self._dataset)
+        sample = self.problem.record(batch, self._dataset)
         self._writer.write(observations.index, estimates, sample, pool.weight_summary())
 
     def finish(self) -> None:

@@ -110,7 +110,7 @@ class Problem(ABC):
         """Return a baseline's estimate as one of this problem."""
         return estimate
 
-    def sample(self, batch: Labelled[Any, Any], dataset: Any) -> Batch:
+    def record(self, batch: Labelled[Any, Any], dataset: Any) -> Batch:
         """Return what ``schema`` stores of each sample of a batch."""
         return TrueJoints.from_truth(batch.truth)
 

@@ -124,7 +124,7 @@ class PoseTriangulation(Problem):
             learned["view_weights"] = view_weights(model)
         return learned | build(settings.baselines, "baselines")
 
-    def sample(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
+    def record(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
         """Return the frames' true poses, recordings and numbers."""
         observations = batch.observations
         frame = torch.from_numpy(dataset.frame_numbers(observations.index.tolist()))

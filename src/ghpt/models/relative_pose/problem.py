@@ -214,7 +214,7 @@ class RelativePose(Problem):
         length = self.scale(estimate, observations)
         return replace(estimate, t=estimate.t * length[..., None])
 
-    def sample(self, batch: Labelled[PairObservations, PairTruth], dataset: Pairs) -> PairSample:
+    def record(self, batch: Labelled[PairObservations, PairTruth], dataset: Pairs) -> PairSample:
         """Return the pairs' true relative poses, rigs, draws and views."""
         R, t = batch.truth.relative_pose()
         observations = batch.observations
