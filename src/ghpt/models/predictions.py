@@ -7,6 +7,7 @@ says what its file holds, and nothing here knows more of a problem than that.
 from __future__ import annotations
 
 import json
+import math
 import re
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
@@ -314,7 +315,9 @@ def _read_table(
     if dtype == "U":
         texts = text_table(path, members, name)
         return np.array(texts, dtype=np.str_).reshape(members[name].shape)
-    if name not in members or members[name].dtype != np.dtype(dtype) or not members[name].shape:
+    member = members.get(name)
+    if member is None or member.dtype != np.dtype(dtype) or not member.shape:
         raise ValueError(f"{name} is not an array of {dtype}")
-    member = members[name]
+    if not math.prod(member.shape):
+        raise ValueError(f"{name} is empty")
     return read_rows(path, member, 0, member.shape[0])

@@ -130,7 +130,7 @@ def trainable(
     return (learnable[:, PELVIS] & (learnable.sum(dim=1) >= joints)).numpy()
 
 
-def _starts(recordings: Sequence[LabelledRecording]) -> Int[np.ndarray, " R+1"]:
+def _starts(recordings: Sequence[LabelledRecording]) -> Int[np.ndarray, " S"]:
     """Return where each recording begins among all frames, and where the last one ends."""
     return np.cumsum([0, *map(len, recordings)])
 
