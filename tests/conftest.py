@@ -4,19 +4,52 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
 
+import children
 from ghpt.commands.app import Command, run
 
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if WORKER:  # each of several test processes has its own core, and so have the commands that it runs
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
+
+
+CACHE = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
+SERVER = pytest.StashKey[children.Server]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Set up what all test processes share: a cache of prepared recordings, in place of the user's,
+    and the server of child processes.
+    """
+    if WORKER:
+        return
+    config.stash[CACHE] = tempfile.TemporaryDirectory(prefix="ghpt-cache-")
+    os.environ["GHPT_CACHE"] = config.stash[CACHE].name
+    if sys.platform == "linux":
+        config.stash[SERVER] = children.Server()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Clear it away."""
+    if SERVER in config.stash:
+        config.stash[SERVER].close()
+    if CACHE in config.stash:
+        config.stash[CACHE].cleanup()
+
+
+@pytest.fixture(autouse=True)
+def own_children() -> Iterator[None]:
+    """Children that a test has left running end with it."""
+    yield
+    children.close_all()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -45,15 +78,6 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"the developers' real data is not at {folder}")
     return folder
-
-
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Prepared recordings go to a folder of the test session, shared by its tests, never to the
-    user's cache.
-    """
-    base = tmp_path_factory.getbasetemp()
-    monkeypatch.setenv("GHPT_CACHE", str((base.parent if WORKER else base) / "cache"))
 
 
 @pytest.fixture

@@ -8,7 +8,6 @@ import re
 import shutil
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -18,6 +17,7 @@ import pytest
 import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import children
 import ghpt.commands.test as testing
 import toys
 from ghpt.commands.train import train
@@ -58,16 +58,7 @@ def project(tmp_path_factory):
 @pytest.fixture(scope="module")
 def typed_for_two(project):
     """``typed_for_two("train", *words)`` starts train.py on two processes."""
-    path = os.pathsep.join([str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    environment.pop("HYDRA_FULL_ERROR", None)
-    return lambda name, *words: subprocess.Popen(
-        [sys.executable, str(project / f"{name}.py"), *SMALL, *TWO, *words],
-        env=environment,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    return lambda name, *words: children.start(project / f"{name}.py", *SMALL, *TWO, *words)
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import re
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -17,6 +16,7 @@ import pytest
 import torch
 import yaml
 
+import children
 import ghpt.commands.jobs
 import toys
 from ghpt.commands.overrides import check_overrides
@@ -24,7 +24,7 @@ from ghpt.commands.train import COMMAND
 from ghpt.models.checkpoint import read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
-TOY = [sys.executable, str(ROOT / "tests" / "toy_sweep.py")]
+TOY = ROOT / "tests" / "toy_sweep.py"
 LOCAL = "hydra/launcher=submitit_local"
 SLURM = {  # stand-ins: an array's jobs run at once, on this machine
     "sbatch": """
@@ -51,18 +51,11 @@ def toy(tmp_path):
     }
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "toy.yaml").write_text(yaml.safe_dump(content))
-    environment = os.environ | {"TOY_CONF": str(tmp_path / "conf"), "PYTHON": sys.executable}
-    environment.pop("HYDRA_FULL_ERROR", None)
+    environment = {"TOY_CONF": str(tmp_path / "conf"), "PYTHON": sys.executable}
 
     def start(*words, path=""):
-        environment["PATH"] = f"{path}{os.pathsep}{os.environ['PATH']}"
-        return subprocess.Popen(
-            [*TOY, *words],
-            env=environment,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
+        paths = f"{path}{os.pathsep}{os.environ['PATH']}"
+        return children.start(TOY, *words, env={**environment, "PATH": paths})
 
     return start
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import children
 import ghpt
 import ghpt.commands.test as testing
 import toys
@@ -113,8 +114,8 @@ def test_pycolmap_s_handler_of_sigterm_is_not_there():
     program = (
         "import os, signal\nfrom ghpt.colmap import pycolmap\nos.kill(os.getpid(), signal.SIGTERM)"
     )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
+    ended = children.run("-c", program)
+    assert (ended.status, ended.errors) == (-signal.SIGTERM, "")
 
 
 def test_pycolmap_is_imported_in_one_place():

@@ -27,7 +27,14 @@ from ghpt.data.formats.validate import frame_rate, open_input
 from ghpt.data.people.people import Detections, KeyPoints, as_people
 from ghpt.errors import GhptDataError
 
-__all__ = ["FORMATS", "Detections", "KeyPoints", "read_key_points", "read_people", "write_key_points"]
+__all__ = [
+    "FORMATS",
+    "Detections",
+    "KeyPoints",
+    "read_key_points",
+    "read_people",
+    "write_key_points",
+]
 
 _HINT = (
     "Known: a folder with OpenPose's JSON files in a folder for each camera; COCO results or MMPose's JSON, a file for "
