@@ -1,12 +1,15 @@
 import functools
 import os
+import re
 from collections import OrderedDict
+from dataclasses import dataclass, field
+from typing import Literal
 
 import pytest
 import torch
 
-from ghpt.config import build, check_plain
-from ghpt.errors import GhptConfigError
+from ghpt.config import Target, build, check_plain, settings
+from ghpt.errors import GhptConfigError, check
 from ghpt.models.scorer import Scorer
 
 SCORER = {
@@ -86,3 +89,77 @@ def test_plain_data(value):
 def test_what_is_not_plain_data_is_named(value, where):
     with pytest.raises(GhptConfigError, match=rf"^{where}: "):
         check_plain(value, "config")
+
+
+@dataclass(frozen=True)
+class Lens:
+    model: Literal["pinhole", "brown"]
+    coefficients: tuple[float, ...]
+
+    def __post_init__(self):
+        check(len(self.coefficients) < 6, "coefficients", "are too many", "Give 5 or fewer.")
+
+
+@dataclass(frozen=True)
+class Camera:
+    name: str | int
+    size: tuple[int, int]
+    focal: float | None
+    lens: Lens | None
+    estimator: Target
+    views: tuple[str, ...] = ()
+    lenses: dict[str, Lens] = field(default_factory=dict)
+
+
+LENS = {"model": "brown", "coefficients": [1, 0.5]}
+CAMERA = {
+    "name": 7,
+    "size": [640, 480],
+    "focal": 1000,
+    "lens": LENS,
+    "estimator": SCORER,
+}
+
+
+def test_settings_are_typed_as_they_are_annotated():
+    camera = settings(Camera, CAMERA | {"lenses": {"a": LENS}})
+    lens = Lens("brown", (1.0, 0.5))
+    assert camera == Camera(7, (640, 480), 1000.0, lens, SCORER, (), {"a": lens})
+    assert [type(value) for value in (camera.name, camera.focal, camera.size[0])] == [
+        int,
+        float,
+        int,
+    ]
+
+
+def test_an_optional_group_may_be_null():
+    assert settings(Camera, CAMERA | {"lens": None, "focal": None}).lens is None
+
+
+@pytest.mark.parametrize(
+    ("changed", "key", "problem"),
+    [
+        ({"sise": 1}, "camera.sise", "no such setting"),
+        ({"lens": {"model": "brown"}}, "camera.lens.coefficients", "is missing"),
+        ({"lens": LENS | {"k": 1}}, "camera.lens.k", "no such setting"),
+        ({"lens": LENS | {"model": "fish"}}, "camera.lens.model", "is 'fish', not one of"),
+        ({"lens": 3}, "camera.lens", "is 3, not a group of settings"),
+        ({"lens": [3]}, "camera.lens", r"is \[3\], not a group of settings"),
+        ({"lenses": {"a": LENS | {"k": 1}}}, "camera.lenses.a.k", "no such setting"),
+        ({"lens": LENS | {"coefficients": [0] * 6}}, "camera.lens.coefficients", "are too many"),
+        ({"size": [640]}, "camera.size", "is"),
+        ({"size": [640, 4.5]}, "camera.size", "is"),
+        ({"focal": "wide"}, "camera.focal", "is 'wide', not a finite number or null"),
+        ({"focal": float("nan")}, "camera.focal", "is nan"),
+        ({"views": ["a", 3]}, "camera.views", "is"),
+        ({"estimator": "scorer"}, "camera.estimator", "is 'scorer', not a group of settings"),
+    ],
+)
+def test_a_setting_that_does_not_fit_is_named(changed, key, problem):
+    with pytest.raises(GhptConfigError, match=rf"^{re.escape(key)}: {problem}"):
+        settings(Camera, CAMERA | changed, "camera")
+
+
+def test_a_setting_without_a_default_is_needed():
+    with pytest.raises(GhptConfigError, match=r"^name: is missing\. "):
+        settings(Camera, {key: value for key, value in CAMERA.items() if key != "name"})

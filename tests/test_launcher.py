@@ -223,7 +223,7 @@ def test_trainings_of_a_local_pool_are_those_of_one_process(typed, tmp_path, mon
     conf = tmp_path / "conf"
     shutil.copytree(ROOT / "conf", conf)
     (conf / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
-    monkeypatch.setenv("PYTHONPATH", str(ROOT / "tests"))
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT / "src"), str(ROOT / "tests")]))
     monkeypatch.setenv("OMP_NUM_THREADS", str(torch.get_num_threads()))
     small = (
         "data=toy",

@@ -51,7 +51,11 @@ def test_a_signal_ends_a_command_with_its_status_and_no_word(typed, tmp_path, na
         time.sleep(60)
 
     status, said, errors = typed(
-        CONF, Command("cameras", task, str, lambda settings: Files()), [f"output={tmp_path}"]
+        CONF,
+        Command(
+            name="cameras", settings=dict, task=task, summary=str, files=lambda settings: Files()
+        ),
+        [f"output={tmp_path}"],
     )
     assert (status, said, errors) == (STATUS[name], "", "")
 

@@ -39,7 +39,12 @@ def task(config, output):
 
 def after(jobs):
     told = [
-        {"name": j.name, "how": j.config.get("how"), "result": j.result, "failed": j.failed}
+        {
+            "name": j.name,
+            "how": (j.settings or {}).get("how"),
+            "result": j.result,
+            "failed": j.failed,
+        }
         for j in jobs
     ]
     print("after", json.dumps({"pid": os.getpid(), "jobs": told}))
@@ -50,5 +55,12 @@ if __name__ == "__main__":
         import submitit
 
         submitit.Job._results_timeout_s = 0  # a local disk shows at once what a killed job has left
-    command = Command("toy", task, lambda result: "done", lambda settings: Files(), after)
+    command = Command(
+        name="toy",
+        settings=dict,
+        task=task,
+        summary=lambda result: "done",
+        files=lambda settings: Files(),
+        after=after,
+    )
     run(Path(os.environ["TOY_CONF"]), command)

@@ -1,11 +1,14 @@
-"""From plain configuration to objects: ``_target_`` names a class, the other keys are its
-arguments.
+"""From plain configuration to typed settings and to objects.
+
+`settings` turns the composed configuration of a command into its frozen dataclass. `build` makes
+objects of the groups that have a ``_target_``: it names a class, the other keys are its arguments.
 
 Hydra composes the yaml; this builds it, because a checkpoint carries its configuration too, and
 what comes out of a file must not be able to name arbitrary callables or read the environment
 through interpolations. What a checkpoint may name is in ``ghpt.models.registry``.
 """
 
+import dataclasses
 import difflib
 import functools
 import importlib
@@ -13,12 +16,24 @@ import inspect
 import math
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
+from typing import (
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 from omegaconf import OmegaConf
 
 from ghpt.errors import GhptConfigError
 
+S = TypeVar("S")
+Target = Mapping[str, Any]
+"""A group of a configuration that has a ``_target_``: it stays plain, and `build` makes it."""
 Find = Callable[[Mapping[str, Any], str], Callable[..., Any]]
 """Gives what a node with ``_target_`` is built with, of the node and the key it stands under."""
 _DEPTH = 32
@@ -30,6 +45,91 @@ _NODES = 100_000
 def plain(config: Any) -> Any:
     """Resolve an OmegaConf node to dicts, lists and scalars."""
     return OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
+
+
+def settings(cls: type[S], values: Mapping[str, Any], path: str = "") -> S:
+    """Return the dataclass ``cls``, such as a command's settings, of a plain configuration.
+
+    Every key must be a field, and every field without a default needs its key; a group that is
+    annotated as a dataclass becomes one. Lists become tuples where the annotation says ``tuple``,
+    integers floats where it says ``float``. Groups annotated as `Target` stay plain. ``path`` is
+    the dotted key that ``values`` stand under.
+
+    Raises GhptConfigError, naming the dotted key, for an unknown key, a missing key, a value of
+    another type, and for what the dataclass itself refuses.
+    """
+    annotations = _annotations(cls)
+    for name in values:
+        if name not in annotations:
+            hint = suggest(name, annotations)
+            raise GhptConfigError(_dotted(path, name), "no such setting", hint)
+    arguments = {}
+    for name, wanted in annotations.items():
+        key = _dotted(path, name)
+        if name in values:
+            arguments[name] = _typed(values[name], wanted, key)
+        elif name in _required(cls):
+            raise GhptConfigError(key, "is missing", "Set it in the yaml.")
+    try:
+        return cls(**arguments)
+    except GhptConfigError as error:
+        if error.key not in arguments:
+            raise
+        key = _dotted(path, error.key)
+        raise GhptConfigError(key, error.problem, error.hint) from error
+
+
+def _annotations(cls: type[Any]) -> dict[str, Any]:
+    """Return the annotation of each field of a dataclass."""
+    hints = get_type_hints(cls)
+    return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
+
+
+def _required(cls: type[Any]) -> set[str]:
+    """Return the names of the fields of a dataclass that have no default."""
+    missing = dataclasses.MISSING
+    fields = dataclasses.fields(cls)
+    return {f.name for f in fields if f.default is missing and f.default_factory is missing}
+
+
+def _dotted(path: str, name: str) -> str:
+    return f"{path}.{name}" if path else name
+
+
+def _typed(value: Any, wanted: Any, key: str) -> Any:
+    """Return a plain value as the annotation ``wanted`` has it; see `settings`."""
+    kind = _alternative(value, wanted)
+    if isinstance(kind, type) and dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
+        return settings(kind, value, key)
+    check_type(value, wanted, key)
+    origin = get_origin(kind)
+    inner = get_args(kind)
+    if origin in (list, tuple, Sequence) and inner:
+        kinds = _kinds_of_items(kind, len(value))
+        items = zip(value, kinds, strict=True)
+        typed = [_typed(item, of_item, f"{key}[{i}]") for i, (item, of_item) in enumerate(items)]
+        return typed if origin is list else tuple(typed)
+    if origin in (dict, Mapping) and inner:
+        return {name: _typed(item, inner[1], f"{key}.{name}") for name, item in value.items()}
+    return float(value) if kind is float else value
+
+
+def _alternative(value: Any, wanted: Any) -> Any:
+    """Return which part of a union the value is of; any other annotation itself."""
+    if get_origin(wanted) not in (Union, types.UnionType):
+        return wanted
+    alternatives = get_args(wanted)
+    if type(value) in alternatives:
+        return type(value)
+    return next((kind for kind in alternatives if _fits(value, kind)), wanted)
+
+
+def _kinds_of_items(wanted: Any, count: int) -> tuple[Any, ...]:
+    """Return the annotation of each of ``count`` items of a list or tuple."""
+    inner = get_args(wanted)
+    if get_origin(wanted) is tuple and Ellipsis not in inner:
+        return inner
+    return (inner[0],) * count
 
 
 def suggest(word: str, existing: Iterable[object]) -> str:
@@ -229,12 +329,19 @@ def _fits(value: Any, wanted: Any) -> bool:
     if origin is Callable:
         return callable(value)
     if origin in (list, tuple, Sequence, Iterable):
-        return isinstance(value, list | tuple) and (
-            len(inner) != 1 or all(_fits(one, inner[0]) for one in value)
-        )
+        if not isinstance(value, list | tuple):
+            return False
+        kinds = _kinds_of_items(wanted, len(value))
+        return len(kinds) == len(value) and all(map(_fits, value, kinds))
+    if dataclasses.is_dataclass(wanted):
+        return type(value) not in {*_SCALARS, list, tuple}
     if origin in (dict, Mapping) or is_typeddict(wanted):
         return isinstance(value, Mapping)
     return not isinstance(wanted, type) or wanted in (object, Any) or type(value) not in _SCALARS
+
+
+def _is_plain(wanted: Any) -> bool:
+    return wanted in _SCALARS or get_origin(wanted) is Literal or dataclasses.is_dataclass(wanted)
 
 
 def _words(wanted: Any) -> str:
@@ -242,13 +349,13 @@ def _words(wanted: Any) -> str:
     origin = get_origin(wanted)
     inner = get_args(wanted)
     if origin in (Union, types.UnionType):
-        plain_ones = [one for one in inner if one in _SCALARS or get_origin(one) is Literal]
+        plain_ones = [one for one in inner if _is_plain(one)]
         return " or ".join(dict.fromkeys(map(_words, plain_ones or inner)))
     if origin is Literal:
         return ("one of " if len(inner) > 1 else "") + ", ".join(map(repr, inner))
     if origin in (list, tuple, Sequence, Iterable):
         return "a list" + (f" ({_words(inner[0])} each)" if inner else "")
-    if origin in (dict, Mapping) or is_typeddict(wanted):
+    if origin in (dict, Mapping) or is_typeddict(wanted) or dataclasses.is_dataclass(wanted):
         return "a group of settings"
     return (
         _SCALARS.get(wanted)

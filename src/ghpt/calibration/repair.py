@@ -100,8 +100,8 @@ def _exchange(
     """
     for other, whose in enumerate(names):
         both = K[[view, other]]
-        valid = bool(torch.isfinite(both).all() & (both.diagonal(dim1=-2, dim2=-1) > 0).all())
-        if other == view or not valid or torch.allclose(K[other], K[view], rtol=0.01):
+        intact = bool(torch.isfinite(both).all() & (both.diagonal(dim1=-2, dim2=-1) > 0).all())
+        if other == view or not intact or torch.allclose(K[other], K[view], rtol=0.01):
             continue
         exchanged = K.clone()
         exchanged[[view, other]] = K[[other, view]]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import hydra
 from hydra._internal.utils import get_args_parser
@@ -30,10 +30,13 @@ from ghpt.commands.jobs import (
 from ghpt.commands.outputs import Files, OutputFolder, SweepFolder
 from ghpt.commands.overrides import check_overrides
 from ghpt.config import plain
+from ghpt.config import settings as typed_settings
 from ghpt.errors import GhptConfigError, GhptError, one_line, out_of_memory
 from ghpt.files import atomic_write
 from ghpt.signals import stopped_by_signals
 
+S = TypeVar("S")
+R = TypeVar("R")
 USERS_ERRORS = (GhptError, HydraException, OmegaConfBaseException, OSError)
 """What a user can cause and mend: said in one line. Anything else is a fault of the program, with
 its trace.
@@ -44,24 +47,31 @@ _CONFIGURATION = ".hydra"
 _log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Command:
-    """What a script such as train.py does."""
+@dataclass(frozen=True, kw_only=True)
+class Command(Generic[S, R]):
+    """What a script such as train.py does.
+
+    ``settings`` is the frozen dataclass of all keys of the yaml, derived from `OutputSettings`;
+    `run` makes it once, with `ghpt.config.settings`, and gives it to ``files``, ``task`` and
+    ``after``. With ``settings=dict`` they get the plain configuration.
+    """
 
     name: str
-    """Of the configuration file in conf/."""
-    task: Callable[[dict[str, Any], Path], Any]
+    """The name of the configuration file in conf/."""
+    settings: type[S]
+    """The type of the settings."""
+    task: Callable[[S, Path], R]
     """Takes the settings and the output folder."""
-    summary: Callable[[Any], str]
-    """What ``task`` returned, in words."""
-    files: Callable[[dict[str, Any]], Files]
-    """What the settings make it read and write."""
-    after: Callable[[list[Job]], Any] | None = None
+    summary: Callable[[R], str]
+    """Says in one line what ``task`` returned."""
+    files: Callable[[S], Files]
+    """Says what the settings make it read and write."""
+    after: Callable[[list[Job[S, R]]], object] | None = None
     """Called after a sweep with all of its jobs, the failed ones included."""
 
 
 @stopped_by_signals()
-def run(conf: Path, command: Command) -> None:
+def run(conf: Path, command: Command[Any, Any]) -> None:
     """Compose ``<conf>/<command.name>.yaml`` with the command line and call ``command.task``.
 
     The output folder is locked and guarded meanwhile, see `ghpt.commands.outputs`. A user's error
@@ -72,7 +82,7 @@ def run(conf: Path, command: Command) -> None:
     trace = os.environ.get(_FULL) == "1"
     os.environ[_FULL] = "1"  # Hydra then lets errors through, to be said here
     script = os.path.abspath(sys.argv[0])
-    ended: list[Job] = []
+    ended: list[Job[Any, Any]] = []
     try:
         arguments = get_args_parser().parse_args()
         sweep = bool(arguments.multirun)
@@ -124,42 +134,43 @@ class _Job:
     where it is a copy.
     """
 
-    command: Command
+    command: Command[Any, Any]
     script: str
     process: int
     sweep: bool
     trace: bool
-    ended: list[Job]
+    ended: list[Job[Any, Any]]
 
-    def __call__(self, config: Any) -> Job:
+    def __call__(self, config: Any) -> Job[Any, Any]:
         elsewhere = os.getpid() != self.process
         if elsewhere:
             take_signals()
         _quieten()
         output = Path(HydraConfig.get().runtime.output_dir)
-        settings = {}
+        settings = None
         result = None
         said = "stopped"
         failed = True
         with ExitStack() as stack:  # the log is open until the end is in it
             try:
-                settings = plain(config)
-                if self.sweep and settings.get("resume") is False and not settings.get("overwrite"):
-                    settings["resume"] = "auto"
-                folder = stack.enter_context(self._folder(output, settings))
-                before = folder.finished(settings) if folder is not None and self.sweep else None
-                if before is not None and not settings.get("overwrite"):
+                values = plain(config)
+                if self.sweep and values.get("resume") is False and not values.get("overwrite"):
+                    values["resume"] = "auto"
+                settings = self._settings(values)
+                folder = stack.enter_context(self._folder(output, settings, values))
+                before = folder.finished(values) if folder is not None and self.sweep else None
+                if before is not None and not values.get("overwrite"):
                     said = f"{before} (finished before)"
                     failed = False
                 else:
                     stack.enter_context(self._records(config, output))
-                    stack.enter_context(self._as_command(settings))
+                    stack.enter_context(self._as_command(values))
                     with stopped_by_signals():
                         result = self.command.task(settings, output)
                     said = self.command.summary(result) if self.sweep else ""
                     failed = False
                     if folder is not None:
-                        folder.finish(settings, said)
+                        folder.finish(values, said)
             except Exception as caught:
                 if first_of_several_ends():
                     sys.exit(1)
@@ -178,8 +189,13 @@ class _Job:
                 self.ended.append(Job(output.name, settings, result, said, failed))
         return self.ended[-1]
 
+    def _settings(self, values: dict[str, Any]) -> Any:
+        if self.command.settings is dict:
+            return values
+        return typed_settings(self.command.settings, values)
+
     def _folder(
-        self, output: Path, settings: dict[str, Any]
+        self, output: Path, settings: Any, values: dict[str, Any]
     ) -> AbstractContextManager[OutputFolder | None]:
         """The output folder, locked and guarded; None in a training's other processes."""
         if not is_first_process():
@@ -192,7 +208,7 @@ class _Job:
         files = replace(
             files, writes=(*files.writes, *configuration), growing=(*files.growing, log)
         )
-        return OutputFolder(output, files, bool(settings.get("overwrite")))
+        return OutputFolder(output, files, bool(values.get("overwrite")))
 
     @contextmanager
     def _records(self, config: Any, output: Path) -> Iterator[None]:
@@ -216,10 +232,10 @@ class _Job:
             logging.root.removeHandler(handler)
             handler.close()
 
-    def _as_command(self, settings: dict[str, Any]) -> AbstractContextManager[None]:
+    def _as_command(self, values: dict[str, Any]) -> AbstractContextManager[None]:
         if not self.sweep:
             return nullcontext()
-        return own_command(self.script, ["resume=auto"] if settings.get("resume") == "auto" else [])
+        return own_command(self.script, ["resume=auto"] if values.get("resume") == "auto" else [])
 
 
 def _folder_names(overrides: Sequence[Override]) -> list[str]:

@@ -304,4 +304,4 @@ def _through(case: Case, views: list[int], cameras: Cameras) -> Recording:
     return case.views.part(views).recording(case.title, cameras.index(views))
 
 
-COMMAND = Command("calibrate", calibrate, summary, files)
+COMMAND = Command(name="calibrate", settings=dict, task=calibrate, summary=summary, files=files)

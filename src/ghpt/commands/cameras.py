@@ -277,4 +277,4 @@ def _stature(numbers: dict[str, Any]) -> str:
     )
 
 
-COMMAND = Command("cameras", examine, summary, files)
+COMMAND = Command(name="cameras", settings=dict, task=examine, summary=summary, files=files)

@@ -9,9 +9,10 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Generic, TypeVar
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
@@ -32,14 +33,20 @@ _PATIENCE = 10.0
 """Seconds that interrupted jobs have to save their state."""
 
 
-class Job(NamedTuple):
+S = TypeVar("S")
+R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Job(Generic[S, R]):
     """A job of a sweep, ended."""
 
     name: str
-    """Of its folder, in the sweep's."""
-    config: dict[str, Any]
-    result: Any
-    """What the task returned; None if it failed."""
+    """The name of its folder, in the sweep's."""
+    settings: S | None
+    """The settings; None if they could not be made or the job ended without a word."""
+    result: R | None
+    """What the task returned; None if it failed or had finished in an earlier run."""
     said: str
     """One line: the result's summary, or the error."""
     failed: bool
@@ -71,7 +78,7 @@ def chosen_launcher(overrides: Sequence[Override], compose_only: bool) -> str:
 
 
 @contextmanager
-def awaited(ended: list[Job]) -> Iterator[None]:
+def awaited(ended: list[Job[Any, Any]]) -> Iterator[None]:
     """Within the block, every job that submitit's launchers start is added to ``ended`` when it
     ends, however it does.
 
@@ -115,7 +122,7 @@ def awaited(ended: list[Job]) -> Iterator[None]:
 class _Awaited:
     """A submitit job whose end is noted; what Hydra's launcher asks of it."""
 
-    def __init__(self, job: Any, folder: Path, number: int, ended: list[Job]) -> None:
+    def __init__(self, job: Any, folder: Path, number: int, ended: list[Job[Any, Any]]) -> None:
         self.job = job
         self.folder = folder
         self.number = number
@@ -135,7 +142,7 @@ class _Awaited:
         self.ended.append(job)
         return [JobReturn(status=JobStatus.COMPLETED, _return_value=job)]
 
-    def _end(self) -> Job:
+    def _end(self) -> Job[Any, Any]:
         from submitit.core.utils import FailedJobError, UncompletedJobError
 
         try:
@@ -145,7 +152,7 @@ class _Awaited:
                 (path.name for path in self.folder.glob(f"{self.number}_*")), str(self.number)
             )
             said = f"error: it ended without a result; {self.job.paths.stderr} may say why"
-            return Job(name, {}, None, said, failed=True)
+            return Job(name, None, None, said, failed=True)
 
 
 def _stop(jobs: list[Any]) -> None:

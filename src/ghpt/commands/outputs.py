@@ -34,6 +34,16 @@ _NOT_COMPARED = ("output", "overwrite", "progress_bar", "resume")
 _INSIST = "Move it away, name another output, or insist with overwrite=true."
 
 
+@dataclass(frozen=True, kw_only=True)
+class OutputSettings:
+    """The settings that every command has."""
+
+    output: str
+    """The output folder."""
+    overwrite: bool = False
+    """Whether what is there is replaced, whoever wrote it."""
+
+
 @dataclass(frozen=True)
 class Files:
     """What a command reads and writes, as its settings tell before it computes anything."""
@@ -256,28 +266,39 @@ class SweepFolder(Callback):
                 cls._taken.pop().__exit__(None, None, None)
 
 
-def input_paths(settings: Mapping[str, Any]) -> tuple[Path, ...]:
-    """The files and folders that the settings of any command name as inputs."""
-    named = [settings.get("ckpt"), settings.get("cameras"), settings.get("keypoints")]
-    named.append((settings.get("data") or {}).get("root"))
-    paths = [Path(str(value)).expanduser() for value in named if value]
-    cameras = settings.get("cameras")
-    if cameras and Path(str(cameras)).is_dir():
-        # A folder of cameras may be the output of an earlier calibration: these files are read.
-        paths += [Path(str(cameras)) / name for name in ("intri.yml", "extri.yml")]
+def input_paths(*named: str | Mapping[str, Any] | None) -> tuple[Path, ...]:
+    """Return the files and folders that settings name as inputs; None names nothing.
+
+    For a mapping, the plain settings of a command, these are its ckpt, cameras, keypoints and
+    data.root.
+    """
+    values: list[str] = []
+    for one in named:
+        if isinstance(one, Mapping):
+            of_data = one.get("data") or {}
+            inputs = [one.get("ckpt"), one.get("cameras"), one.get("keypoints")]
+            values += [str(value) for value in (*inputs, of_data.get("root")) if value]
+        elif one:
+            values.append(one)
+    paths = [Path(value).expanduser() for value in values]
+    for folder in tuple(paths):
+        if folder.is_dir():
+            # A folder of cameras may be the output of an earlier calibration: these files are read.
+            paths += [folder / name for name in ("intri.yml", "extri.yml")]
     return tuple(paths)
 
 
-def check_apart(settings: Mapping[str, Any]) -> None:
-    """Raise GhptConfigError if the output folder is the folder of key points itself."""
-    folder = Path(str(settings.get("keypoints") or ""))
-    output = settings.get("output")
-    if (
-        settings.get("keypoints")
-        and output
-        and folder.is_dir()
-        and Path(str(output)).resolve() == folder.resolve()
-    ):
+def check_apart(keypoints: str | Mapping[str, Any] | None, output: str = "") -> None:
+    """Raise GhptConfigError if the output folder is the folder of key points itself.
+
+    Both may be given as the plain settings of a command.
+    """
+    if isinstance(keypoints, Mapping):
+        output = str(keypoints.get("output") or "")
+        keypoints = str(keypoints.get("keypoints") or "")
+    if not keypoints or not output or not Path(keypoints).is_dir():
+        return
+    if Path(output).resolve() == Path(keypoints).resolve():
         problem = f"is {output}, the folder that the key points are read from"
         raise GhptConfigError("output", problem, "Name another folder.")
 

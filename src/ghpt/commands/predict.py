@@ -362,4 +362,4 @@ def _check(config: dict[str, Any]) -> None:
             check(name in existing, key, f"there is no {name!r}", suggest(name, existing))
 
 
-COMMAND = Command("predict", predict, summary, files)
+COMMAND = Command(name="predict", settings=dict, task=predict, summary=summary, files=files)

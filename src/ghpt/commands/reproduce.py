@@ -105,13 +105,13 @@ def reproduce(config: dict[str, Any], output: Path, conf: Path) -> dict[str, Any
     return _reproduce(config, seeds_of(config), output, conf)
 
 
-def gather(jobs: Sequence[Job], conf: Path) -> None:
+def gather(jobs: Sequence[Job[dict[str, Any], dict[str, Any]]], conf: Path) -> None:
     """After a sweep over seeds or items: one report of them all in the sweep's folder, from the
     cells that they kept.
 
     Where the jobs differ in anything else there is nothing to gather, and each has its own report.
     """
-    configs = [job.config for job in jobs if not job.failed]
+    configs = [job.settings for job in jobs if not job.failed and job.settings is not None]
     if not configs or any(_but_shares(config) != _but_shares(configs[0]) for config in configs):
         return
     seeds = sorted({seed for config in configs for seed in seeds_of(config)})
@@ -268,4 +268,6 @@ def command(conf: Path) -> Command:
     """The command, of the configurations in the folder ``conf``."""
     task = partial(reproduce, conf=conf)
     after = partial(gather, conf=conf)
-    return Command("reproduce", task, summary, files, after)
+    return Command(
+        name="reproduce", settings=dict, task=task, summary=summary, files=files, after=after
+    )

@@ -136,4 +136,4 @@ def summary(metrics: dict[str, Any]) -> str:
 test.__test__ = False  # not one for pytest
 
 
-COMMAND = Command("test", test, summary, files)
+COMMAND = Command(name="test", settings=dict, task=test, summary=summary, files=files)

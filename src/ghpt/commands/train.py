@@ -305,4 +305,4 @@ def _say_stopped(last: Path, step: int | None) -> None:
         )
 
 
-COMMAND = Command("train", train, summary, files)
+COMMAND = Command(name="train", settings=dict, task=train, summary=summary, files=files)

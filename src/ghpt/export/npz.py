@@ -26,6 +26,8 @@ _HINT = "Predict this recording again, or copy the file again"
 _TEXTS = ("meta", "joints", "camera_names")
 
 
+_FIELDS = {"swapped": "flipped"}
+"""The fields of ``Reconstruction`` whose arrays have another name in the file."""
 _Layout = dict[str, tuple[str, tuple[int, ...]]]
 
 
@@ -86,7 +88,7 @@ def _meta(about: About) -> dict[str, Any]:
 
 
 def _masked(piece: Reconstruction) -> dict[str, torch.Tensor]:
-    values = {name: getattr(piece, name).cpu() for name in _layout(1, 1)}
+    values = {name: getattr(piece, _FIELDS.get(name, name)).cpu() for name in _layout(1, 1)}
     observed = values["state"] == State.OBSERVED
     values["points"] = torch.where(
         (values["state"] <= State.FILLED)[..., None], values["points"], torch.nan
@@ -178,7 +180,7 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
 
 def _read(path: Path, members: dict[str, Member], start: int, stop: int) -> Reconstruction:
     rows = {
-        name: torch.from_numpy(read_rows(path, members[name], start, stop))
+        _FIELDS.get(name, name): torch.from_numpy(read_rows(path, members[name], start, stop))
         for name in _layout(1, 1)
     }
     state = rows["state"]

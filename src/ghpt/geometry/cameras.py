@@ -48,24 +48,31 @@ class Cameras:
 def project(
     cameras: Cameras, points: Float[Tensor, "*B J 3"]
 ) -> tuple[Float[Tensor, "*B V J 2"], Float[Tensor, "*B V J"]]:
-    """Pixels and depths (mm) of world points in every view. Behind a camera (depth <= 0) pixels
-    mean nothing, and are finite except at depth 0 exactly, where they are 0.
+    """Return pixels and depths (mm) of world points in every view.
+
+    Behind a camera (depth <= 0) pixels mean nothing, and are finite except at depth 0 exactly,
+    where they are 0.
     """
     in_camera = points[..., None, :, :] @ cameras.R.mT + cameras.t[..., None, :]
     depth = in_camera[..., 2]
     homogeneous = in_camera @ cameras.K.mT
-    safe = torch.where(depth == 0, torch.ones_like(depth), depth)
-    pixels = torch.where((depth == 0)[..., None], 0.0, homogeneous[..., :2] / safe[..., None])
-    return pixels, depth
+    at_centre = depth == 0
+    safe_depth = torch.where(at_centre, 1.0, depth)
+    pixels = homogeneous[..., :2] / safe_depth[..., None]
+    return torch.where(at_centre[..., None], 0.0, pixels), depth
 
 
 def reprojection_error(
-    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"], points: Float[Tensor, "*B J 3"]
+    cameras: Cameras,
+    key_points: Float[Tensor, "*B V J 2"],
+    points: Float[Tensor, "*B J 3"],
 ) -> Float[Tensor, "*B V J"]:
-    """Distance in pixels between key points and the projected points, float64; inf behind a camera
-    and where an input is not finite.
+    """Return the distance in pixels between key points and the projected points, float64.
+
+    It is inf behind a camera and where an input is not finite.
     """
     double = cameras.to(torch.float64)
-    pixels, depth = project(double, points.to(torch.float64))
+    pixels, depth = project(double, points.double())
     error = torch.linalg.vector_norm(pixels - key_points, dim=-1)
-    return torch.where((depth > 0) & torch.isfinite(error), error, torch.inf)
+    measurable = (depth > 0) & torch.isfinite(error)
+    return torch.where(measurable, error, torch.inf)

@@ -1,5 +1,4 @@
-"""Two views: normalised 8-point algorithm, essential matrix, the four relative poses, distances of
-rays.
+"""Two views: the 8-point algorithm, the essential matrix, its four poses, distances of rays.
 
 Points are normalised image coordinates, ``(x, y, 1) = K^-1 (u, v, 1)``, of the reference camera a
 and the target camera b: ``x_b = R x_a + t``, ``E = [t]x R``, ``b^T E a = 0``. t has length 1.
@@ -7,8 +6,16 @@ Everything is batched and never raises on values: what a set of points does not 
 """
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
+
+from ghpt.geometry.masking import (
+    apply,
+    finite_matrices,
+    finite_vectors,
+    identity_like,
+    where,
+)
 
 MINIMUM = 8
 """Correspondences that the 8-point algorithm needs."""
@@ -23,89 +30,122 @@ tell them, and the pose that comes of them means nothing.
 """
 
 _OUTLIER = 3.0
+_MEDIAN_SAMPLES = 256
+"""A median of residuals needs no more of them."""
+_PARALLEL = 1e-14
+"""Squared sine of the angle between two rays below which they have no nearest points."""
 
 
 def normalise(
-    K: Float[Tensor, "*B 3 3"], pixels: Float[Tensor, "*B N 2"]
+    K: Float[Tensor, "*B 3 3"],
+    pixels: Float[Tensor, "*B N 2"],
 ) -> Float[Tensor, "*B N 2"]:
-    """Pixels as normalised image coordinates, float64; K is upper triangular with last row (0, 0,
-    1).
+    """Return pixels as normalised image coordinates, float64.
+
+    K is upper triangular with last row (0, 0, 1).
     """
     K = K.double()[..., None, :, :]
-    pixels = pixels.double()
-    y = (pixels[..., 1] - K[..., 1, 2]) / K[..., 1, 1]
-    x = (pixels[..., 0] - K[..., 0, 2] - K[..., 0, 1] * y) / K[..., 0, 0]
+    u, v = pixels.double().unbind(-1)
+    y = (v - K[..., 1, 2]) / K[..., 1, 1]
+    x = (u - K[..., 0, 2] - K[..., 0, 1] * y) / K[..., 0, 0]
     return torch.stack((x, y), dim=-1)
 
 
 def homogeneous(points: Float[Tensor, "*B 2"]) -> Float[Tensor, "*B 3"]:
-    return torch.cat((points, torch.ones_like(points[..., :1])), dim=-1)
+    """Return (x, y, 1) of (x, y)."""
+    one = torch.ones_like(points[..., :1])
+    return torch.cat((points, one), dim=-1)
 
 
 def cross_matrix(t: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
-    """[t]x, with ``[t]x v = t x v``."""
+    """Return [t]x, with ``[t]x v = t x v``."""
     x, y, z = t.unbind(-1)
     zero = torch.zeros_like(x)
-    return torch.stack((zero, -z, y, z, zero, -x, -y, x, zero), dim=-1).unflatten(-1, (3, 3))
+    elements = (zero, -z, y, z, zero, -x, -y, x, zero)
+    return torch.stack(elements, dim=-1).unflatten(-1, (3, 3))
 
 
 def essential(R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
-    """E = [t]x R of a relative pose."""
+    """Return E = [t]x R of a relative pose."""
     return cross_matrix(t) @ R
 
 
 def _hartley(
-    points: Float[Tensor, "*B N 2"], weights: Float[Tensor, "*B N"]
-) -> tuple[Tensor, Tensor]:
-    """Points with mean 0 and mean distance sqrt(2) (Hartley 1997), and the 3x3 matrix that makes
-    them so.
+    points: Float[Tensor, "*B N 2"],
+    weights: Float[Tensor, "*B N"],
+) -> tuple[Float[Tensor, "*B N 2"], Float[Tensor, "*B 3 3"]]:
+    """Return points with mean 0 and mean distance sqrt(2), and the matrix that makes them so.
+
+    This is the normalisation of Hartley (1997).
     """
-    share = weights / weights.sum(-1, keepdim=True).clamp_min(torch.finfo(weights.dtype).tiny)
+    tiny = torch.finfo(weights.dtype).tiny
+    total = weights.sum(-1, keepdim=True)
+    share = weights / total.clamp_min(tiny)
     mean = (share[..., None] * points).sum(-2)
     centred = points - mean[..., None, :]
     distance = (share * centred.norm(dim=-1)).sum(-1)
     scale = 2**0.5 / torch.where(distance > 0, distance, 1.0)
-    T = torch.diag_embed(torch.stack((scale, scale, torch.ones_like(scale)), dim=-1))
+    diagonal = (scale, scale, torch.ones_like(scale))
+    T = torch.diag_embed(torch.stack(diagonal, dim=-1))
     T[..., :2, 2] = -scale[..., None] * mean
     return centred * scale[..., None, None], T
 
 
-def eight_point(
-    a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], weights: Float[Tensor, "*B N"]
-) -> tuple[Float[Tensor, "*B 3 3"], Bool[Tensor, "*B"]]:
-    """The essential matrix (singular values 1, 1, 0) that minimises the weighted sum of (b^T E
-    a)^2, by the normalised 8-point algorithm, and whether the points determine one (then at least 8
-    have a weight); 0 where not.
+def _correspondence_rows(
+    a: Float[Tensor, "*B N d"],
+    b: Float[Tensor, "*B N d"],
+) -> Float[Tensor, "*B N d*d"]:
+    """Return the rows r with ``r . vec(E) = b^T E a`` of homogeneous points a and b."""
+    outer = b[..., :, None] * a[..., None, :]
+    return outer.flatten(-2)
 
-    A point with weight 0 is not used, whatever its numbers are.
+
+def eight_point(
+    a: Float[Tensor, "*B N 2"],
+    b: Float[Tensor, "*B N 2"],
+    weights: Float[Tensor, "*B N"],
+) -> tuple[Float[Tensor, "*B 3 3"], Bool[Tensor, "*B"]]:
+    """Return the essential matrix that minimises the weighted sum of (b^T E a)^2, and its validity.
+
+    The matrix (singular values 1, 1, 0) is that of the normalised 8-point algorithm. It is valid if
+    the points determine one, so at least 8 have a weight; otherwise it is 0. A point with weight 0
+    is not used, whatever its numbers are.
     """
-    used = (weights > 0) & torch.isfinite(a).all(-1) & torch.isfinite(b).all(-1)
+    finite = finite_vectors(a) & finite_vectors(b)
+    used = (weights > 0) & finite
     weights = torch.where(used, weights, 0.0).double()
-    (rows_a, Ta), (rows_b, Tb) = (
-        _hartley(torch.where(used[..., None], x, 0.0).double(), weights) for x in (a, b)
-    )
-    rows = (homogeneous(rows_b)[..., :, None] * homogeneous(rows_a)[..., None, :]).flatten(-2)
-    return _smallest(rows.mT @ (weights[..., None] * rows), used.sum(-1), Ta, Tb)
+    safe_a = where(used, a, 0.0).double()
+    safe_b = where(used, b, 0.0).double()
+    normalised_a, Ta = _hartley(safe_a, weights)
+    normalised_b, Tb = _hartley(safe_b, weights)
+    rows = _correspondence_rows(homogeneous(normalised_a), homogeneous(normalised_b))
+    normal = rows.mT @ (weights[..., None] * rows)
+    return _solve_essential(normal, used.sum(-1), Ta, Tb)
 
 
 def eight_point_subsets(
-    a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], weights: Float[Tensor, "*B H N"]
+    a: Float[Tensor, "*B N 2"],
+    b: Float[Tensor, "*B N 2"],
+    weights: Float[Tensor, "*B H N"],
 ) -> tuple[Float[Tensor, "*B H 3 3"], Bool[Tensor, "*B H"]]:
-    """``eight_point`` under each of H weightings of the same points, which must be finite: one
-    product of matrices.
+    """Return ``eight_point`` under each of H weightings of the same points, which must be finite.
 
-    The points are normalised once, by all that any weighting uses.
+    The points are normalised once, by all that any weighting uses; the normal equations of all
+    weightings are one product of matrices.
     """
     weights = weights.double()
-    anywhere = (weights > 0).any(-2).double()
-    (a, Ta) = _hartley(a.double(), anywhere)
-    (b, Tb) = _hartley(b.double(), anywhere)
-    rows = (homogeneous(b)[..., :, None] * homogeneous(a)[..., None, :]).flatten(-2)
+    used_by_any = (weights > 0).any(-2).double()
+    normalised_a, Ta = _hartley(a.double(), used_by_any)
+    normalised_b, Tb = _hartley(b.double(), used_by_any)
+    rows = _correspondence_rows(homogeneous(normalised_a), homogeneous(normalised_b))
     i, j = torch.triu_indices(9, 9, device=rows.device)
-    normal = torch.empty((*weights.shape[:-1], 9, 9), dtype=rows.dtype, device=rows.device)
-    normal[..., i, j] = weights @ (rows[..., i] * rows[..., j])
-    normal[..., j, i] = normal[..., i, j]
-    return _smallest(normal, (weights > 0).sum(-1), Ta[..., None, :, :], Tb[..., None, :, :])
+    upper = weights @ (rows[..., i] * rows[..., j])
+    shape = (*weights.shape[:-1], 9, 9)
+    normal = torch.empty(shape, dtype=rows.dtype, device=rows.device)
+    normal[..., i, j] = upper
+    normal[..., j, i] = upper
+    count = (weights > 0).sum(-1)
+    return _solve_essential(normal, count, Ta.unsqueeze(-3), Tb.unsqueeze(-3))
 
 
 def robust_weights(
@@ -114,54 +154,70 @@ def robust_weights(
     b: Float[Tensor, "*B N 2"],
     used: Bool[Tensor, "*B N"],
 ) -> Float[Tensor, "*B H N"]:
-    """Weights of (b^T E a)^2 that make it the squared Sampson distance r^2 under Geman and
-    McClure's loss, ``1 / (1 + (r / s)^2)^2`` with s three times the median of r, about four
-    standard deviations of what is no outlier; the largest is 1, of unused points 0.
+    """Return weights of (b^T E a)^2 that make it Geman and McClure's loss of the Sampson distance.
+
+    With r that distance, they are ``1 / (1 + (r / s)^2)^2`` over its squared gradient, with s three
+    times the median of r, about four standard deviations of the inliers. The largest is 1, those of
+    unused points are 0.
     """
-    ha = homogeneous(a)
-    hb = homogeneous(b)
-    residual = E.flatten(-2) @ (hb[..., :, None] * ha[..., None, :]).flatten(-2).mT
-    gradient = (E[..., :2, :].flatten(-3, -2) @ ha.mT).square().unflatten(-2, (-1, 2)).sum(-2)
-    gradient += (E.mT[..., :2, :].flatten(-3, -2) @ hb.mT).square().unflatten(-2, (-1, 2)).sum(-2)
     tiny = torch.finfo(E.dtype).tiny
+    residual, gradient = _sampson_terms(E, homogeneous(a), homogeneous(b))
     gradient = gradient.clamp_min(tiny)
     square = residual.square() / gradient
-    few = slice(None, None, -(-a.shape[-2] // 256))  # a median needs no more
-    some = torch.where(used[..., None, few], square[..., few], torch.nan)
-    scale = (
-        (_OUTLIER**2 * some.nanmedian(dim=-1, keepdim=True).values).nan_to_num(1.0).clamp_min(tiny)
-    )
-    weights = torch.where(used[..., None, :], 1 / ((1 + square / scale).square() * gradient), 0.0)
-    return weights / weights.amax(dim=-1, keepdim=True).clamp_min(tiny)
+    stride = -(-a.shape[-2] // _MEDIAN_SAMPLES)
+    sampled_used = used[..., None, ::stride]
+    sampled_square = torch.where(sampled_used, square[..., ::stride], torch.nan)
+    median = sampled_square.nanmedian(dim=-1, keepdim=True).values
+    scale = (_OUTLIER**2 * median).nan_to_num(1.0).clamp_min(tiny)
+    weights = 1 / ((1 + square / scale).square() * gradient)
+    weights = torch.where(used[..., None, :], weights, 0.0)
+    largest = weights.amax(dim=-1, keepdim=True)
+    return weights / largest.clamp_min(tiny)
 
 
-def _smallest(normal: Tensor, count: Tensor, Ta: Tensor, Tb: Tensor) -> tuple[Tensor, Tensor]:
-    """The essential matrix of normal equations, and whether they have one solution."""
-    finite = torch.isfinite(normal).all(-1).all(-1)
-    values, vectors = torch.linalg.eigh(torch.where(finite[..., None, None], normal, 0.0))
-    ok = finite & (count >= MINIMUM) & (values[..., 1] > DEGENERATE * values[..., -1])
-    F = Tb.mT @ vectors[..., 0].unflatten(-1, (3, 3)) @ Ta
-    U, _, Vt = torch.linalg.svd(
-        torch.where(ok[..., None, None], F, torch.eye(3, dtype=F.dtype, device=F.device))
-    )
+def _solve_essential(
+    normal: Float[Tensor, "*B 9 9"],
+    count: Int[Tensor, "*B"],
+    Ta: Float[Tensor, "*#B 3 3"],
+    Tb: Float[Tensor, "*#B 3 3"],
+) -> tuple[Float[Tensor, "*B 3 3"], Bool[Tensor, "*B"]]:
+    """Return the essential matrix of normal equations, and whether they have one solution."""
+    finite = finite_matrices(normal)
+    safe_normal = where(finite, normal, 0.0)
+    values, vectors = torch.linalg.eigh(safe_normal)
+    unique = values[..., 1] > DEGENERATE * values[..., -1]
+    valid = finite & (count >= MINIMUM) & unique
+    solution = vectors[..., 0].unflatten(-1, (3, 3))
+    F = Tb.mT @ solution @ Ta
+    safe_F = where(valid, F, identity_like(F))
+    U, _, Vt = torch.linalg.svd(safe_F)
     E = U[..., :2] @ Vt[..., :2, :]
-    return torch.where(ok[..., None, None], E, 0.0), ok
+    return where(valid, E, 0.0), valid
 
 
 def decompose(
     E: Float[Tensor, "*B 3 3"],
 ) -> tuple[Float[Tensor, "*B 4 3 3"], Float[Tensor, "*B 4 3"]]:
-    """The four relative poses of an essential matrix: (R1, t), (R1, -t), (R2, t), (R2, -t), t of
-    length 1. Finite and meaningless where E is not finite.
+    """Return the four relative poses of an essential matrix: (R1, t), (R1, -t), (R2, t), (R2, -t).
+
+    t has length 1. The poses are finite and meaningless where E is not finite.
     """
-    finite = torch.isfinite(E).all(-1).all(-1)[..., None, None]
-    U, _, Vt = torch.linalg.svd(torch.where(finite, E, 0.0))
-    U, Vt = (M * torch.where(torch.linalg.det(M) < 0, -1.0, 1.0)[..., None, None] for M in (U, Vt))
+    safe_E = where(finite_matrices(E), E, 0.0)
+    U, _, Vt = torch.linalg.svd(safe_E)
+    U = _with_positive_determinant(U)
+    Vt = _with_positive_determinant(Vt)
     W = E.new_tensor([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     R1 = U @ W @ Vt
     R2 = U @ W.mT @ Vt
     t = U[..., 2]
-    return torch.stack((R1, R1, R2, R2), dim=-3), torch.stack((t, -t, t, -t), dim=-2)
+    rotations = torch.stack((R1, R1, R2, R2), dim=-3)
+    translations = torch.stack((t, -t, t, -t), dim=-2)
+    return rotations, translations
+
+
+def _with_positive_determinant(M: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3 3"]:
+    sign = torch.where(torch.linalg.det(M) < 0, -1.0, 1.0)
+    return M * sign[..., None, None]
 
 
 def depths(
@@ -170,24 +226,24 @@ def depths(
     a: Float[Tensor, "*#B N 2"],
     b: Float[Tensor, "*#B N 2"],
 ) -> tuple[Float[Tensor, "*#B N"], Float[Tensor, "*#B N"]]:
-    """Depths, in units of t: in a of the point of a's ray nearest to b's, in b of that of b's ray;
-    0 for parallel rays.
+    """Return, in units of t, the depths in a and in b of the points where their rays are nearest.
 
-    These points are at ``alpha R a`` and ``beta b - t`` in b's axes (all from a's centre).
+    The points are at ``alpha R a`` and ``beta b - t`` in b's axes (all from a's centre). Depths are
+    0 for parallel rays.
     """
     u = homogeneous(a) @ R.mT
     v = homogeneous(b)
     uu = (u * u).sum(-1)
     vv = (v * v).sum(-1)
     uv = (u * v).sum(-1)
-    ut = (u @ t[..., None])[..., 0]
-    vt = (v @ t[..., None])[..., 0]
+    ut = apply(u, t)
+    vt = apply(v, t)
     determinant = uu * vv - uv * uv
-    good = determinant > 1e-14 * uu * vv
-    safe = torch.where(good, determinant, 1.0)
+    crossing = determinant > _PARALLEL * uu * vv
+    safe = torch.where(crossing, determinant, 1.0)
     alpha = (uv * vt - vv * ut) / safe
     beta = (uu * vt - uv * ut) / safe
-    return torch.where(good, alpha, 0.0), torch.where(good, beta, 0.0)
+    return torch.where(crossing, alpha, 0.0), torch.where(crossing, beta, 0.0)
 
 
 def in_front(
@@ -196,7 +252,7 @@ def in_front(
     a: Float[Tensor, "*#B N 2"],
     b: Float[Tensor, "*#B N 2"],
 ) -> Bool[Tensor, "*#B N"]:
-    """Which points lie in front of both cameras."""
+    """Return which points lie in front of both cameras."""
     alpha, beta = depths(R, t, a, b)
     return (alpha > 0) & (beta > 0)
 
@@ -207,9 +263,9 @@ def pose_in_front(
     b: Float[Tensor, "*B N 2"],
     used: Bool[Tensor, "*B N"],
 ) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"], Bool[Tensor, "*B"]]:
-    """``poses_in_front`` of one essential matrix for each set of points."""
-    R, t, ok = poses_in_front(E[..., None, :, :], a, b, used[..., None, :])
-    return R[..., 0, :, :], t[..., 0, :], ok[..., 0]
+    """Return ``poses_in_front`` of one essential matrix for each set of points."""
+    R, t, valid = poses_in_front(E[..., None, :, :], a, b, used[..., None, :])
+    return R[..., 0, :, :], t[..., 0, :], valid[..., 0]
 
 
 def poses_in_front(
@@ -218,31 +274,62 @@ def poses_in_front(
     b: Float[Tensor, "*B N 2"],
     used: Bool[Tensor, "*B H N"],
 ) -> tuple[Float[Tensor, "*B H 3 3"], Float[Tensor, "*B H 3"], Bool[Tensor, "*B H"]]:
-    """Of the four poses of each of H essential matrices the one with most of its used points in
-    front, and whether one has more than the others. Identity and t = 0 where none has.
+    """Return the pose of each of H essential matrices with most of its used points in front.
+
+    Also returns whether one of its four poses has more of them than the others; the pose is the
+    identity and t = 0 where none has.
+    """
+    rotations, translations = decompose(E)
+    # the poses of +t; those of -t are counted by their signs
+    R = rotations[..., ::2, :, :]
+    t = translations[..., ::2, :]
+    count = _count_in_front(R, t, a, b, used)
+    top = count.topk(2, dim=-1)
+    best = top.indices[..., 0]
+    valid = top.values[..., 0] > top.values[..., 1]
+    index = (best // 2)[..., None, None]
+    R_index = index[..., None].expand(*best.shape, 1, 3, 3)
+    best_R = R.gather(-3, R_index)[..., 0, :, :]
+    best_t = t.gather(-2, index.expand(*best.shape, 1, 3))[..., 0, :]
+    sign = 1 - 2 * (best % 2)
+    best_t = best_t * sign[..., None]
+    best_R = where(valid, best_R, identity_like(best_R))
+    best_t = where(valid, best_t, 0.0)
+    return best_R, best_t, valid
+
+
+def _count_in_front(
+    R: Float[Tensor, "*B H 2 3 3"],
+    t: Float[Tensor, "*B H 2 3"],
+    a: Float[Tensor, "*B N 2"],
+    b: Float[Tensor, "*B N 2"],
+    used: Bool[Tensor, "*B H N"],
+) -> Int[Tensor, "*B H 4"]:
+    """Count the used points in front of both cameras under (R1, t), (R1, -t), (R2, t), (R2, -t).
 
     Only signs are needed: with unit rays f, those of the depths' numerators (see ``depths``), and
     -t flips both.
     """
-    Rs, ts = (x[..., ::2, :, :] if x.dim() > E.dim() else x[..., ::2, :] for x in decompose(E))
-    fa, fb = (homogeneous(x) / homogeneous(x).norm(dim=-1, keepdim=True) for x in (a, b))
-    products = (fb[..., :, None] * fa[..., None, :]).flatten(-2).mT
-    uv = (Rs.flatten(-2).flatten(-3, -2) @ products).unflatten(-2, (-1, 2))
-    ut = ((Rs.mT @ ts[..., None])[..., 0].flatten(-3, -2) @ fa.mT).unflatten(-2, (-1, 2))
-    vt = (ts.flatten(-3, -2) @ fb.mT).unflatten(-2, (-1, 2))
+    fa = _unit_rays(a)
+    fb = _unit_rays(b)
+    pairs = _correspondence_rows(fa, fb).mT
+    R_rows = R.flatten(-2).flatten(-3, -2)
+    uv = (R_rows @ pairs).unflatten(-2, (-1, 2))
+    t_in_a = apply(R.mT, t)
+    ut = (t_in_a.flatten(-3, -2) @ fa.mT).unflatten(-2, (-1, 2))
+    vt = (t.flatten(-3, -2) @ fb.mT).unflatten(-2, (-1, 2))
     alpha = uv * vt - ut
     beta = vt - uv * ut
-    forward = (alpha > 0) & (beta > 0) & used[..., None, :]
-    backward = (alpha < 0) & (beta < 0) & used[..., None, :]
-    count = torch.stack((forward.sum(-1), backward.sum(-1)), dim=-1).flatten(-2)
-    top = count.topk(2, dim=-1)
-    best = top.indices[..., 0]
-    ok = top.values[..., 0] > top.values[..., 1]
-    index = (best // 2)[..., None, None]
-    R = Rs.gather(-3, index[..., None].expand(*best.shape, 1, 3, 3))[..., 0, :, :]
-    t = ts.gather(-2, index.expand(*best.shape, 1, 3))[..., 0, :] * (1 - 2 * (best % 2))[..., None]
-    eye = torch.eye(3, dtype=R.dtype, device=R.device)
-    return torch.where(ok[..., None, None], R, eye), torch.where(ok[..., None], t, 0.0), ok
+    used = used[..., None, :]
+    forward = (alpha > 0) & (beta > 0) & used
+    backward = (alpha < 0) & (beta < 0) & used
+    counts = (forward.sum(-1), backward.sum(-1))
+    return torch.stack(counts, dim=-1).flatten(-2)
+
+
+def _unit_rays(points: Float[Tensor, "*B N 2"]) -> Float[Tensor, "*B N 3"]:
+    ray = homogeneous(points)
+    return ray / ray.norm(dim=-1, keepdim=True)
 
 
 def ray_distances(
@@ -251,29 +338,52 @@ def ray_distances(
     a: Float[Tensor, "*B N 2"],
     b: Float[Tensor, "*B N 2"],
 ) -> Float[Tensor, "*B H N"]:
-    """Distances, in units of t (of length 1), between the corresponding rays (as lines) under each
-    of H poses.
+    """Return the distances between corresponding rays (as lines) under each of H poses.
 
-    With unit rays f it is |f_b^T E f_a| / |R f_a x f_b|: two products of matrices for all poses and
-    points. Rays closer than 1e-6 rad to parallel have no well-defined distance and get at most 1.
+    Distances are in units of t (of length 1). With unit rays f each is |f_b^T E f_a| / |R f_a x
+    f_b|: two products of matrices for all poses and points. Rays closer than 1e-6 rad to parallel
+    have no well-defined distance and get at most 1.
     """
-    fa, fb = (homogeneous(x) / homogeneous(x).norm(dim=-1, keepdim=True) for x in (a, b))
-    products = (fb[..., :, None] * fa[..., None, :]).flatten(-2).mT
-    numerator = (essential(R, t).flatten(-2) @ products).abs()
-    cosine = R.flatten(-2) @ products
-    return (numerator / (1 - cosine * cosine).clamp_min(1e-12).sqrt()).clamp(max=1)
+    pairs = _correspondence_rows(_unit_rays(a), _unit_rays(b)).mT
+    E = essential(R, t)
+    numerator = (E.flatten(-2) @ pairs).abs()
+    cosine = R.flatten(-2) @ pairs
+    square_sine = (1 - cosine * cosine).clamp_min(1e-12)
+    distance = numerator / square_sine.sqrt()
+    return distance.clamp(max=1)
 
 
 def sampson_error(
-    E: Float[Tensor, "*B H 3 3"], a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"]
+    E: Float[Tensor, "*B H 3 3"],
+    a: Float[Tensor, "*B N 2"],
+    b: Float[Tensor, "*B N 2"],
 ) -> Float[Tensor, "*B H N"]:
-    """First-order distance of each correspondence from each of H epipolar geometries (normalised
-    image coordinates, >= 0).
+    """Return the first-order distance of correspondences from each of H epipolar geometries.
+
+    It is in normalised image coordinates and >= 0.
     """
-    a = homogeneous(a)
-    b = homogeneous(b)
-    residual = E.flatten(-2) @ (b[..., :, None] * a[..., None, :]).flatten(-2).mT
-    Ea = (E[..., :2, :].flatten(-3, -2) @ a.mT).unflatten(-2, (-1, 2))
-    Eb = (E.mT[..., :2, :].flatten(-3, -2) @ b.mT).unflatten(-2, (-1, 2))
-    square = Ea.square().sum(-2) + Eb.square().sum(-2)
-    return residual.abs() / square.clamp_min(torch.finfo(E.dtype).tiny).sqrt()
+    tiny = torch.finfo(E.dtype).tiny
+    residual, gradient = _sampson_terms(E, homogeneous(a), homogeneous(b))
+    return residual.abs() / gradient.clamp_min(tiny).sqrt()
+
+
+def _sampson_terms(
+    E: Float[Tensor, "*B H 3 3"],
+    a: Float[Tensor, "*B N 3"],
+    b: Float[Tensor, "*B N 3"],
+) -> tuple[Float[Tensor, "*B H N"], Float[Tensor, "*B H N"]]:
+    """Return the residual b^T E a and its squared gradient in image coordinates."""
+    residual = E.flatten(-2) @ _correspondence_rows(a, b).mT
+    square_a = _square_line_normals(E, a)
+    square_b = _square_line_normals(E.mT, b)
+    return residual, square_a + square_b
+
+
+def _square_line_normals(
+    E: Float[Tensor, "*B H 3 3"],
+    points: Float[Tensor, "*B N 3"],
+) -> Float[Tensor, "*B H N"]:
+    """Return the squared norm of the first two components of the epipolar lines ``E x``."""
+    rows = E[..., :2, :].flatten(-3, -2)
+    normals = (rows @ points.mT).unflatten(-2, (-1, 2))
+    return normals.square().sum(-2)

@@ -213,7 +213,7 @@ def _section(
         )
         for split, rows in numbers.items()
     ]
-    data = results.words(BASE)
+    data = results.display_name(BASE)
     figure = curves(
         panels,
         f"{data}, trained on its training subjects unless said",

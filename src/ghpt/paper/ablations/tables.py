@@ -64,7 +64,7 @@ def _section(results: Results, variants: Variants, about: str) -> Section:
     ]
     table = "Pelvis-relative MPJPE of the weighted selection on Human3.6M, trained on Human3.6M unless said."
     body = [f"{about} {table}", markdown(head, rows), _chosen(numbers)]
-    return Section(results.words(BASE), "\n\n".join(body))
+    return Section(results.display_name(BASE), "\n\n".join(body))
 
 
 def _chosen(numbers: Mapping[str, Sequence[Spread]]) -> str:

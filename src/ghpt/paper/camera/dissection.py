@@ -48,7 +48,7 @@ def _dissection(results: Results) -> Section:
         f"(largest opposite: {_largest_opposite(alone)})",
     )
     return Section(
-        results.words("h36m"),
+        results.display_name("h36m"),
         f"{text}\n\n{markdown(head, rows)}",
         {},
         compared,

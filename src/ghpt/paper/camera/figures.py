@@ -58,7 +58,7 @@ def _section(results: Results) -> Section:
     paper = sweeps[name]
     frames = sorted(sweeps[name]["weight"])
     draws = len(paper["weight"][frames[0]])
-    words = results.words("h36m")
+    words = results.display_name("h36m")
     heading = f"Cameras {name} of {words}, {draws} draws of M frames"
     caption = (
         f"E_3D against the number of frames M: mean and standard deviation of {draws} draws, cut at {CLIP:.0f} mm; "

@@ -75,7 +75,7 @@ def _fundamental(results: Results) -> Section:
         _baselines(results),
     ]
     return Section(
-        results.words("h36m"),
+        results.display_name("h36m"),
         "\n\n".join(body),
         {},
         compared,

@@ -77,7 +77,7 @@ def _cells(setup: Setup) -> dict[str, Cell]:
 
 def _section(results: Results) -> Section:
     size = results.setup.sizes["unknown_extrinsics"]
-    words = results.words("h36m")
+    words = results.display_name("h36m")
     rows = []
     compared = []
     for trained, name in MODELS.items():
@@ -111,8 +111,8 @@ def _section(results: Results) -> Section:
         other,
         _increases(results),
     ]
-    if results.words("cmu3").startswith("synthetic") != words.startswith("synthetic"):
-        words = f"{words}, CMU3 model trained on {results.words('cmu3')}"
+    if results.display_name("cmu3").startswith("synthetic") != words.startswith("synthetic"):
+        words = f"{words}, CMU3 model trained on {results.display_name('cmu3')}"
     return Section(words, "\n\n".join(body), {}, compared, _claims(results), _explained(results))
 
 

@@ -79,7 +79,7 @@ def _quantitative(results: Results) -> Section:
         f"{mean:.1f} mm: ahead of {len(beaten)} of 5 (29.1 mm: 4 of 5)",
     )
     return Section(
-        results.words("h36m"),
+        results.display_name("h36m"),
         f"{text}\n\n{markdown(header, rows)}",
         {},
         compared,
@@ -114,7 +114,7 @@ def _hypotheses(results: Results) -> Section:
         others += [
             Compared(NAMES.get(s, s), None, results.relative(test, s)) for s in BASELINES[1:]
         ]
-        about = f"**{escaped(results.words(data))}**, trained on the same"
+        about = f"**{escaped(results.display_name(data))}**, trained on the same"
         tables.append(f"{about}\n\n{comparison([*rows, *others], 'hypothesis')}")
         compared += [
             Compared(f"{name}, {row.what}", row.paper, row.ours, row.better) for row in rows
@@ -135,7 +135,7 @@ def _hypotheses(results: Results) -> Section:
         )
     )
     return Section(
-        f"{results.words('h36m')} and {results.words(PANOPTIC)}",
+        f"{results.display_name('h36m')} and {results.display_name(PANOPTIC)}",
         "\n\n".join(tables),
         {},
         compared,
@@ -230,7 +230,7 @@ def _limitation(results: Results) -> Section:
     text = comparison(rows, "split of Human3.6M")
     synthetic = results.setup.root("h36m") is None
     return Section(
-        results.words("h36m"), f"{text}\n\n{note}" if synthetic else text, {}, rows, [claim]
+        results.display_name("h36m"), f"{text}\n\n{note}" if synthetic else text, {}, rows, [claim]
     )
 
 

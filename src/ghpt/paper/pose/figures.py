@@ -58,7 +58,7 @@ def _qualitative(results: Results) -> Section:
     pictures = "\n\n".join(
         f"![{kind} frame]({name}.svg)" for kind, name in zip(QUANTILES, figures, strict=True)
     )
-    return Section(results.words("h36m"), f"{text}\n\n{pictures}", figures, (), [claim])
+    return Section(results.display_name("h36m"), f"{text}\n\n{pictures}", figures, (), [claim])
 
 
 def _relative_errors(chunk: PredictionChunk, name: str) -> Float[np.ndarray, " N"]:
@@ -73,7 +73,7 @@ def _heading(
     results: Results, predictions: Predictions, chunk: PredictionChunk, row: int, which: str
 ) -> str:
     take = predictions.recording_name[int(chunk.recording[row])]
-    return f"{results.words('h36m')}, test split: {take}, frame {int(chunk.frame[row])}, {which}"
+    return f"{results.display_name('h36m')}, test split: {take}, frame {int(chunk.frame[row])}, {which}"
 
 
 def _pose_prior(results: Results) -> Section:
@@ -130,7 +130,7 @@ def _pose_prior(results: Results) -> Section:
     body = (
         f"{text}\n\n![pose prior](pose-prior.svg)\n\n1000 S², seed {results.setup.seed}:\n\n{table}"
     )
-    return Section(results.words("h36m"), body, {"pose-prior": figure}, (), claims)
+    return Section(results.display_name("h36m"), body, {"pose-prior": figure}, (), claims)
 
 
 def _ratio(a: Float[np.ndarray, " L"], b: Float[np.ndarray, " L"]) -> float:

@@ -87,13 +87,13 @@ def _generalization(results: Results) -> Section:
         f"{min(averages):.1f} to {max(averages):.1f}, nearly all of it a difference in the definition of the joints "
         f"that no selection can remove; our learned numbers are {min(weights):.1f} to {max(weights):.1f} mm."
     )
-    data = f"{four(results)} and {results.words('h36m')}"
+    data = f"{four(results)} and {results.display_name('h36m')}"
     return Section(data, f"{text}\n\n{markdown(header, rows)}", {}, compared, claims, explained)
 
 
 def four(results: Results) -> str:
     """Panoptic's arrangements in words."""
-    return results.words("cmu1").replace(" CMU1", " CMU1 to CMU4")
+    return results.display_name("cmu1").replace(" CMU1", " CMU1 to CMU4")
 
 
 def _difference(results: Results, test: str) -> Spread:

@@ -69,7 +69,7 @@ def _gain(ours: Spread) -> float:
 
 
 def _to_human36m(results: Results, train: str) -> str:
-    return f"{results.words(train)} to {results.words('h36m')}"
+    return f"{results.display_name(train)} to {results.display_name('h36m')}"
 
 
 def _remelli(results: Results) -> Section:
@@ -123,7 +123,7 @@ def _remelli(results: Results) -> Section:
             f"{inter.text()} % (15.1 %)",
         ),
     ]
-    data = f"{four(results)} and {results.words('h36m')}"
+    data = f"{four(results)} and {results.display_name('h36m')}"
     return Section(
         data, f"{text}\n\n{markdown(header, rows)}", {}, compared, claims, _EXPLAINED_LEVEL
     )

@@ -61,7 +61,7 @@ def _section(results: Results) -> Section:
         _beats_classical("Human3.6M", ours, {"h36m": classical["h36m"]}),
         _beats_classical("Panoptic", ours, {test: classical[test] for test in PANOPTIC}),
     ]
-    data = f"{four(results)} and {results.words('h36m')}"
+    data = f"{four(results)} and {results.display_name('h36m')}"
     return Section(data, f"{text}\n\n{markdown(header, rows)}", {}, (), claims)
 
 

@@ -21,8 +21,8 @@ def _section(
 ) -> Section:
     sizes = results.setup.sizes["robustness"]
     all_found = [found(results, curve) for curve in of]
-    data = results.words(of[0].data)
-    trained = f"trained on {results.words(sizes['trained_on'])}"
+    data = results.display_name(of[0].data)
+    trained = f"trained on {results.display_name(sizes['trained_on'])}"
     kinds = ("relative", "absolute") if absolute else ("relative",)
     figures = {}
     body = [about]

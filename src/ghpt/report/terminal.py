@@ -1,0 +1,89 @@
+"""A document in the terminal."""
+
+from __future__ import annotations
+
+import rich.table
+import rich.text
+from rich.console import Console
+
+from ghpt.report.document import (
+    Block,
+    Bullets,
+    CodeBlock,
+    Document,
+    Emphasis,
+    Figure,
+    Heading,
+    Paragraph,
+    Span,
+    Strong,
+    Table,
+    Text,
+    printable,
+    spans,
+)
+
+
+def print_document(document: Document, console: Console | None = None) -> None:
+    """Print the document to ``console``, by default to standard output."""
+    console = console or Console()
+    if document.title:
+        console.print(styled(document.title, "bold"), soft_wrap=True)
+    for block in document.blocks:
+        _print_block(block, console)
+
+
+def styled(text: Text, style: str = "") -> rich.text.Text:
+    """Return the text for the terminal, in which ``[red]`` and ``:smile:`` are letters."""
+    parts = [(_shown(span), _style(span)) for span in spans(text)]
+    return rich.text.Text.assemble(*parts, style=style)
+
+
+def _shown(span: Span) -> str:
+    return printable(span if isinstance(span, str) else span.text)
+
+
+def _style(span: Span) -> str:
+    match span:
+        case Strong(_, colour):
+            return colour or "bold"
+        case Emphasis():
+            return "italic"
+        case _:
+            return ""
+
+
+def _print_block(block: Block, console: Console) -> None:
+    match block:
+        case Table():
+            console.print(_table(block))
+        case Heading(text):
+            console.print(styled(text, "bold"), soft_wrap=True)
+        case Paragraph(text):
+            console.print(styled(text), soft_wrap=True)
+        case Bullets(items):
+            for item in items:
+                console.print(styled(("- ", *spans(item))), soft_wrap=True)
+        case Figure(path, caption):
+            console.print(styled(f"{caption}: {path}"), soft_wrap=True)
+        case CodeBlock(code, _, summary):
+            if summary:
+                console.print(styled(f"{summary}:"), soft_wrap=True)
+            for line in code.splitlines():
+                console.print(styled(line), soft_wrap=True)
+
+
+def _table(table: Table) -> rich.table.Table:
+    lines = [styled(line, "table.caption") for line in table.caption]
+    result = rich.table.Table(
+        title=styled(table.title, "table.title") if table.title else None,
+        caption=rich.text.Text("\n").join(lines) if lines else None,
+        title_justify="left",
+        caption_justify="left",
+    )
+    for column, name in enumerate(table.header):
+        left = column in table.left_columns
+        result.add_column(styled(name), justify="left" if left else "right")
+    for number, row in enumerate(table.rows):
+        result.add_row(*map(styled, row), end_section=number in table.last_rows)
+    return result
