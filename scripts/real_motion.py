@@ -17,8 +17,9 @@ import numpy as np
 import yaml
 
 from ghpt.data.synthetic.detector import Detector
-from ghpt.data.synthetic.rigs import Rig, panoptic_rig
+from ghpt.data.synthetic.rigs import panoptic_rig
 from ghpt.files import atomic_folder
+from ghpt.geometry.cameras import CameraSet
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tests"))
@@ -52,7 +53,7 @@ def main() -> None:
     take = np.load(arguments.data / "panoptic" / f"{NAME}_joints19.npz")
     calibration = arguments.data / "panoptic" / "160906_band1" / "calibration_160906_band1.json"
 
-    def detect(rig: Rig, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def detect(rig: CameraSet, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         found = detector(poses, rig, RATE_HZ, arguments.seed, NAME, NAME)
         return found.key_points, found.confidence, found.valid
 

@@ -86,7 +86,11 @@ def poses(words: list[str], output: Path) -> dict[int, np.ndarray]:
     run(words, output)
     at, found = [JOINT[name] for name in LIMBS], {}
     for part in read_reconstruction(output / "poses.npz")[1]:
-        values = torch.where(part.placed[..., None], part.points, torch.nan)[:, at].double().numpy()
+        values = (
+            torch.where(part.has_position[..., None], part.points, torch.nan)[:, at]
+            .double()
+            .numpy()
+        )
         found |= dict(zip(part.frame.tolist(), values, strict=True))
     return found
 

@@ -22,16 +22,20 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import IO
 
 import sizes
 
 ADDRESS = "GHPT_TEST_FORK_SERVER"
 """The environment variable that names the server's socket."""
+RANKS = {"GHPT_TEST_FORK_RANKS": "1"}
+"""What has the other processes of a run forked too, in place of Lightning starting Python."""
 TESTS = Path(__file__).resolve().parent
 LIMIT = 7200.0 if sizes.NIGHTLY else 300.0
 """Seconds after which a child counts as hanging, on however slow a machine."""
@@ -47,34 +51,37 @@ MODULES = (
 """What the server imports, and with it nearly all that a child would."""
 
 
-class Child:
-    """A forked process, with what the tests need of ``subprocess.Popen``.
+class Fork:
+    """A process that the server has forked, with what Lightning needs of ``subprocess.Popen``.
 
-    Its standard output is a pipe, its standard error a file, its standard input empty.
+    Its group is its own, or that of the process that asks for it; its streams are those given.
     """
 
-    def __init__(self, words: Sequence[str], env: Mapping[str, str], cwd: Path) -> None:
+    def __init__(
+        self,
+        words: Sequence[str],
+        env: Mapping[str, str],
+        cwd: str | Path | None,
+        streams: Sequence[int] = (0, 1, 2),
+        group: int = 0,
+    ) -> None:
         self.returncode: int | None = None
-        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")
-        reading, writing = os.pipe()
-        self.stdout: IO[str] = open(reading, encoding="utf-8")
+        self._lock = threading.Lock()
         self._server = socket.socket(socket.AF_UNIX)
         self._server.connect(os.environ[ADDRESS])
-        request = {"words": list(words), "env": dict(env), "cwd": str(cwd)}
+        folder = str(cwd or Path.cwd())
+        request = {"words": list(words), "env": dict(env), "cwd": folder, "group": group}
         content = json.dumps(request).encode()
-        with open(os.devnull) as nothing:
-            streams = [nothing.fileno(), writing, self._errors.fileno()]
-            socket.send_fds(self._server, [len(content).to_bytes(8)], streams)
-        os.close(writing)
+        socket.send_fds(self._server, [len(content).to_bytes(8)], streams)
         self._server.sendall(content)
         self.pid = int.from_bytes(self._server.recv(8, socket.MSG_WAITALL))
-        _CHILDREN.append(self)
 
     def poll(self) -> int | None:
         """Return the exit status, negative for a signal, or None while the process runs."""
-        if self.returncode is None and select.select([self._server], [], [], 0)[0]:
-            status = self._server.recv(8, socket.MSG_WAITALL)
-            self.returncode = os.waitstatus_to_exitcode(int.from_bytes(status))
+        with self._lock:  # Lightning asks in a thread too
+            if self.returncode is None and select.select([self._server], [], [], 0)[0]:
+                status = self._server.recv(8, socket.MSG_WAITALL)
+                self.returncode = os.waitstatus_to_exitcode(int.from_bytes(status))
         return self.returncode
 
     def wait(self, timeout: float = LIMIT) -> int:
@@ -85,6 +92,28 @@ class Child:
         if status is None:
             raise subprocess.TimeoutExpired("child", timeout)
         return status
+
+    def send_signal(self, number: int) -> None:
+        """Send a signal to the process, if it still runs."""
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        """Kill the process, if it still runs."""
+        self.send_signal(signal.SIGKILL)
+
+
+class Child(Fork):
+    """A fork whose standard output is a pipe, its standard error a file, its standard input empty."""
+
+    def __init__(self, words: Sequence[str], env: Mapping[str, str], cwd: Path) -> None:
+        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")
+        reading, writing = os.pipe()
+        self.stdout: IO[str] = open(reading, encoding="utf-8")
+        with open(os.devnull) as nothing:
+            super().__init__(words, env, cwd, (nothing.fileno(), writing, self._errors.fileno()))
+        os.close(writing)
+        _CHILDREN.append(self)
 
     def communicate(self, timeout: float = LIMIT) -> tuple[str, str]:
         """Return what the process has written to both streams, when it has ended."""
@@ -104,15 +133,6 @@ class Child:
         self.stdout.close()
         self._errors.close()
         return "".join(chunks), errors
-
-    def send_signal(self, number: int) -> None:
-        """Send a signal to the process, if it still runs."""
-        if self.poll() is None:
-            os.kill(self.pid, number)
-
-    def kill(self) -> None:
-        """Kill the process, if it still runs."""
-        self.send_signal(signal.SIGKILL)
 
     def close(self) -> None:
         """Close the streams. The server kills what is left of the process and its children."""
@@ -220,11 +240,12 @@ class Program:
     words: list[str]
     env: dict[str, str]
     cwd: str
+    group: int
     streams: list[int]
 
     def become(self) -> None:
         """Give this process the streams, session, environment and folder of the program."""
-        os.setsid()
+        os.setpgid(0, self.group)
         signal.set_wakeup_fd(-1)
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -245,6 +266,8 @@ class Program:
         import torch
 
         torch.set_num_threads(int(self.env.get("OMP_NUM_THREADS", "1")))
+        if RANKS.items() <= self.env.items():
+            fork_ranks()
         if self.words[0] == "-c":
             sys.argv[:] = ["-c", *self.words[2:]]
             exec(compile(self.words[1], "<string>", "exec"), {"__name__": "__main__"})
@@ -252,6 +275,16 @@ class Program:
             sys.argv[:] = self.words
             sys.path.insert(0, os.path.dirname(os.path.abspath(self.words[0])))
             runpy.run_path(self.words[0], run_name="__main__")
+
+
+def fork_ranks() -> None:
+    """Have Lightning fork the other processes of a run."""
+    from lightning.pytorch.strategies.launchers import subprocess_script
+
+    def started(command: list[str], env: Mapping[str, str], cwd: str | None) -> Fork:
+        return Fork(command[1:], env, cwd, group=os.getpgid(0))
+
+    subprocess_script.subprocess = SimpleNamespace(Popen=started)  # type: ignore[assignment]
 
 
 def import_modules() -> None:
@@ -266,7 +299,7 @@ def received(connection: socket.socket) -> Program:
     length, streams, _, _ = socket.recv_fds(connection, 8, 3)
     content = connection.recv(int.from_bytes(length), socket.MSG_WAITALL)
     request = json.loads(content)
-    return Program(request["words"], request["env"], request["cwd"], streams)
+    return Program(**request, streams=streams)
 
 
 def serve(address: str) -> Program | None:

@@ -17,8 +17,8 @@ import torch
 from ghpt.data.formats.camera_writers import write_opencv, write_pose2sim
 from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.formats.skeletons import SKELETONS
-from ghpt.data.synthetic.rigs import Rig, human36m_rig
-from ghpt.geometry.cameras import Cameras, project
+from ghpt.data.synthetic.rigs import human36m_rig
+from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import walk, write_people
 from real_layout import write_human36m_layout
@@ -106,7 +106,9 @@ def workplace(folder: Path) -> Path:
     format.
     """
     rig = human36m_rig("S9")
-    rig = Rig(("cam01", "cam02", "cam03", "cam04"), rig.cameras, 0 * rig.distortion, rig.size)
+    rig = CameraSet.from_cameras(
+        ("cam01", "cam02", "cam03", "cam04"), rig.cameras, 0 * rig.distortion, rig.size
+    )
     points = walk()[:FRAMES]
     pixels = project(rig.cameras, points)[0].numpy()
     pixels = pixels + np.random.default_rng(0).normal(0, 1, pixels.shape)
@@ -152,7 +154,7 @@ def takes() -> list[tuple[str, str, np.ndarray]]:
     return [(subject, "Walking-1", walk()[:40].numpy()) for subject in subjects]
 
 
-def write_openpose(folder: Path, rig: Rig, pixels: np.ndarray) -> None:
+def write_openpose(folder: Path, rig: CameraSet, pixels: np.ndarray) -> None:
     """OpenPose's folders, a file for each frame."""
     for view, name in enumerate(rig.names):
         (folder / f"{name}_json").mkdir(parents=True)
@@ -161,7 +163,7 @@ def write_openpose(folder: Path, rig: Rig, pixels: np.ndarray) -> None:
             write_people(folder / f"{name}_json" / f"{name}_{frame:06d}.json", [person])
 
 
-def write_caliscope(folder: Path, rig: Rig, pixels: np.ndarray) -> None:
+def write_caliscope(folder: Path, rig: CameraSet, pixels: np.ndarray) -> None:
     """caliscope's table of MediaPipe's landmarks, and its cameras."""
     rows = [
         "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"

@@ -15,8 +15,8 @@ from ghpt.commands.prediction.frames import Frames, Seen
 from ghpt.config import plain
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.synthetic.recordings import motion
-from ghpt.data.synthetic.rigs import Rig, human36m_rig
-from ghpt.geometry.cameras import Cameras, project
+from ghpt.data.synthetic.rigs import human36m_rig
+from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINTS
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -64,7 +64,9 @@ def cameras_file(folder: Path) -> Path:
     rig = human36m_rig("S9")
     names = tuple(f"cam_{i:02d}" for i in range(len(rig)))
     write_pose2sim(
-        folder / "cameras.toml", Rig(names, rig.cameras, 0 * rig.distortion, rig.size), {}
+        folder / "cameras.toml",
+        CameraSet.from_cameras(names, rig.cameras, 0 * rig.distortion, rig.size),
+        {},
     )
     return folder / "cameras.toml"
 

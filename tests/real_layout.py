@@ -14,11 +14,11 @@ import torch
 
 from ghpt.data.datasets.labels import LABELS_FILE
 from ghpt.data.datasets.panoptic import COCO19, joints17
-from ghpt.data.synthetic.rigs import Rig, human36m_rig
-from ghpt.geometry.cameras import project
+from ghpt.data.synthetic.rigs import human36m_rig
+from ghpt.geometry.cameras import CameraSet, project
 from ghpt.geometry.lens import distort
 
-Detect = Callable[[Rig, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+Detect = Callable[[CameraSet, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """(rig, poses [T 17 3] mm) -> ideal pixels [T V 17 2], confidence [T V 17], seen [T V 17]."""
 
 SUBJECTS = ["S1", "S5", "S6", "S7", "S8", "S9", "S11"]
@@ -31,12 +31,12 @@ def person(
     return rng.uniform(-900, 900, (frames, joints, 3)) + np.asarray(centre, float)
 
 
-def ideal(rig: Rig, poses: np.ndarray) -> np.ndarray:
+def ideal(rig: CameraSet, poses: np.ndarray) -> np.ndarray:
     """Pinhole pixels [T V J 2]."""
     return project(rig.cameras, torch.from_numpy(poses))[0].numpy()
 
 
-def through_lens(rig: Rig, pixels: np.ndarray) -> np.ndarray:
+def through_lens(rig: CameraSet, pixels: np.ndarray) -> np.ndarray:
     """What the real lenses show of ideal pixels [T V J 2]."""
     shown = np.empty_like(pixels)
     for view in range(len(rig)):
@@ -49,7 +49,7 @@ def through_lens(rig: Rig, pixels: np.ndarray) -> np.ndarray:
     return shown
 
 
-def perfect(rig: Rig, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def perfect(rig: CameraSet, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """A detector without error."""
     pixels = ideal(rig, poses)
     return pixels, np.ones(pixels.shape[:-1]), np.ones(pixels.shape[:-1], bool)
@@ -126,7 +126,7 @@ def write_panoptic_layout(
     root: Path,
     name: str,
     calibration: dict,
-    rig: Rig,
+    rig: CameraSet,
     frames: Sequence[int],
     poses: np.ndarray,
     detect: Detect,
@@ -158,7 +158,7 @@ def write_panoptic_layout(
         )
 
 
-def panoptic_calibration(rig: Rig) -> dict:
+def panoptic_calibration(rig: CameraSet) -> dict:
     """The calibration file's content for a rig, in its order."""
     cameras = [
         {

@@ -14,8 +14,8 @@ from torch import Tensor
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.config import build
 from ghpt.data.synthetic.recordings import motion
-from ghpt.data.synthetic.rigs import Rig, human36m_rig, panoptic_rig
-from ghpt.geometry.cameras import Cameras, project
+from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
+from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.models.estimators.classical import person_scale
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -69,7 +69,7 @@ def _walk(frames: int, seed: int) -> np.ndarray:
 
 def people(rig: str = "h36m", frames: int = 80, noise: float = 0.01, seed: int = 0) -> Detections:
     """``noise``: standard deviation of a pixel coordinate in persons' sizes; ``rig``: h36m or cmu3."""
-    found: Rig = human36m_rig("S8") if rig == "h36m" else panoptic_rig((10, 12, 16, 18))
+    found: CameraSet = human36m_rig("S8") if rig == "h36m" else panoptic_rig((10, 12, 16, 18))
     points = torch.from_numpy(_walk(frames, seed))
     if rig != "h36m":  # Panoptic's y points down
         points = torch.stack((points[..., 0], -points[..., 2], points[..., 1]), dim=-1)
@@ -89,5 +89,4 @@ def people(rig: str = "h36m", frames: int = 80, noise: float = 0.01, seed: int =
 
 def relative(cameras: Cameras, a: int, b: int) -> tuple[Tensor, Tensor]:
     """R, t of ``x_b = R x_a + t``."""
-    R = cameras.R[b] @ cameras.R[a].T
-    return R, cameras.t[b] - R @ cameras.t[a]
+    return cameras.relative_pose(a, b)

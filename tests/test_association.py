@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import yaml
 
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import read_people
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.people.association import associate
@@ -19,8 +18,9 @@ from ghpt.data.people.tracks import tracks
 from ghpt.data.people.views import undistort_and_match, who
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import motion
-from ghpt.data.synthetic.rigs import Rig, human36m_rig
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import CameraSet
 
 FRAMES = 240
 
@@ -34,23 +34,22 @@ def detector(pytestconfig) -> Detector:
     )
 
 
-def rig_of(views: int) -> Rig:
+def rig_of(views: int) -> CameraSet:
     rig = human36m_rig("S9")
     at = list(range(views))
-    return Rig(
+    return CameraSet.from_cameras(
         tuple(rig.names[i] for i in at), rig.cameras.index(at), rig.distortion[at], rig.size[at]
     )
 
 
-def camera_file(rig: Rig, calibrated: bool = True) -> CameraFile:
-    pose = (rig.cameras.R, rig.cameras.t) if calibrated else (None, None)
+def camera_file(rig: CameraSet, calibrated: bool = True) -> CameraSet:
     lens = rig.distortion * 0  # the detector's key points are out of the lens
-    return CameraFile(
-        "Calib.toml", "Pose2Sim", rig.names, ("",) * len(rig), rig.cameras.K, lens, None, *pose
-    )
+    if not calibrated:
+        return CameraSet(rig.names, rig.K, lens, path="Calib.toml")
+    return CameraSet.from_cameras(rig.names, rig.cameras, lens, path="Calib.toml")
 
 
-def scene(detector: Detector, rig: Rig, seed: int = 1) -> tuple[Detections, np.ndarray]:
+def scene(detector: Detector, rig: CameraSet, seed: int = 1) -> tuple[Detections, np.ndarray]:
     """One who walks and one who greets, each out of each view for a while, listed in any order;
     whose each is.
     """
@@ -115,7 +114,11 @@ def test_millimetres_or_metres_do_not_matter(detector):
     rig = rig_of(3)
     people, _ = scene(detector, rig)
     cameras = replace(rig.cameras, t=rig.cameras.t / 1000)
-    small = who(people, camera_file(Rig(rig.names, cameras, rig.distortion, rig.size)), range(3))
+    small = who(
+        people,
+        camera_file(CameraSet.from_cameras(rig.names, cameras, rig.distortion, rig.size)),
+        range(3),
+    )
     np.testing.assert_array_equal(small, who(people, camera_file(rig), range(3)))
 
 
@@ -126,7 +129,11 @@ def test_without_extrinsics_each_view_follows_its_own(detector, caplog):
     alone = who(people, camera_file(rig, calibrated=False), range(4))
     turned = replace(rig.cameras, R=rig.cameras.R.mT.contiguous())
     with caplog.at_level(logging.WARNING):
-        wrong = who(people, camera_file(Rig(rig.names, turned, rig.distortion, rig.size)), range(4))
+        wrong = who(
+            people,
+            camera_file(CameraSet.from_cameras(rig.names, turned, rig.distortion, rig.size)),
+            range(4),
+        )
     assert "the views agree on nobody: check the extrinsics" in caplog.text
     np.testing.assert_array_equal(alone, wrong)
     with pytest.raises(GhptDataError, match="there is no person 1: 1 can be told apart"):
@@ -164,7 +171,9 @@ def test_identities_in_the_files_are_taken_as_they_are(tmp_path):
             ]
             (tmp_path / view / f"{frame}.json").write_text(json.dumps({"people": listed}))
     people = read_people(tmp_path, "body_25b")
-    cameras = camera_file(Rig(("a", "b"), rig_of(2).cameras, rig_of(2).distortion, rig_of(2).size))
+    cameras = camera_file(
+        CameraSet.from_cameras(("a", "b"), rig_of(2).cameras, rig_of(2).distortion, rig_of(2).size)
+    )
     for person, number in enumerate((7, 3)):
         points = people.pick(who(people, cameras, (0, 1), person))
         there = np.array([number == 7 or frame != 2 for frame in range(4)])

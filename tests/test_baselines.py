@@ -5,7 +5,7 @@ import torch
 
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras, reprojection_error
-from ghpt.geometry.triangulation import Status
+from ghpt.geometry.state import State
 from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_scale
 from ghpt.models.estimators.lo_ransac import LoRansac
 from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
@@ -170,7 +170,7 @@ def test_the_m_estimator_minimises_pixels_and_says_when_it_has_not_finished():
         ).all()
     short = MEstimator(loss="huber", scale=1e-4, iterations=1, tolerance=1e-6)
     result = short.triangulate(batch)
-    assert (result.status == Status.NOT_CONVERGED).all()
+    assert (result.status == State.NOT_CONVERGED).all()
     assert short(batch).estimated.all()
 
 

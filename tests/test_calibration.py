@@ -134,7 +134,7 @@ def moved(rig, step):
     """After a step of the views' parameters: rotation vector about the world's axes, centre."""
     step = step.view(-1, 6)
     R = rig.R @ vector_to_matrix(step[:, :3]).mT
-    centre = -(rig.R.mT @ rig.t[..., None])[..., 0] + step[:, 3:]
+    centre = rig.centre + step[:, 3:]
     return replace(rig, R=R, t=-(R @ centre[..., None])[..., 0])
 
 
@@ -143,7 +143,7 @@ def test_gradient_is_that_of_the_cost():
     state = linearise(seen_by, rig, rig.inlier, 3.0)
     h, count = 1e-6, 18
     # in the directions of the gauge, moved points included, the cost does not change
-    G = gauge(rig.R, -(rig.R.mT @ rig.t[..., None])[..., 0])
+    G = gauge(rig.R, rig.centre)
     assert (state.matrix @ G).abs().max() < 1e-6 * state.matrix.abs().max()
     assert (state.scores.sum(0) @ G).abs().max() < 1e-6 * state.scores.abs().max()
     # with the points at their best place for the views, eliminating them leaves the plain gradient

@@ -15,14 +15,14 @@ from scipy.spatial.transform import Rotation
 from damage import damage
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
-from ghpt.data.synthetic.rigs import Rig, human36m_rig, panoptic_rig
+from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptDataError
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 
 META = {"adjusted": False, "error": 0.0, "scale": 'a "height" of 1750 mm'}
 
 
-def many(count: int = 12, lens: bool = True) -> Rig:
+def many(count: int = 12, lens: bool = True) -> CameraSet:
     """Random cameras, one turned by almost half a turn, one not at all."""
     rng = np.random.default_rng(3)
     vectors = rng.normal(size=(count, 3))
@@ -41,13 +41,15 @@ def many(count: int = 12, lens: bool = True) -> Rig:
         )
     )
     distortion = torch.from_numpy(rng.normal(size=(count, 5)) * 0.1 * lens)
-    return Rig(names, cameras, distortion, torch.tensor([[1080 + i, 1920] for i in range(count)]))
+    return CameraSet.from_cameras(
+        names, cameras, distortion, torch.tensor([[1080 + i, 1920] for i in range(count)])
+    )
 
 
 WRITERS = {"pose2sim": write_pose2sim, "aniposelib": write_aniposelib, "opencv": None}
 
 
-def written(form: str, folder: Path, rig: Rig) -> Path:
+def written(form: str, folder: Path, rig: CameraSet) -> Path:
     if form == "opencv":
         write_opencv(folder, rig)
         return folder
@@ -150,7 +152,9 @@ def test_aniposelib_s_order_of_keys_is_the_rig_s(tmp_path):
 
 def test_names_of_any_kind_survive_toml(tmp_path):
     rig = many(3)
-    rig = Rig(("left cam.1", 'the "best"', "Kamera_ä"), rig.cameras, rig.distortion, rig.size)
+    rig = CameraSet.from_cameras(
+        ("left cam.1", 'the "best"', "Kamera_ä"), rig.cameras, rig.distortion, rig.size
+    )
     for form in ("pose2sim", "aniposelib"):
         assert read_cameras(written(form, tmp_path, rig)).names == rig.names
 
@@ -158,7 +162,9 @@ def test_names_of_any_kind_survive_toml(tmp_path):
 def test_names_that_yml_cannot_tell_apart_are_refused(tmp_path):
     rig = many(2)
     with pytest.raises(GhptDataError, match=r"intri\.yml: names: are the same.*letters, digits"):
-        write_opencv(tmp_path, Rig(("a b", "a.b"), rig.cameras, rig.distortion, rig.size))
+        write_opencv(
+            tmp_path, CameraSet.from_cameras(("a b", "a.b"), rig.cameras, rig.distortion, rig.size)
+        )
 
 
 CAMERA = """
@@ -197,10 +203,10 @@ def test_intrinsics_alone_are_enough(tmp_path):
         ("rotation = [0, 0.5, 0]", 'rotation = "null"'),
     ):
         found = read_cameras(toml(tmp_path, old=old, new=new))
-        assert found.cameras is None
+        assert not found.calibrated
         assert found.K.shape == (2, 3, 3)
     same = CAMERA.format(key="a", turn=0) + CAMERA.format(key="b", turn=0)
-    assert read_cameras(toml(tmp_path, same)).cameras is None
+    assert read_cameras(toml(tmp_path, same)).calibrated is False
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,7 @@ from ghpt.calibration.check.examination import Finding, merged
 from ghpt.calibration.check.resection import resect
 from ghpt.calibration.check.setup import Look, Setup, as_filed
 from ghpt.config import build, plain
-from ghpt.data.formats.camera_files import CameraFile, read_cameras
+from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import KeyPoints, read_key_points
 from ghpt.data.synthetic.recordings import motion
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
@@ -58,17 +58,7 @@ def case(
     random = torch.randn(
         bent.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
     )
-    file = CameraFile(
-        path="",
-        format="",
-        names=rig.names,
-        other_names=("",) * views,
-        K=rig.cameras.K,
-        distortion=rig.distortion,
-        size=rig.size,
-        R=rig.cameras.R,
-        t=rig.cameras.t,
-    )
+    file = rig
     found = choose(
         rig.names,
         (bent + 500 * noise * random).numpy(),
@@ -274,17 +264,7 @@ def test_real_rigs(shared_data):
 
 def test_cameras_without_extrinsics_are_refused():
     rig, crowd = human36m_rig("S8"), people(frames=30)
-    file = CameraFile(
-        path="intrinsics",
-        format="",
-        names=rig.names,
-        other_names=("",) * 4,
-        K=rig.cameras.K,
-        distortion=rig.distortion,
-        size=rig.size,
-        R=None,
-        t=None,
-    )
+    file = replace(rig, path="intrinsics", R=None, t=None)
     values = crowd.key_points.numpy()
     points = KeyPoints(
         "",

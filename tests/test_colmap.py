@@ -134,7 +134,7 @@ def test_human36m_s_camera_parameters(shared_data, tmp_path):
         read_cameras(path, subject="S20")
     content = json.loads(path.read_text())
     (tmp_path / "c.json").write_text(json.dumps({"intrinsics": content["intrinsics"]}))
-    assert read_cameras(tmp_path / "c.json").cameras is None
+    assert read_cameras(tmp_path / "c.json").calibrated is False
     del content["intrinsics"]["54138969"]["distortion"]
     (tmp_path / "c.json").write_text(json.dumps(content))
     with pytest.raises(GhptDataError, match=r"intrinsics\.54138969\.distortion: is missing"):

@@ -10,9 +10,9 @@ from ghpt.data.synthetic.body import occlusion, random_body, stature, trunk_fram
 from ghpt.data.synthetic.detector import KINDS, Detector
 from ghpt.data.synthetic.motion import move
 from ghpt.data.synthetic.random_processes import generator, process
-from ghpt.data.synthetic.rigs import Rig, human36m_rig
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry import lens
-from ghpt.geometry.cameras import project
+from ghpt.geometry.cameras import CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS, MIRROR
 
 CONF = Path(__file__).parents[1] / "conf" / "detector"
@@ -51,7 +51,9 @@ def take(action: str = "Greeting", frames: int = 600) -> np.ndarray:
     return move(random_body(rng), action, frames, 50.0, rng)
 
 
-def detect(points: np.ndarray, rig: Rig = RIG, seed: int = 0, familiar: bool = False, **numbers):
+def detect(
+    points: np.ndarray, rig: CameraSet = RIG, seed: int = 0, familiar: bool = False, **numbers
+):
     return Detector(**PERFECT | numbers)(points, rig, 50.0, seed, "S9", "S9/Greeting-1", familiar)
 
 
@@ -218,7 +220,7 @@ def test_a_view_does_not_depend_on_the_other_views():
         "drift": 0.01,
     }
     every = detect(points, **numbers)
-    two = Rig(
+    two = CameraSet.from_cameras(
         RIG.names[2:0:-1], RIG.cameras.index([2, 1]), RIG.distortion[[2, 1]], RIG.size[[2, 1]]
     )
     some = detect(points, rig=two, **numbers)

@@ -141,9 +141,9 @@ def test_the_player_s_logic(tmp_path):
     )
     assert found["count"] == 6
     for t, joints in enumerate(found["drawn"]):
-        placed = torch.nonzero(made.placed[t])[:, 0].tolist()
+        placed = torch.nonzero(made.has_position[t])[:, 0].tolist()
         assert joints == [[j, bool(made.state[t, j] == State.FILLED)] for j in placed]
-    assert found["bones"] == sum(bool(made.placed[0, [a, b]].all()) for a, b in BONES)
+    assert found["bones"] == sum(bool(made.has_position[0, [a, b]].all()) for a, b in BONES)
     assert found["none"] == {"joints": [], "bones": []}
     assert found["at"] == [-1, 0, 0, 1, -1, -1, 2, -1]
     assert found["middle"][:2] == [400, 300]

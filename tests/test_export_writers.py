@@ -125,9 +125,11 @@ def test_nothing_missing_is_placed_after_any_round_trip(tmp_path):
         read = next(read_reconstruction(tmp_path / "poses.npz")[1])
         np.testing.assert_array_equal(read.state, made.state)
         with np.load(tmp_path / "poses.npz") as stored:
-            np.testing.assert_array_equal(np.isnan(stored["points"]).any(-1), ~made.placed.numpy())
+            np.testing.assert_array_equal(
+                np.isnan(stored["points"]).any(-1), ~made.has_position.numpy()
+            )
         _, written = trc_points(tmp_path / "poses.trc")
-        np.testing.assert_array_equal(np.isnan(written).any(-1), ~made.placed.numpy())
+        np.testing.assert_array_equal(np.isnan(written).any(-1), ~made.has_position.numpy())
 
 
 def found_out(path):

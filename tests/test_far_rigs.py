@@ -18,9 +18,10 @@ from ghpt.commands.prediction.frames import Frames
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.data.formats.stored_npz import add_member
-from ghpt.data.synthetic.rigs import Rig, human36m_rig
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.export import WRITERS, Evidence, Scene, read_reconstruction
+from ghpt.geometry.cameras import CameraSet
 from ghpt.recording import Recording
 from ghpt.report.rig_files import write_poses
 from ghpt.skeleton import MIRROR
@@ -41,11 +42,11 @@ LIMIT = 0.01
 """mm, of what a distance may cost."""
 
 
-def moved_rig(offset) -> Rig:
+def moved_rig(offset) -> CameraSet:
     rig = human36m_rig("S9")
     cameras = rig.cameras.relative_to(-torch.tensor(offset, dtype=torch.float64))
     names = tuple(f"cam_{i:02d}" for i in range(len(rig)))
-    return Rig(names, cameras, 0 * rig.distortion, rig.size)
+    return CameraSet.from_cameras(names, cameras, 0 * rig.distortion, rig.size)
 
 
 def predicted(folder: Path, offset, *words: str) -> Path:

@@ -11,33 +11,22 @@ import torch
 
 from damage import damage
 from ghpt.commands.prediction.stored import open_stored
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import KeyPoints, read_key_points, read_people, write_key_points
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.people.views import matched, normal, undistort_and_match
 from ghpt.errors import GhptDataError
-from ghpt.geometry.cameras import project
+from ghpt.geometry.cameras import CameraSet, project
 from ghpt.geometry.lens import distort
 from scenes import random_scene
 
 
-def camera_file(names, other=None, lens: float = 0.0) -> CameraFile:
+def camera_file(names, other=None, lens: float = 0.0) -> CameraSet:
     views = len(names)
     K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64).expand(
         views, 3, 3
     )
     distortion = torch.tensor([lens, lens / 2, 0, 0, 0], dtype=torch.float64).expand(views, 5)
-    return CameraFile(
-        "Calib.toml",
-        "Pose2Sim",
-        tuple(names),
-        tuple(other or [""] * views),
-        K,
-        distortion,
-        None,
-        None,
-        None,
-    )
+    return CameraSet(tuple(names), K, distortion, other_names=tuple(other or ()), path="Calib.toml")
 
 
 def key_points(views=("a", "b"), frames: int = 5, joints=SKELETONS["coco_17"]) -> KeyPoints:

@@ -15,9 +15,9 @@ from ghpt.commands.predict import COMMAND, predict
 from ghpt.config import build, plain
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.formats.key_points import KeyPoints, write_key_points
-from ghpt.data.synthetic.rigs import Rig, human36m_rig
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import read_reconstruction
-from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.models.checkpoint import FORMAT_VERSION, AtomicCheckpointIO
 from ghpt.reconstruction import State
 from ghpt.skeleton import JOINTS
@@ -306,7 +306,9 @@ def spoilt(folder: Path, kind: str) -> list[str]:
             RIG.cameras.K, RIG.cameras.R[:1].expand(4, 3, 3), RIG.cameras.t[:1].expand(4, 3)
         )
         names = tuple(f"cam_{i:02d}" for i in range(4))
-        write_pose2sim(cameras, Rig(names, same, 0 * RIG.distortion, RIG.size), {})
+        write_pose2sim(
+            cameras, CameraSet.from_cameras(names, same, 0 * RIG.distortion, RIG.size), {}
+        )
     elif kind == "no cameras":
         return [f"keypoints={points}"]
     elif kind == "camera checkpoint":

@@ -72,11 +72,11 @@ def sound(result, batch):
         expected = torch.float64 if field == "points" else torch.float32
         assert getattr(result, field).dtype == expected
     assert torch.equal(result.frame, batch.sample)
-    missing = ~result.placed
+    missing = ~result.has_position
     for field in ("points", "error", "covariance"):
         assert (getattr(result, field)[missing] == 0).all()
     assert not result.views.mT[missing].any()
-    assert (result.views.sum(1)[result.placed] >= 2).all()
+    assert (result.views.sum(1)[result.has_position] >= 2).all()
     assert not (result.views & ~batch.valid).any()
     return result
 
@@ -123,7 +123,7 @@ def test_displaced_key_points_spoil_the_average_of_the_hypotheses_and_not_the_le
         (points - scene.points).norm(dim=-1).mean()
         for points in (result.points, pool.points.mean(1))
     )
-    assert result.placed.all()
+    assert result.has_position.all()
     assert ours < 0.3 * average
     moved = (batch.key_points - scene.key_points).norm(dim=-1) > 0
     assert result.views[moved].double().mean() < 0.2
@@ -139,7 +139,7 @@ def test_no_joint_is_lost_that_two_seen_views_determine():
     result = sound(learned()(batch), batch)
     placed = Linear()(batch).estimated
     assert not placed.all()
-    assert result.placed[placed].all()
+    assert result.has_position[placed].all()
 
 
 @pytest.mark.parametrize("make", [classical, learned])
@@ -295,5 +295,5 @@ def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
         build(config["classical"], "estimator.classical")(estimator=estimator),
         build(config["learned"], "estimator.learned")(view_weights=learned().view_weights),
     ):
-        assert made(batch).placed.all()
+        assert made(batch).has_position.all()
         assert made.fitted(batch).uncertainty.noise == pytest.approx(float(2 / size), rel=0.3)

@@ -3,7 +3,8 @@ import torch
 
 from ghpt.geometry.cameras import project
 from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
-from ghpt.geometry.triangulation import Status, triangulate
+from ghpt.geometry.state import State
+from ghpt.geometry.triangulation import triangulate
 from scenes import Scene, random_scene
 
 TOLERANCE = 1e-6
@@ -68,8 +69,8 @@ def test_not_converged_is_said_where_the_last_step_is_longer_than_the_tolerance(
     step = (robustly(scene, "cauchy", iterations)[0].points - before.points).norm(dim=-1)
     tolerance = float(step.median())
     status = robustly(scene, "cauchy", iterations, tolerance=tolerance)[0].status
-    assert torch.equal(status == Status.NOT_CONVERGED, step > tolerance)
-    assert ((status == Status.OK) == (step <= tolerance)).all()
+    assert torch.equal(status == State.NOT_CONVERGED, step > tolerance)
+    assert ((status == State.OBSERVED) == (step <= tolerance)).all()
 
 
 def test_a_joint_rests_only_when_its_step_is_far_below_the_tolerance():
@@ -99,8 +100,8 @@ def test_what_is_not_seen_is_not_used_and_what_is_broken_is_said():
     spoilt.key_points[:, 2:, 3] = 1e5
     found = robustly(spoilt, "cauchy", 50, valid)[0]
     assert torch.equal(found.points, expected.points)
-    assert (found.status[:, 4] == Status.FEW_VIEWS).all()
+    assert (found.status[:, 4] == State.FEW_VIEWS).all()
     spoilt.key_points[0, 0, 0] = torch.nan
     status = robustly(spoilt, "cauchy", 50, valid)[0].status
-    assert status[0, 0] == Status.NONFINITE_INPUT
-    assert (status == Status.NONFINITE_INPUT).sum() == 1
+    assert status[0, 0] == State.BAD_INPUT
+    assert (status == State.BAD_INPUT).sum() == 1

@@ -7,7 +7,8 @@ import torch
 from ghpt.geometry.cameras import Cameras, project, reprojection_error
 from ghpt.geometry.normal_equations import solve_symmetric
 from ghpt.geometry.rotations import vector_to_matrix
-from ghpt.geometry.triangulation import Status, System, triangulate, triangulate_subsets
+from ghpt.geometry.state import FILE_STATES, State
+from ghpt.geometry.triangulation import System, triangulate, triangulate_subsets
 from scenes import random_scene
 
 
@@ -200,7 +201,7 @@ def test_too_few_views_are_said_and_no_point_is_made():
     weights[0, :, 0] = 0
     weights[0, 1:, 1] = 0
     result = triangulate(scene.cameras, scene.key_points, weights)
-    assert result.status[0, :3].tolist() == [Status.FEW_VIEWS, Status.FEW_VIEWS, Status.OK]
+    assert result.status[0, :3].tolist() == [State.FEW_VIEWS, State.FEW_VIEWS, State.OBSERVED]
     assert (result.points[0, :2] == 0).all()
     assert (result.angle[0, :2] == 0).all()
 
@@ -251,8 +252,8 @@ def test_a_narrow_baseline_keeps_the_digits_that_squaring_would_cost():
 
 
 def test_the_numbers_of_the_states_are_those_of_the_files():
-    names = ("OK", "FEW_VIEWS", "PARALLEL", "BEHIND", "NONFINITE_INPUT", "NOT_CONVERGED")
-    assert {state.name: state.value for state in Status} == {
+    names = ("OBSERVED", "FILLED", "FEW_VIEWS", "PARALLEL", "BEHIND", "BAD_INPUT", "REJECTED")
+    assert {state.name: state.value for state in FILE_STATES} == {
         name: i for i, name in enumerate(names)
     }
 
@@ -263,8 +264,8 @@ def test_either_coordinate_of_a_key_point_may_be_broken(coordinate, value):
     scene = random_scene(16, frames=1, views=3)
     scene.key_points[0, 1, 5, coordinate] = value
     status = triangulate(scene.cameras, scene.key_points, ones(scene)).status[0]
-    assert status[5] == Status.NONFINITE_INPUT
-    assert (status != Status.OK).sum() == 1
+    assert status[5] == State.BAD_INPUT
+    assert (status != State.OBSERVED).sum() == 1
 
 
 @pytest.mark.parametrize("weight", [torch.nan, torch.inf])
@@ -273,8 +274,8 @@ def test_a_broken_weight_is_said(weight):
     weights = ones(scene)
     weights[0, 2, 4] = weight
     status = triangulate(scene.cameras, scene.key_points, weights).status[0]
-    assert status[4] == Status.NONFINITE_INPUT
-    assert (status != Status.OK).sum() == 1
+    assert status[4] == State.BAD_INPUT
+    assert (status != State.OBSERVED).sum() == 1
 
 
 def test_two_cameras_at_one_place_fix_no_point_though_a_third_is_elsewhere():
@@ -288,8 +289,8 @@ def test_two_cameras_at_one_place_fix_no_point_though_a_third_is_elsewhere():
     weights = ones(scene)
     weights[:, 2, :9] = 0
     status = triangulate(cameras, key_points, weights).status
-    assert (status[:, :9] == Status.PARALLEL).all()
-    assert (status[:, 9:] == Status.OK).all()
+    assert (status[:, :9] == State.PARALLEL).all()
+    assert (status[:, 9:] == State.OBSERVED).all()
 
 
 def test_a_point_behind_one_camera_is_said_with_its_depth():
@@ -298,8 +299,8 @@ def test_a_point_behind_one_camera_is_said_with_its_depth():
     points[:, 3] = 2 * scene.cameras.centre[:, 0]  # the rig looks at the origin
     key_points, depth = project(scene.cameras, points)
     result = triangulate(scene.cameras, key_points, ones(scene))
-    assert result.status[0, 3] == Status.BEHIND
-    assert (result.status != Status.OK).sum() == 1
+    assert result.status[0, 3] == State.BEHIND
+    assert (result.status != State.OBSERVED).sum() == 1
     torch.testing.assert_close(result.depth_min, depth.amin(1))
     assert (result.points[0, 3] == 0).all()
 
@@ -325,7 +326,7 @@ def test_rows_are_put_in_their_places():
     few[:, 1:] = 0
     part = triangulate(scene.cameras.index(slice(2)), scene.key_points[:2], few)
     mixed = whole.with_rows(torch.tensor([3, 1]), part)
-    assert (mixed.status[[1, 3]] == Status.FEW_VIEWS).all()
+    assert (mixed.status[[1, 3]] == State.FEW_VIEWS).all()
     for name in ("points", "status", "angle", "depth_min", "cond"):
         assert torch.equal(getattr(mixed, name)[[0, 2]], getattr(whole, name)[[0, 2]])
         assert torch.equal(getattr(mixed, name)[[3, 1]], getattr(part, name))

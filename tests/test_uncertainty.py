@@ -137,9 +137,10 @@ def test_calibration_on_embedded_people_known_to_the_detector_and_not(split, ban
     frames = Frames(takes, np.arange(0, sum(map(len, takes)), 16))
     batch = frames[range(len(frames))]
     result = predictor.fitted(batch)(batch)
-    offset = (result.points - batch.truth).double()[result.placed][..., None]
+    offset = (result.points - batch.truth).double()[result.has_position][..., None]
     distance = (
-        offset.mT @ torch.linalg.solve(full(result.covariance)[result.placed].double(), offset)
+        offset.mT
+        @ torch.linalg.solve(full(result.covariance)[result.has_position].double(), offset)
     ).flatten()
     for limit, (low, high) in zip((2.366, 6.251, 7.815), bands, strict=True):
         assert low < (distance <= limit).double().mean() < high

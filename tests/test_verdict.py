@@ -25,10 +25,10 @@ from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_pose2sim
 from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.people.views import undistort_and_match
-from ghpt.data.synthetic.rigs import Rig, human36m_rig
+from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import read_reconstruction
-from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import CONF, cameras_file, config, walk
 
@@ -69,7 +69,7 @@ def points_file(path: Path, values: np.ndarray, joints: list[int] | None = None)
 def rig_file(path: Path, unit_mm: float, write=write_aniposelib) -> Path:
     """The rig with a translation in this unit, in a format whose writer takes mm and writes metres."""
     cameras = Cameras(RIG.cameras.K, RIG.cameras.R, RIG.cameras.t * 1000 / unit_mm)
-    write(path, Rig(NAMES, cameras, 0 * RIG.distortion, RIG.size), {})
+    write(path, CameraSet.from_cameras(NAMES, cameras, 0 * RIG.distortion, RIG.size), {})
     if write is write_aniposelib:  # which writes no such line itself, and says no unit
         path.write_text(
             path.read_text(encoding="utf-8").replace("fisheye = false\n", ""), encoding="utf-8"
@@ -251,7 +251,9 @@ def test_images_that_are_turned_are_named(tmp_path):
     K[:, 0, 2] += 600
     size = RIG.size + torch.tensor([1200, 0])
     write_pose2sim(
-        tmp_path / "wide.toml", Rig(NAMES, Cameras(K, wide.R, wide.t), 0 * RIG.distortion, size), {}
+        tmp_path / "wide.toml",
+        CameraSet.from_cameras(NAMES, Cameras(K, wide.R, wide.t), 0 * RIG.distortion, size),
+        {},
     )
     values = (pixels() + np.array([600.0, 0.0]))[..., ::-1]
     with pytest.raises(GhptDataError, match="turned by 90 degrees"):

@@ -5,30 +5,14 @@ missing.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from enum import IntEnum
 from typing import Any
 
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
+from ghpt.geometry.state import FILE_STATES, State
 
-class State(IntEnum):
-    """What a joint of a frame is. Only OBSERVED and FILLED joints have a position."""
-
-    OBSERVED = 0
-    """Triangulated from this frame's key points."""
-    FILLED = 1
-    """Interpolated between observed frames, on request."""
-    FEW_VIEWS = 2
-    """Missing: fewer than two views see it."""
-    PARALLEL = 3
-    """Missing: the rays that see it fix no point."""
-    BEHIND = 4
-    """Missing: its rays meet behind a camera."""
-    BAD_INPUT = 5
-    """Missing: a key point or camera is not finite or absurd."""
-    REJECTED = 6
-    """Missing: no two views explain it, so wherever it were put would be made up."""
+__all__ = ["FILE_STATES", "About", "Reconstruction", "State"]
 
 
 @dataclass(frozen=True)
@@ -79,6 +63,6 @@ class Reconstruction:
         return len(self.frame)
 
     @property
-    def placed(self) -> Bool[Tensor, "T J"]:
+    def has_position(self) -> Bool[Tensor, "T J"]:
         """Joints that have a position."""
         return self.state <= State.FILLED

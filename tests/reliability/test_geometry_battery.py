@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.lens import distort, undistort
+from ghpt.geometry.state import State
 from ghpt.geometry.subsets import random_subsets
-from ghpt.geometry.triangulation import Status, triangulate, triangulate_subsets
+from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear
 from ghpt.models.estimators.lo_ransac import LoRansac
 from ghpt.models.estimators.ransac import Ransac
@@ -222,7 +223,7 @@ def weigh(value, view=slice(None)):
     return case
 
 
-S = Status
+S = State
 DEGENERATE = {
     "no view": (use(), S.FEW_VIEWS),
     "one view": (use(2), S.FEW_VIEWS),

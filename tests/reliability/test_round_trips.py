@@ -22,7 +22,7 @@ EPSILON = np.finfo(np.float32).eps
 
 def truth(made, count=None):
     """Positions as they must come back, NaN where missing."""
-    return torch.where(made.placed[..., None], made.points, torch.nan).numpy()
+    return torch.where(made.has_position[..., None], made.points, torch.nan).numpy()
 
 
 def difference(found, expected):
@@ -126,12 +126,12 @@ def check_c3d(path, who, made):
     residual = np.where(
         observed, np.clip(np.round(made.error.numpy() / RESIDUAL_STEP), 1, 255) * RESIDUAL_STEP, 0
     )
-    residual = np.where(made.placed.numpy(), residual, -1)
+    residual = np.where(made.has_position.numpy(), residual, -1)
     for found in (ezc3d_table(path), py_c3d_table(path)):
         error = np.abs(found["points"] - expected) / (EPSILON * np.maximum(np.abs(expected), 1e-30))
         np.testing.assert_array_equal(np.isnan(found["points"]), np.isnan(expected))
         worst = max(worst, float(np.nanmax(error, initial=0.0)))
-        np.testing.assert_array_equal(found["missing"], ~made.placed.numpy())
+        np.testing.assert_array_equal(found["missing"], ~made.has_position.numpy())
         assert list(found["labels"]) == list(who.joints)
         assert list(found["units"]) == ["mm"]
         assert found["rate"] == pytest.approx(who.rate_hz, rel=1e-7)
@@ -139,7 +139,9 @@ def check_c3d(path, who, made):
     # the other way round.
     np.testing.assert_array_equal(found["residual"], residual)
     bits = (made.views[:, :7] * 2 ** torch.arange(made.views[:, :7].shape[1])[:, None]).sum(1)
-    np.testing.assert_array_equal(found["mask"], np.where(made.placed.numpy(), bits.numpy(), 127))
+    np.testing.assert_array_equal(
+        found["mask"], np.where(made.has_position.numpy(), bits.numpy(), 127)
+    )
     return worst
 
 
@@ -230,7 +232,7 @@ def test_e1_npz_by_numpy_and_by_its_own_reader(tmp_path):
             field
         )
     points = torch.cat([p.points for p in parts])
-    assert torch.equal(points, torch.where(made.placed[..., None], made.points, 0.0))
+    assert torch.equal(points, torch.where(made.has_position[..., None], made.points, 0.0))
 
 
 def test_e1_parquet(tmp_path):
@@ -244,7 +246,7 @@ def test_e1_parquet(tmp_path):
         [[np.nan if v is None else v for v in c.to_pylist()] for c in columns]
     ).T.reshape(50, 17, 3)
     assert difference(found, truth(made)) == 0
-    assert sum(c.null_count for c in columns) == 3 * int((~made.placed).sum())
+    assert sum(c.null_count for c in columns) == 3 * int((~made.has_position).sum())
     notes = json.loads(table.schema.metadata[b"ghpt"])
     assert (notes["rate_hz"], notes["unit"], tuple(notes["joints"])) == (29.97, "mm", JOINTS)
 

@@ -8,6 +8,7 @@ import torch
 
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.errors import check
+from ghpt.geometry.cameras import relative_pose
 from ghpt.recording import PairBatch, RelativePoseEstimate
 
 
@@ -38,8 +39,7 @@ class RigBaseline:
             )
         )
         item = torch.arange(len(rigs))
-        turn = R[item, b] @ R[item, a].mT
-        shift = t[item, b] - (turn @ t[item, a][..., None])[..., 0]
+        turn, shift = relative_pose(R[item, a], t[item, a], R[item, b], t[item, b])
         length = shift.norm(dim=-1)
         ok = ok[item, a] & ok[item, b] & (length > 0)
         eye = torch.eye(3, dtype=R.dtype)

@@ -197,7 +197,7 @@ class Diagnostics:
                 )
 
     def _geometry(self, case: Case, rig: Rig) -> Iterator[Diagnosis]:
-        centre = -(rig.R.mT @ rig.t[..., None])[..., 0]
+        centre = rig.centre
         distance = torch.cdist(centre, centre)
         near = (distance < self.apart) & (rig.placed & rig.placed[:, None]).triu(1)
         for a, b in torch.nonzero(near).tolist():

@@ -68,7 +68,7 @@ def linearise(
         return Linearised(scale, float("inf"), False, False, float("inf"), *nothing)
     used = used[:, chosen]
     frame = seen_by.frame[chosen]
-    centre = -(rig.R.mT @ rig.t[..., None])[..., 0]
+    centre = rig.centre
     arm = rig.points[chosen] - centre[:, None]
     x, y, z = (arm @ rig.R.mT).unbind(-1)
     front = used & (z > 0)

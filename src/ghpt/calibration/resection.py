@@ -15,7 +15,7 @@ from torch import Tensor
 from ghpt.calibration.observations import Observations
 from ghpt.calibration.pairs import PairTable, camera_dict, ransac_options
 from ghpt.errors import check_positive
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, camera_centre
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.randomness import key, uniform
 
@@ -33,6 +33,11 @@ class Rig:
     inlier: Bool[Tensor, "V N"]
     """Observations in placed views that agree with their point; a point has none or at least two.
     """
+
+    @property
+    def centre(self) -> Float[Tensor, "V 3"]:
+        """The centres of the cameras in the world."""
+        return camera_centre(self.R, self.t)
 
 
 @dataclass(frozen=True)

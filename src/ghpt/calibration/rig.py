@@ -248,7 +248,7 @@ class RigCalibration:
 def unitised(rig: Rig) -> Rig:
     """The rig in the frame of its first placed view, with the size 1."""
     views = torch.nonzero(rig.placed)[:, 0]
-    centre = -(rig.R.mT @ rig.t[..., None])[..., 0]
+    centre = rig.centre
     size = (centre[views] - centre[views].mean(0)).square().sum(-1).mean().sqrt()
     size = torch.where((size > 0) & torch.isfinite(size), size, 1.0)
     first = views[0]

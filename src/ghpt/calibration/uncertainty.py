@@ -57,7 +57,7 @@ def uncertainty(seen_by: Observations, rig: Rig, state: Linearised, blocks: int)
     if not state.finite or len(views) < 2:
         return Uncertainty(covariance, 0.0, 1.0)
     own = (6 * views[:, None] + torch.arange(6)).flatten()
-    centre = -(rig.R.mT @ rig.t[..., None])[views, :, 0]
+    centre = rig.centre[views]
     basis = torch.linalg.svd(gauge(rig.R[views], centre))[0][:, 7:]
     matrix = basis.T @ state.matrix[own][:, own] @ basis
     values, vectors = torch.linalg.eigh((matrix + matrix.T) / 2)

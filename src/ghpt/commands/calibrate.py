@@ -23,13 +23,12 @@ from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.frames import MEASURED, frames_of_views
 from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import KeyPoints
 from ghpt.data.formats.names import Name
 from ghpt.data.people.views import Views, undistort_and_match
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.models.estimators.classical import Baseline
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.provenance import provenance
@@ -141,11 +140,11 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
 
     estimate, scale = in_millimetres(estimate, lengths, measure)
     chosen = torch.nonzero(usable_cameras(estimate))[:, 0].tolist()
-    world, gauge = _gauge(estimate, placed, cameras.cameras, case.reference)
-    moved = gauge.cameras(estimate.cameras)
-    rigs = {"estimated": moved} | (
-        {case.reference: cameras.cameras} if cameras.cameras is not None else {}
+    world, gauge = _gauge(
+        estimate, placed, cameras.cameras if cameras.calibrated else None, case.reference
     )
+    moved = gauge.cameras(estimate.cameras)
+    rigs = {"estimated": moved} | ({case.reference: cameras.cameras} if cameras.calibrated else {})
     seen_by = {name: _through(case, placed, rig) for name, rig in rigs.items() if placed}
     numbers = {
         "data": case.title,
@@ -174,7 +173,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
         points, estimated = triangulate_recording(recording, estimator)
         write_rig(output, cameras.select(chosen), moved.index(chosen), numbers)
         write_poses(output / "poses.npz", recording, points, estimated, numbers)
-    reference = (case.reference, cameras.cameras) if cameras.cameras is not None else None
+    reference = (case.reference, cameras.cameras) if cameras.calibrated else None
     covariance = gauge.covariance(estimate.covariance)
     write_rig_figure(
         output, numbers, moved, covariance, points, estimated, estimate.calibrated, reference
@@ -228,7 +227,7 @@ def in_unit(case: Case, estimator: Baseline) -> Case:
     with.
     """
     file = case.views.cameras
-    if file.unit_known or file.cameras is None or len(file) < 2:
+    if file.unit_known or not file.calibrated or len(file) < 2:
         return case
     frames = frames_of_views(case.views, case.source, case.title)
     file = decide_unit(file, frames.batch(frames.spread(MEASURED)), estimator, ask=False)
@@ -250,18 +249,7 @@ def people_note(points: KeyPoints) -> tuple[Diagnosis, ...]:
 def from_data(config: Mapping[str, Any]) -> Case:
     """One recording of a data set, whose true extrinsics serve the comparison alone."""
     data, found = recording_of(config)
-    rig = found.cameras
-    file = CameraFile(
-        path=data.source,
-        format="ghpt",
-        names=found.camera_names,
-        other_names=("",) * len(found.camera_names),
-        K=rig.K,
-        distortion=rig.K.new_zeros(len(rig.K), 5),
-        size=None,
-        R=rig.R,
-        t=rig.t,
-    )
+    file = CameraSet.from_cameras(found.camera_names, found.cameras, path=data.source)
     arrays = (
         np.array(getattr(found, field)) for field in ("key_points", "confidence", "valid", "frame")
     )

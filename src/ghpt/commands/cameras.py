@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +28,11 @@ from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, rec
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import KeyPoints
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.files import atomic_write, remove, sweep_temporaries, write_json
+from ghpt.geometry.cameras import CameraSet
 from ghpt.geometry.lens import distort
 from ghpt.provenance import provenance
 from ghpt.recording import Recording
@@ -58,7 +58,7 @@ class Patient:
     title: str
     source: str
     evidence: Evidence
-    cameras: CameraFile
+    cameras: CameraSet
     setup: Setup
     points: KeyPoints | None
     """None for a demonstration."""
@@ -160,7 +160,7 @@ def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
 
 def from_recording(
     recording: Recording, data: Any, doctor: Doctor, frames: int
-) -> tuple[Evidence, CameraFile]:
+) -> tuple[Evidence, CameraSet]:
     """The middle ``frames`` frames of a synthetic recording, as its rig's lenses show them."""
     rig = human36m_rig(recording.subject) if data.name == "h36m" else panoptic_rig(data.cameras)
     first = max(0, (len(recording) - frames) // 2)
@@ -171,17 +171,7 @@ def from_recording(
         .reshape(straight.shape)
         .transpose(0, 1)
     )
-    file = CameraFile(
-        path=recording.name,
-        format="ghpt",
-        names=rig.names,
-        other_names=("",) * len(rig),
-        K=rig.cameras.K,
-        distortion=rig.distortion,
-        size=rig.size,
-        R=rig.cameras.R,
-        t=rig.cameras.t,
-    )
+    file = replace(rig, path=recording.name)
     valid = np.array(recording.valid[rows])
     frame = np.array(recording.frame[rows])
     return choose(

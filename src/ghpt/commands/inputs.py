@@ -10,10 +10,11 @@ from typing import Any, TypedDict
 from ghpt.config import build, suggest
 from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.data.datasets.store import prepared
-from ghpt.data.formats.camera_files import CameraFile, read_cameras
+from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import KeyPoints, read_key_points
 from ghpt.data.formats.names import Name
 from ghpt.errors import GhptConfigError
+from ghpt.geometry.cameras import CameraSet
 from ghpt.recording import Recording
 
 
@@ -33,7 +34,7 @@ class InputSettings(TypedDict):
     data: dict[str, Any]
 
 
-def own_cameras(config: Mapping[str, Any], example: str) -> CameraFile:
+def own_cameras(config: Mapping[str, Any], example: str) -> CameraSet:
     """The user's camera file. Raises GhptConfigError, with ``example``, if none is named."""
     if not config["cameras"]:
         raise GhptConfigError("cameras", "is missing", f"Name the file: cameras={example}")

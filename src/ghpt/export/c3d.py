@@ -86,7 +86,7 @@ def _points(about: About, piece: Reconstruction) -> np.ndarray:
     """x, y, z and the word with the mask in the high byte and the residual in the low one, float32
     [T, J, 4].
     """
-    placed = piece.placed
+    placed = piece.has_position
     observed = piece.state == State.OBSERVED
     bits = 2 ** torch.arange(min(_CAMERAS, piece.views.shape[1]))
     mask = (piece.views[:, :_CAMERAS] * bits[:, None]).sum(1)

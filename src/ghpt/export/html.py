@@ -91,7 +91,7 @@ def _arrays(about: About, piece: Reconstruction, kept: slice) -> tuple[np.ndarra
     observed = (piece.state == State.OBSERVED)[kept]
     total = torch.where(observed, piece.error[kept], 0.0).sum(1)
     mean = torch.where(observed.any(1), total / observed.sum(1).clamp(min=1), torch.nan)
-    points = torch.where(piece.placed[..., None], points_of_origin(about, piece), 0.0)[kept]
+    points = torch.where(piece.has_position[..., None], points_of_origin(about, piece), 0.0)[kept]
     return tuple(value.numpy() for value in (piece.frame[kept], points, piece.state[kept], mean))
 
 

@@ -17,7 +17,7 @@ from ghpt.data.formats.stored_npz import Member, add_member, members_of, read_ro
 from ghpt.errors import GhptDataError
 from ghpt.export.stream import PIECE, Chunks, pieces
 from ghpt.files import atomic_write
-from ghpt.reconstruction import About, Reconstruction, State
+from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
 
 FORMAT_VERSION = 2
 _POINTS = {1: "<f4", 2: "<f8"}
@@ -83,7 +83,7 @@ def _meta(about: About) -> dict[str, Any]:
     return (
         meta
         | {field: getattr(about, field) for field in plain}
-        | {"states": {s.name.lower(): int(s) for s in State}}
+        | {"states": {s.name.lower(): int(s) for s in FILE_STATES}}
     )
 
 
@@ -184,7 +184,7 @@ def _read(path: Path, members: dict[str, Member], start: int, stop: int) -> Reco
         for name in _layout(1, 1)
     }
     state = rows["state"]
-    if ((state < 0) | (state > max(State))).any():
+    if ((state < 0) | (state > max(FILE_STATES))).any():
         raise GhptDataError(path, "state", "holds a number that is no state", _HINT)
     placed = (state <= State.FILLED)[..., None].expand_as(rows["points"])
     if not rows["points"][placed].isfinite().all():

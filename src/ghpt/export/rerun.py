@@ -105,10 +105,12 @@ class _Piece:
     def log(self, scene: Scene | None, evidence: Evidence | None) -> None:
         rr = self.rr
         piece = self.piece
-        self._points(rr.Points3D, "world/joints", piece.points, piece.placed, self.colours, 15.0)
+        self._points(
+            rr.Points3D, "world/joints", piece.points, piece.has_position, self.colours, 15.0
+        )
         bones = torch.tensor(bones_of(self.about.joints), dtype=torch.long).reshape(-1, 2)
         strips = piece.points[:, bones]
-        there = piece.placed[:, bones].all(-1)
+        there = piece.has_position[:, bones].all(-1)
         colours = torch.minimum(self.colours[:, bones[:, 0]], self.colours[:, bones[:, 1]])
         self._strips("world/bones", strips, there, colours, 6.0)
         observed = piece.state == State.OBSERVED
@@ -140,7 +142,7 @@ class _Piece:
             colour = torch.full_like(piece.state, 0, dtype=torch.long) + _GREY
             self._strips(f"world/rays/{rr.escape_entity_path_part(name)}", rays, used, colour, 1.0)
             image = f"{_camera(rr, name)}/image"
-            shown = piece.placed & (depth[:, v] > 0)
+            shown = piece.has_position & (depth[:, v] > 0)
             self._points(
                 rr.Points2D, f"{image}/reprojected", pixels[:, v], shown, self.colours, 3.0
             )

@@ -64,7 +64,7 @@ def upright(joints: tuple[str, ...], piece: Reconstruction) -> Float[Tensor, " 3
     if not {"pelvis", "thorax"} <= set(joints):
         return torch.zeros(3, dtype=torch.float64)
     ends = [joints.index("pelvis"), joints.index("thorax")]
-    both = piece.placed[:, ends].all(1)
+    both = piece.has_position[:, ends].all(1)
     way = piece.points[both][:, ends].double()
     return (way[:, 1] - way[:, 0]).sum(0)
 

@@ -15,9 +15,9 @@ import torch
 from ghpt.errors import GhptConfigError
 from ghpt.export.stream import Chunks, pieces, plain_names, text_rows
 from ghpt.files import atomic_write
-from ghpt.reconstruction import About, Reconstruction, State
+from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
 
-_STATES = np.array([state.name.lower() for state in State])
+_STATES = np.array([state.name.lower() for state in FILE_STATES])
 
 
 class Column(NamedTuple):
@@ -35,7 +35,7 @@ def columns(path: Path, about: About, piece: Reconstruction) -> list[Column]:
     """
     rate = about.rate_hz if about.rate_hz else np.nan
     observed = piece.state == State.OBSERVED
-    placed = piece.placed
+    placed = piece.has_position
     points = torch.where(placed[..., None], piece.points, torch.nan).numpy()
     error = torch.where(observed, piece.error, torch.nan).numpy()
     spread = torch.where(

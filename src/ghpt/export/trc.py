@@ -74,5 +74,5 @@ def write_trc(
             points = (piece.points.double() @ turn.T).flatten(1).numpy()
             numbers = np.column_stack([frame, (frame - whole.first) / rate, points])
             there = np.ones(numbers.shape, bool)
-            there[:, 2:] = piece.placed.numpy().repeat(3, axis=1)
+            there[:, 2:] = piece.has_position.numpy().repeat(3, axis=1)
             handle.write(text_rows(np.where(there, forms, ""), numbers[there], "\t", "\t\n"))

@@ -4,12 +4,31 @@ pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
+
+from ghpt.errors import GhptDataError
+
+
+def camera_centre(R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
+    """Return the centre of each world-to-camera pose, ``-R^T t``, in the world."""
+    return -(R.mT @ t[..., None])[..., 0]
+
+
+def relative_pose(
+    R_a: Float[Tensor, "*A 3 3"],
+    t_a: Float[Tensor, "*A 3"],
+    R_b: Float[Tensor, "*B 3 3"],
+    t_b: Float[Tensor, "*B 3"],
+) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"]]:
+    """Return R and t of ``x_b = R x_a + t``, from the frame of camera a to that of camera b."""
+    R = R_b @ R_a.mT
+    return R, t_b - (R @ t_a[..., None])[..., 0]
 
 
 @dataclass(frozen=True)
@@ -25,24 +44,149 @@ class Cameras:
 
     @property
     def centre(self) -> Float[Tensor, "*B V 3"]:
-        """Camera centres in the world, ``-R^T t``."""
-        return -(self.R.mT @ self.t[..., None])[..., 0]
+        """The camera centres in the world, mm."""
+        return camera_centre(self.R, self.t)
+
+    def relative_pose(
+        self, reference: int, target: int | slice
+    ) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"]]:
+        """Return R and t of ``x_target = R x_reference + t``.
+
+        A slice of targets, of a rig without leading dimensions, gives the poses of all of them.
+        """
+        R_a = self.R[..., reference, :, :]
+        t_a = self.t[..., reference, :]
+        return relative_pose(R_a, t_a, self.R[..., target, :, :], self.t[..., target, :])
 
     def relative_to(self, origin: Float[Tensor, " 3"]) -> Cameras:
-        """The same cameras in a world whose zero is ``origin`` (mm) of theirs; float64."""
+        """Return the same cameras in a world whose zero is ``origin`` (mm) of theirs; float64."""
         double = self.to(torch.float64)
-        shift = double.R @ origin.to(double.R)[:, None]
-        return Cameras(double.K, double.R, double.t + shift[..., 0])
+        offset = double.R @ origin.to(double.R)[:, None]
+        return Cameras(double.K, double.R, double.t + offset[..., 0])
+
+    def expand(self, count: int) -> Cameras:
+        """Return the cameras ``count`` times along a new leading dimension; no memory is copied."""
+        K = self.K.expand(count, *self.K.shape)
+        R = self.R.expand(count, *self.R.shape)
+        t = self.t.expand(count, *self.t.shape)
+        return Cameras(K, R, t)
 
     def index(self, item: Any) -> Cameras:
         """Index the leading dimensions."""
         return Cameras(self.K[item], self.R[item], self.t[item])
 
     def to(self, *args: Any, **kwargs: Any) -> Cameras:
-        return Cameras(*(x.to(*args, **kwargs) for x in (self.K, self.R, self.t)))
+        """Return the cameras on another device or in another dtype, as ``Tensor.to`` takes them."""
+        K = self.K.to(*args, **kwargs)
+        R = self.R.to(*args, **kwargs)
+        t = self.t.to(*args, **kwargs)
+        return Cameras(K, R, t)
 
     def pin_memory(self) -> Cameras:
-        return Cameras(*(x.pin_memory() for x in (self.K, self.R, self.t)))
+        """Return the cameras in page-locked memory."""
+        return Cameras(self.K.pin_memory(), self.R.pin_memory(), self.t.pin_memory())
+
+
+@dataclass(frozen=True)
+class CameraSet:
+    """V named cameras with their lenses, as a file or a data set has them.
+
+    The intrinsics are always known; the extrinsics (mm) and the image sizes only where the file
+    has them for all cameras.
+    """
+
+    names: tuple[str, ...]
+    K: Float[Tensor, "V 3 3"]
+    """Intrinsics, pixels, float64."""
+    distortion: Float[Tensor, "V 5"]
+    """OpenCV's k1, k2, p1, p2, k3."""
+    size: Int[Tensor, "V 2"] | None = None
+    """Width and height of the images, pixels."""
+    R: Float[Tensor, "V 3 3"] | None = None
+    """World to camera; None, with ``t``, for cameras without extrinsics."""
+    t: Float[Tensor, "V 3"] | None = None
+    other_names: tuple[str, ...] = ()
+    """What else the file calls each camera (a TOML table's key), '' where nothing; may be empty."""
+    path: str = ""
+    """The file, or what else errors are to name."""
+    format: str = "ghpt"
+    unit_known: bool = True
+    """False where the file has no unit of length and nobody gave one: ``t`` is in mm by a guess."""
+    unit_mm: float = 1.0
+    """Length of the file's own unit, given, the format's or guessed."""
+
+    @classmethod
+    def from_cameras(
+        cls,
+        names: Sequence[str],
+        cameras: Cameras,
+        distortion: Float[Tensor, "V 5"] | None = None,
+        size: Int[Tensor, "V 2"] | None = None,
+        path: str = "",
+    ) -> CameraSet:
+        """Return calibrated cameras under these names; no ``distortion`` means ideal pinholes."""
+        if distortion is None:
+            distortion = cameras.K.new_zeros(len(names), 5)
+        return cls(
+            names=tuple(names),
+            K=cameras.K,
+            distortion=distortion,
+            size=size,
+            R=cameras.R,
+            t=cameras.t,
+            path=path,
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def calibrated(self) -> bool:
+        """Whether the cameras have extrinsics."""
+        return self.R is not None and self.t is not None
+
+    @property
+    def cameras(self) -> Cameras:
+        """The calibrated cameras. Raises GhptDataError where they have no extrinsics."""
+        if self.R is None or self.t is None:
+            problem = "not all cameras have extrinsics"
+            raise GhptDataError(self.path, "rotation, translation", problem, _CALIBRATE)
+        return Cameras(self.K, self.R, self.t)
+
+    @property
+    def image_size(self) -> Int[Tensor, "V 2"]:
+        """Width and height, pixels; twice the principal point where ``size`` is not known."""
+        if self.size is not None:
+            return self.size
+        return (2 * self.K[:, :2, 2] + 1).round().long()
+
+    def select(self, indices: Sequence[int]) -> CameraSet:
+        """Return some of the cameras, in this order."""
+        at = list(indices)
+        return replace(
+            self,
+            names=tuple(self.names[i] for i in at),
+            other_names=tuple(self.other_names[i] for i in at) if self.other_names else (),
+            K=self.K[at],
+            distortion=self.distortion[at],
+            size=None if self.size is None else self.size[at],
+            R=None if self.R is None else self.R[at],
+            t=None if self.t is None else self.t[at],
+        )
+
+    def with_cameras(self, cameras: Cameras) -> CameraSet:
+        """Return the same lenses and images with other pinhole cameras, in mm."""
+        return replace(self, K=cameras.K, R=cameras.R, t=cameras.t)
+
+    def without_distortion(self) -> CameraSet:
+        """Return the cameras as the ideal pinholes that undistorted key points are of."""
+        return replace(self, distortion=torch.zeros_like(self.distortion))
+
+
+_CALIBRATE = (
+    "Calibrate first (python calibrate.py keypoints=... cameras=...), "
+    "and give the rig.toml that it writes."
+)
 
 
 def project(

@@ -12,7 +12,8 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import products, solve_symmetric, weighted_sum
-from ghpt.geometry.triangulation import Status, System, Triangulation, flat_cameras, in_parts
+from ghpt.geometry.state import State
+from ghpt.geometry.triangulation import System, Triangulation, flat_cameras, in_parts
 
 _TINY = 1e-30
 _SETTLED = 1e-3
@@ -59,14 +60,14 @@ def triangulate_robustly(
         robust = system.solve(weight / weight.amax(0).clamp(min=_TINY))
         fields = system.fields(*robust, weight > 0, spoilt)
         step = torch.linalg.vector_norm(torch.stack(robust[0]) - before, dim=0).mT
-        started = first[1] == Status.OK
-        good = fields[1] == Status.OK
+        started = first[1] == State.OBSERVED
+        good = fields[1] == State.OBSERVED
         fields = tuple(
             torch.where((started & good)[..., None] if x.ndim > good.ndim else started & good, x, y)
             for x, y in zip(fields, first, strict=True)
         )
         unsettled = started & ~(good & (step <= tolerance))
-        return (fields[0], fields[1].masked_fill(unsettled, int(Status.NOT_CONVERGED)), *fields[2:])
+        return (fields[0], fields[1].masked_fill(unsettled, int(State.NOT_CONVERGED)), *fields[2:])
 
     return Triangulation(*in_parts(part, valid.shape))
 

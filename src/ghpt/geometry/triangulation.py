@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
-from enum import IntEnum
 
 import torch
 from jaxtyping import Bool, Float, Int, Int8
@@ -28,34 +27,13 @@ from ghpt.geometry.normal_equations import (
     views_of,
     weighted_sum,
 )
+from ghpt.geometry.state import State
 
 NO_DEPTH = 1e-9
 """A depth below this fraction of |t| is rounding: the rays met in the camera's own centre."""
 
 _AT_ONCE = 2**15
 """Key points that are worked on at once: few enough to stay in a processor's cache."""
-
-
-class Status(IntEnum):
-    """Why a joint has no point. The first that applies, in the order NONFINITE_INPUT, FEW_VIEWS,
-    PARALLEL, BEHIND, NOT_CONVERGED.
-    """
-
-    OK = 0
-    FEW_VIEWS = 1
-    """Fewer than two views are used."""
-    PARALLEL = 2
-    """The used rays do not fix a point: parallel, along their baseline, or from one and the same
-    centre.
-    """
-    BEHIND = 3
-    """The point is not in front of every used camera."""
-    NONFINITE_INPUT = 4
-    """A used key point, weight or camera is not finite, absurdly large (``LARGEST``) or not a
-    camera at all (R not a rotation, focal length not positive).
-    """
-    NOT_CONVERGED = 5
-    """An iterative estimator stopped at its limit; the point is its last."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +45,7 @@ class Triangulation:
     points: Float[Tensor, "*B J 3"]
     """World frame, mm, float64; 0 where not ``ok``."""
     status: Int8[Tensor, "*B J"]
+    """Values of ``State``."""
     angle: Float[Tensor, "*B J"]
     """Radians in [0, pi/2]: the arc sine of the root mean square, over the pairs of used views, of
     the sine between their rays. For two views it is the (acute) angle between the two rays.
@@ -79,12 +58,12 @@ class Triangulation:
 
     @property
     def ok(self) -> Bool[Tensor, "*B J"]:
-        return self.status == Status.OK
+        return self.status == State.OBSERVED
 
     @property
-    def placed(self) -> Bool[Tensor, "*B J"]:
-        """The joints that have a point."""
-        return self.ok | (self.status == Status.NOT_CONVERGED)
+    def has_position(self) -> Bool[Tensor, "*B J"]:
+        """The joints that have a point: those that are ``ok`` or did not converge."""
+        return self.status <= State.FILLED
 
     def with_rows(self, rows: Int[Tensor, " b"], part: Triangulation) -> Triangulation:
         """This, with ``part`` in these rows of the first dimension."""
@@ -220,19 +199,19 @@ class System:
         distance = torch.where(used.any(1), self.length.mT, 0.0)[:, None]
         parallel = torch.isinf(cond) | _one_centre(self.local, distance, used)
         behind = (used & ~(depth > NO_DEPTH * distance)).any(0)
-        status = torch.full_like(count, int(Status.OK), dtype=torch.int8)
+        status = torch.full_like(count, int(State.OBSERVED), dtype=torch.int8)
         for mask, reason in (
-            (behind, Status.BEHIND),
-            (parallel, Status.PARALLEL),
-            (count < 2, Status.FEW_VIEWS),
-            (spoilt, Status.NONFINITE_INPUT),
+            (behind, State.BEHIND),
+            (parallel, State.PARALLEL),
+            (count < 2, State.FEW_VIEWS),
+            (spoilt, State.BAD_INPUT),
         ):
             status = status.masked_fill(mask, int(reason))
-        ok = status == Status.OK
+        ok = status == State.OBSERVED
         nearest = (
             torch.where(used, depth, torch.inf).amin(0) if len(depth) else torch.zeros_like(cond)
         )
-        nearest = torch.where(ok | (status == Status.BEHIND), nearest, 0.0)
+        nearest = torch.where(ok | (status == State.BEHIND), nearest, 0.0)
         world = [torch.where(ok, x + o, 0.0) for x, o in zip(solution, self.origin.mT, strict=True)]
         angle = _ray_angle(self.local, self.views, used, count)
         return (

@@ -13,6 +13,7 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
+from ghpt.geometry.cameras import relative_pose
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.pose.predictions import PredictionWriter
 from ghpt.models.relative_pose.predictions import PairWriter
@@ -116,10 +117,9 @@ class CollectPairs(Collect):
             length = module.problem.scale(estimate, batch)
             estimates[name] = replace(estimate, t=estimate.t * length[..., None])
         a, b = (batch.pair_cameras().index((slice(None), view)) for view in (0, 1))
-        R = b.R @ a.R.mT
-        t = b.t - (R @ a.t[..., None])[..., 0]
+        truth = relative_pose(a.R, a.t, b.R, b.t)
         self.writer.write(
-            batch.sample, estimates, (R, t), batch.rig, batch.draw, batch.pair, weights
+            batch.sample, estimates, truth, batch.rig, batch.draw, batch.pair, weights
         )
 
     def finish(self) -> None:

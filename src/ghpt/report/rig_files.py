@@ -15,11 +15,9 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from torch import Tensor
 
 from ghpt.calibration.rig import RigEstimate
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
-from ghpt.data.synthetic.rigs import Rig
 from ghpt.files import atomic_write, finite, remove, write_json
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.recording import Recording
 from ghpt.report.calibration import calibration_report
 from ghpt.report.rig_comparison import Similarity, align, upright
@@ -31,7 +29,7 @@ RIG_FILES = ("rig.toml", "rig_anipose.toml", "intri.yml", "extri.yml", "poses.np
 
 
 def camera_numbers(
-    estimate: RigEstimate, moved: Cameras, gauge: Similarity, file: CameraFile
+    estimate: RigEstimate, moved: Cameras, gauge: Similarity, file: CameraSet
 ) -> list[dict[str, Any]]:
     """For each camera what calibration.json holds; ``moved``: the cameras after ``gauge``, in the
     files' world.
@@ -63,13 +61,12 @@ def camera_numbers(
     return numbers
 
 
-def write_rig(output: Path, file: CameraFile, cameras: Cameras, numbers: dict[str, Any]) -> None:
+def write_rig(output: Path, file: CameraSet, cameras: Cameras, numbers: dict[str, Any]) -> None:
     """The calibrated cameras for Pose2Sim, aniposelib, OpenCV and EasyMocap.
 
     An image size that the user's file does not give is left out of the yml files; in the TOML
     files, which must have one, it is twice the principal point, and the metadata say so.
     """
-    size = (2 * file.K[:, :2, 2] + 1).round().long() if file.size is None else file.size
     metadata = {
         "adjusted": False,
         "error": max(c["reprojection_px"] or 0.0 for c in numbers["cameras"]),
@@ -80,12 +77,10 @@ def write_rig(output: Path, file: CameraFile, cameras: Cameras, numbers: dict[st
     }
     if file.size is None:
         metadata["size"] = "not known: twice the principal point"
-    rig = Rig(file.names, cameras, file.distortion, size)
+    rig = file.with_cameras(cameras)
     write_pose2sim(output / "rig.toml", rig, metadata)
     write_aniposelib(output / "rig_anipose.toml", rig, metadata)
-    write_opencv(
-        output, rig if file.size is not None else Rig(rig.names, cameras, rig.distortion, 0 * size)
-    )
+    write_opencv(output, rig)
 
 
 def write_poses(

@@ -13,6 +13,7 @@ import torch
 from ghpt.calibration.check.candidates import POSES
 from ghpt.calibration.check.evidence import Evidence
 from ghpt.calibration.check.setup import Setup, ideal
+from ghpt.geometry.cameras import camera_centre
 from ghpt.geometry.lens import distort
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.skeleton import MIRROR
@@ -28,7 +29,7 @@ def _pose(case: Case, views: Sequence[int], code: str) -> Case:
     R = setup.R.clone()
     t = setup.t.clone()
     if code == "centre_for_translation":
-        t[at] = -(R[at].mT @ t[at][..., None])[..., 0]
+        t[at] = camera_centre(R[at], t[at])
     elif code == "camera_to_world_flipped":
         R[at], t[at] = POSES["camera_to_world"][0](*POSES["axes_flipped"][0](R[at], t[at]))
     else:  # these undo themselves
@@ -79,7 +80,7 @@ def _moved(case: Case, views: Sequence[int], degrees: float, millimetres: float)
     way = millimetres * torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
     for v in views:
         R = turn @ setup.R[v]
-        setup = setup.changed(v, R=R, t=-R @ (way - setup.R[v].mT @ setup.t[v]))
+        setup = setup.changed(v, R=R, t=-R @ (way + camera_centre(setup.R[v], setup.t[v])))
     return evidence, setup
 
 

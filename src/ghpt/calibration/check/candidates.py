@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ghpt.calibration.check.setup import Setup
 from ghpt.calibration.repair import RESOLUTIONS
+from ghpt.geometry.cameras import camera_centre
 
 UNITS = {
     1e3: "metres for millimetres",
@@ -55,7 +56,7 @@ def _from_centre(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _inverse(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-    return R.mT, -(R.mT @ t[..., None])[..., 0]
+    return R.mT, camera_centre(R, t)
 
 
 def _flipped(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:

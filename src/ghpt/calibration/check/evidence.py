@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.key_points import KeyPoints
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.skeletons import joints17
 from ghpt.data.people.views import check_pixels, matched
 from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import CameraSet
 
 _LEAST_JOINTS = 6
 """Seen in two views for a frame to be looked at."""
@@ -50,12 +50,12 @@ class Evidence:
 
 def gather(
     points: KeyPoints,
-    cameras: CameraFile,
+    cameras: CameraSet,
     match: Mapping[Name, Name],
     views: Sequence[Name] | None,
     frames: int,
     max_shift: int,
-) -> tuple[Evidence, CameraFile, tuple[int, ...]]:
+) -> tuple[Evidence, CameraSet, tuple[int, ...]]:
     """At most ``frames`` frames, evenly spread over those in which people are seen; their cameras
     in the order of the views; and which of the key points' views these are. ``max_shift``:
     the largest shift, at most a quarter of the frames.
@@ -70,7 +70,7 @@ def gather(
         )
     at = [view for view, _ in pairs]
     ordered = cameras.select([camera for _, camera in pairs])
-    if ordered.cameras is None:
+    if not ordered.calibrated:
         hint = "Calibrate them first: python calibrate.py --help"
         raise GhptDataError(
             cameras.path, "extrinsics", "are missing: there is nothing to check", hint
@@ -79,7 +79,7 @@ def gather(
 
 
 def of_points(
-    points: KeyPoints, at: Sequence[int], cameras: CameraFile, frames: int, max_shift: int
+    points: KeyPoints, at: Sequence[int], cameras: CameraSet, frames: int, max_shift: int
 ) -> Evidence:
     """The evidence of the views ``at``, whose cameras these are. Raises GhptDataError for key
     points that are no pixels.

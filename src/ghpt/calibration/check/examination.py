@@ -35,6 +35,7 @@ from ghpt.calibration.check.resection import resect
 from ghpt.calibration.check.setup import Look, Setup
 from ghpt.calibration.check.units import unit_of
 from ghpt.errors import check
+from ghpt.geometry.cameras import camera_centre
 from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.estimators.classical import Baseline, MEstimator
 from ghpt.models.relative_pose.scale import STATURES, stature
@@ -272,7 +273,7 @@ class Doctor:
             return []
         R, t = found
         turn = float(rotation_deg(R, setup.R[view]))
-        way = float((R.mT @ t - setup.R[view].mT @ setup.t[view]).norm())
+        way = float((camera_centre(R, t) - camera_centre(setup.R[view], setup.t[view])).norm())
         text = (
             f"{{camera}} is not where the file has it: its key points fit a camera turned by {turn:.1f}° and "
             f"moved by {way:.0f} mm; calibrate it again"

@@ -10,19 +10,17 @@ import numpy as np
 from ghpt.calibration.check.evidence import moment
 from ghpt.calibration.check.examination import Checkup
 from ghpt.calibration.check.setup import Setup
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.formats.skeletons import joints17
-from ghpt.data.synthetic.rigs import Rig
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.skeleton import JOINTS, MIRROR
 
 MENDED = ("cameras.toml", "keypoints.npz")
 
 
 def write_mended(
-    output: Path, cameras: CameraFile, checkup: Checkup, points: KeyPoints | None, at: Sequence[int]
+    output: Path, cameras: CameraSet, checkup: Checkup, points: KeyPoints | None, at: Sequence[int]
 ) -> None:
     """``cameras.toml``; and ``keypoints.npz``, the 17 joints, where a view was shifted, thinned to
     the others' frames, mirrored or its sides exchanged. Exchanged views are mended by their
@@ -30,8 +28,9 @@ def write_mended(
     """
     setup = checkup.setup
     names = tuple(cameras.names[source] for source in setup.source)
-    size = (2 * cameras.K[:, :2, 2] + 1).round().long() if cameras.size is None else cameras.size
-    rig = Rig(names, Cameras(setup.K, setup.R, setup.t), setup.lens, size)
+    rig = CameraSet.from_cameras(
+        names, Cameras(setup.K, setup.R, setup.t), setup.lens, cameras.image_size
+    )
     said = "; ".join(finding.text for finding in checkup.findings if finding.mended)
     write_pose2sim(output / MENDED[0], rig, {"adjusted": True, "mended": said})
     if points is not None and (_changes_points(setup)):
@@ -44,7 +43,7 @@ def _changes_points(setup: Setup) -> bool:
 
 
 def mended_points(
-    points: KeyPoints, at: Sequence[int], cameras: CameraFile, checkup: Checkup
+    points: KeyPoints, at: Sequence[int], cameras: CameraSet, checkup: Checkup
 ) -> KeyPoints:
     """The key points as the mended cameras are to be shown them, in the order and by the names of
     these.

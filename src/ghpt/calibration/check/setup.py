@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.calibration.check.evidence import Evidence
-from ghpt.data.formats.camera_files import CameraFile
+from ghpt.geometry.cameras import CameraSet
 from ghpt.geometry.lens import undistort
 from ghpt.models.estimators.classical import person_scale
 from ghpt.skeleton import MIRROR
@@ -58,7 +58,7 @@ class Setup:
         return replace(self, **new)
 
 
-def as_filed(cameras: CameraFile) -> Setup:
+def as_filed(cameras: CameraSet) -> Setup:
     """What the files say."""
     rig = cameras.cameras
     views = len(cameras)

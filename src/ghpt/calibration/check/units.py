@@ -5,8 +5,8 @@ from __future__ import annotations
 import logging
 from dataclasses import replace
 
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import CameraSet
 from ghpt.models.estimators.classical import Baseline
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.relative_pose.scale import HUMAN, STATURES, stature
@@ -39,8 +39,8 @@ def unit_for(height: float) -> float:
 
 
 def decide_unit(
-    cameras: CameraFile, batch: Observations, estimator: Baseline, ask: bool
-) -> CameraFile:
+    cameras: CameraSet, batch: Observations, estimator: Baseline, ask: bool
+) -> CameraSet:
     """The cameras in mm, by the size of the person whom they show in these frames; as they are
     where the file says its unit, and where the views do not agree on a person, which is another
     mistake.
@@ -50,8 +50,8 @@ def decide_unit(
     if cameras.unit_known or cameras.t is None:
         return cameras
     found = estimator.triangulate(batch)
-    placed = found.placed
-    explained = _EXPLAINS.explained(batch, found.points, found.placed)
+    placed = found.has_position
+    explained = _EXPLAINS.explained(batch, found.points, found.has_position)
     if float(explained.sum()) < _AGREE * float(placed.sum()):
         return cameras
     height = float(stature(found.points, explained)) / cameras.unit_mm

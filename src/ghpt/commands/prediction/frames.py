@@ -15,11 +15,10 @@ from torch import Tensor
 
 from ghpt.calibration.check.units import decide_unit
 from ghpt.commands.prediction.shards import Shards
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.people.views import Views
 from ghpt.errors import GhptDataError
 from ghpt.export import Evidence
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.normal_equations import local_cameras
 from ghpt.models.estimators.classical import Baseline
 from ghpt.reconstruction import Reconstruction
@@ -38,7 +37,6 @@ MEASURED = 64
 """Frames by which the person tells the unit of length."""
 _STAMPED = 4096
 """Frames that are read at a time for the stamp."""
-_HINT = "Calibrate first (python calibrate.py keypoints=... cameras=...), and give the rig.toml that it writes."
 
 Seen = tuple[Float[np.ndarray, "N V J 2"], Float[np.ndarray, "N V J"], Bool[np.ndarray, "N V J"]]
 """Undistorted pixels (float32), confidences and what is seen, of the 17 joints."""
@@ -48,7 +46,7 @@ Seen = tuple[Float[np.ndarray, "N V J 2"], Float[np.ndarray, "N V J"], Bool[np.n
 class Detected:
     """The recording as the detector and the camera file have it."""
 
-    cameras: CameraFile
+    cameras: CameraSet
     """Of the views, in their order, in mm."""
     read: Callable[[Int[np.ndarray, " N"]], Seen]
     """Pixels through the lens, confidences and what is seen, of some rows, which rise."""
@@ -152,7 +150,7 @@ def in_unit(frames: Frames, estimator: Baseline) -> Frames:
     return replace(frames, cameras=file.cameras, detected=replace(frames.detected, cameras=file))
 
 
-def calibrated(where: str, cameras: CameraFile) -> Cameras:
+def calibrated(where: str, cameras: CameraSet) -> Cameras:
     """The cameras that the views have. Raises GhptDataError unless they are two or more with
     extrinsics.
     """
@@ -160,10 +158,6 @@ def calibrated(where: str, cameras: CameraFile) -> Cameras:
         hint = "A place in space takes two views or more of the same moment."
         raise GhptDataError(
             where, "views", f"there is only {', '.join(cameras.names) or 'none'}", hint
-        )
-    if cameras.cameras is None:
-        raise GhptDataError(
-            cameras.path, "rotation, translation", "not all cameras have extrinsics", _HINT
         )
     return cameras.cameras
 

@@ -17,7 +17,7 @@ from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, SEGMENTS, stature
-from ghpt.reconstruction import Reconstruction, State
+from ghpt.reconstruction import FILE_STATES, Reconstruction, State
 from ghpt.recording import Observations, PoseEstimate
 from ghpt.report.rig_comparison import segment_variation
 
@@ -34,7 +34,7 @@ def counts(
     views were exchanged, and the person's stature (mm; None where no limb is observed).
     """
     frames = 0
-    states = torch.zeros(len(joints), len(State), dtype=torch.int64)
+    states = torch.zeros(len(joints), len(FILE_STATES), dtype=torch.int64)
     flipped = torch.zeros(len(cameras), dtype=torch.int64)
     every = max(1, -(-total // MEASURED_FRAMES))
     points = []
@@ -44,11 +44,11 @@ def counts(
         points.append(chunk.points[measured].double())
         observed.append(chunk.state[measured] == State.OBSERVED)
         frames += len(chunk)
-        states += torch.stack([(chunk.state == state).sum(0) for state in State], dim=1)
+        states += torch.stack([(chunk.state == state).sum(0) for state in FILE_STATES], dim=1)
         flipped += chunk.flipped.sum(0)
     share = {
         state.name.lower(): float(states[:, state].sum()) / max(frames * len(joints), 1)
-        for state in State
+        for state in FILE_STATES
     }
     each = (states[:, State.OBSERVED].double() / max(frames, 1)).tolist()
     return {

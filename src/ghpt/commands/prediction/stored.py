@@ -14,7 +14,6 @@ from jaxtyping import Int
 
 from ghpt.commands.prediction.frames import Detected, Frames, Seen, calibrated
 from ghpt.data.datasets.detections import undistorted
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.skeletons import joints17, recognise
 from ghpt.data.formats.stored_npz import Member, members_of, read_rows, text_table
@@ -22,6 +21,7 @@ from ghpt.data.formats.validate import check_view_count, frame_rate
 from ghpt.data.people.people import KeyPoints, joints_for
 from ghpt.data.people.views import matched, undistort_and_match
 from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import CameraSet
 
 _CHECKED = 2000
 """Frames, evenly spread, by which the skeleton is recognised and the views are checked against
@@ -150,7 +150,7 @@ def open_stored(
 
 def frames_of_stored(
     stored: StoredKeyPoints,
-    cameras: CameraFile,
+    cameras: CameraSet,
     match: Mapping[Name, Name] | None,
     views: Sequence[Name] | None,
     title: str,

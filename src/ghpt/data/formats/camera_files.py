@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
+from jaxtyping import Float
 
 from ghpt.data.formats.colmap import is_colmap, read_colmap
 from ghpt.data.formats.names import Name, chosen_name
@@ -36,7 +35,7 @@ from ghpt.data.formats.validate import (
     read_name,
 )
 from ghpt.errors import GhptDataError
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import CameraSet
 from ghpt.geometry.rotations import vector_to_matrix
 
 _MM_PER_M = 1000.0
@@ -56,53 +55,6 @@ _FORMATS = (
 
 
 @dataclass(frozen=True)
-class CameraFile:
-    """V cameras as a user's file has them: intrinsics always, extrinsics (mm) and image sizes if it
-    has them.
-    """
-
-    path: str
-    format: str
-    names: tuple[str, ...]
-    other_names: tuple[str, ...]
-    """What else the file calls each camera (a TOML table's key); '' where nothing."""
-    K: Float[Tensor, "V 3 3"]
-    distortion: Float[Tensor, "V 5"]
-    """OpenCV's k1, k2, p1, p2, k3."""
-    size: Int[Tensor, "V 2"] | None
-    """Width and height, pixels; None unless the file has it for all cameras."""
-    R: Float[Tensor, "V 3 3"] | None
-    """World to camera; None, with ``t``, unless the file has both for all cameras and they are not
-    all the same.
-    """
-    t: Float[Tensor, "V 3"] | None
-    unit_known: bool = True
-    """False where the file has no unit of length and nobody gave one: then ``t`` is in mm by a
-    guess.
-    """
-    unit_mm: float = 1.0
-    """Length of the file's own unit, given, the format's or guessed."""
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    @property
-    def cameras(self) -> Cameras | None:
-        """The calibrated cameras; None without extrinsics."""
-        return None if self.R is None or self.t is None else Cameras(self.K, self.R, self.t)
-
-    def select(self, indices: Sequence[int]) -> CameraFile:
-        """Some of the cameras, in this order."""
-        at = list(indices)
-        tensors = {
-            field: None if (value := getattr(self, field)) is None else value[at]
-            for field in ("K", "distortion", "size", "R", "t")
-        }
-        names, other = (tuple(v[i] for i in at) for v in (self.names, self.other_names))
-        return replace(self, names=names, other_names=other, **tensors)
-
-
-@dataclass(frozen=True)
 class _Entry:
     """One camera of a file, in the file's own unit of length."""
 
@@ -118,7 +70,7 @@ class _Entry:
 
 def read_cameras(
     path: str | Path, subject: Name = None, unit_mm: int | float | None = None
-) -> CameraFile:
+) -> CameraSet:
     """The cameras of a file, or of a folder with intri.yml or a COLMAP model; the format is
     recognised by content.
 
@@ -329,7 +281,7 @@ def _panoptic(path: Path, content: Any) -> list[_Entry]:
     ]
 
 
-def _checked(path: Path, form: str, entries: Sequence[_Entry], mm_per_unit: float) -> CameraFile:
+def _checked(path: Path, form: str, entries: Sequence[_Entry], mm_per_unit: float) -> CameraSet:
     if not entries:
         raise GhptDataError(path, "", "holds 0 cameras", _FORMATS)
     check_view_count(path, len(entries))
@@ -352,7 +304,7 @@ def _checked(path: Path, form: str, entries: Sequence[_Entry], mm_per_unit: floa
     known = known and bool((np.abs(R - R[0]) > 0).any() or (np.abs(t - t[0]) > 0).any())
     cameras, distortion = check_cameras(path, names, K, R, t, lens)
     sizes = [_size(path, entry) for entry in entries]
-    return CameraFile(
+    return CameraSet(
         path=str(path),
         format=form,
         names=names,

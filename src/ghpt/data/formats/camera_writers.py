@@ -14,16 +14,16 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghpt.data.formats.opencv_yml import read_yml
-from ghpt.data.synthetic.rigs import Rig
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
+from ghpt.geometry.cameras import CameraSet
 from ghpt.geometry.rotations import matrix_to_vector
 
 _MM_PER_M = 1000.0
 Metadata = Mapping[str, str | float | bool]
 
 
-def write_pose2sim(path: str | Path, rig: Rig, metadata: Metadata) -> None:
+def write_pose2sim(path: str | Path, rig: CameraSet, metadata: Metadata) -> None:
     """A TOML file as Pose2Sim's calibration leaves it: a table for each camera, rotation vectors.
 
     Its lens model is OpenCV's, so a k3 that is not 0 is written as a fifth coefficient.
@@ -36,7 +36,7 @@ def write_pose2sim(path: str | Path, rig: Rig, metadata: Metadata) -> None:
     _write_toml(path, rig, keys, lenses, metadata)
 
 
-def write_aniposelib(path: str | Path, rig: Rig, metadata: Metadata) -> None:
+def write_aniposelib(path: str | Path, rig: CameraSet, metadata: Metadata) -> None:
     """A TOML file that aniposelib's ``CameraGroup.load`` reads.
 
     It takes the tables in the order of their keys as texts, so these have leading zeros: cam_02
@@ -52,7 +52,7 @@ def write_aniposelib(path: str | Path, rig: Rig, metadata: Metadata) -> None:
     )
 
 
-def write_opencv(folder: str | Path, rig: Rig) -> None:
+def write_opencv(folder: str | Path, rig: CameraSet) -> None:
     """``intri.yml`` and ``extri.yml`` as EasyMocap's ``read_camera`` and OpenCV's ``FileStorage``
     read them.
 
@@ -76,8 +76,9 @@ def write_opencv(folder: str | Path, rig: Rig) -> None:
             *_matrix(f"K_{name}", rig.cameras.K[i]),
             *_matrix(f"dist_{name}", rig.distortion[i][None]),
         ]
-        width, height = rig.size[i].tolist()
-        intrinsic += [f"H_{name}: {height}", f"W_{name}: {width}"] if width > 0 else []
+        if rig.size is not None:
+            width, height = rig.size[i].tolist()
+            intrinsic += [f"H_{name}: {height}", f"W_{name}: {width}"]
         extrinsic += [
             *_matrix(f"R_{name}", vectors[i][:, None]),
             *_matrix(f"Rot_{name}", rig.cameras.R[i]),
@@ -90,7 +91,7 @@ def write_opencv(folder: str | Path, rig: Rig) -> None:
 
 def _write_toml(
     path: str | Path,
-    rig: Rig,
+    rig: CameraSet,
     keys: Sequence[str],
     lenses: Sequence[Sequence[float]],
     metadata: Metadata,
@@ -102,7 +103,7 @@ def _write_toml(
         lines += [
             f"[{key}]",
             f"name = {json.dumps(name, ensure_ascii=False)}",
-            f"size = {[float(x) for x in rig.size[i].tolist()]}",
+            f"size = {[float(x) for x in rig.image_size[i].tolist()]}",
             f"matrix = {rig.cameras.K[i].tolist()}",
             f"distortions = {list(lenses[i])}",
             f"rotation = {vectors[i]}",

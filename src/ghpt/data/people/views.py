@@ -13,14 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ghpt.data.datasets.detections import undistorted
-from ghpt.data.formats.camera_files import CameraFile
 from ghpt.data.formats.names import Name, chosen_name
 from ghpt.data.formats.openpose import follow_views
 from ghpt.data.formats.skeletons import joints17
 from ghpt.data.people.association import associate
 from ghpt.data.people.people import Detections, KeyPoints
 from ghpt.errors import GhptDataError
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.recording import Recording
 from ghpt.skeleton import JOINTS
 
@@ -41,7 +40,7 @@ class Views:
     starts from.
     """
 
-    cameras: CameraFile
+    cameras: CameraSet
     """In the order of the views; ``cameras.names`` are the views' names from here on."""
     key_points: Float[np.ndarray, "T V J 2"]
     """Undistorted pixels, float32."""
@@ -79,7 +78,7 @@ class Views:
 
 def undistort_and_match(
     points: KeyPoints | Detections,
-    cameras: CameraFile,
+    cameras: CameraSet,
     match: Mapping[Name, Name] | None = None,
     views: Sequence[Name] | None = None,
     person: int = 0,
@@ -108,11 +107,11 @@ def undistort_and_match(
 
 def as_one_person(
     points: KeyPoints | Detections,
-    cameras: CameraFile,
+    cameras: CameraSet,
     match: Mapping[str, str] | None,
     views: Sequence[str] | None,
     person: int,
-) -> tuple[KeyPoints, list[int], CameraFile]:
+) -> tuple[KeyPoints, list[int], CameraSet]:
     """One person's key points, which of their views have a camera, and these cameras in the order
     of the views.
     """
@@ -125,7 +124,7 @@ def as_one_person(
 
 
 def who(
-    people: Detections, cameras: CameraFile, at: Sequence[int], person: int = 0
+    people: Detections, cameras: CameraSet, at: Sequence[int], person: int = 0
 ) -> Int[np.ndarray, "T V"]:
     """The index of one person's detection in each frame and view, -1 where there is none.
 
@@ -145,7 +144,7 @@ def who(
         return _person(people, found, person)
     if not (people.counts()[:, at] > 1).any():
         return _person(people, [people.first()], person)
-    if cameras.cameras is not None:
+    if cameras.calibrated:
         found = _across(people, cameras, at)
         two = ((people.counts()[:, at] > 0).sum(1) >= 2).sum()
         if found and 2 * sum((chosen >= 0).any(1).sum() for chosen in found[:1]) >= two:
@@ -169,7 +168,7 @@ def _person(people: Detections, found: Sequence[np.ndarray], person: int) -> Int
 
 
 def _across(
-    people: Detections, cameras: CameraFile, at: Sequence[int]
+    people: Detections, cameras: CameraSet, at: Sequence[int]
 ) -> list[Int[np.ndarray, "T V"]]:
     """Everybody who can be told apart across the views ``at``."""
     chosen = []
@@ -207,7 +206,7 @@ def _across(
 def matched(
     where: str,
     views: Sequence[str],
-    cameras: CameraFile,
+    cameras: CameraSet,
     match: Mapping[Name, Name],
     wanted: Sequence[Name] | None,
 ) -> list[tuple[int, int]]:
@@ -267,18 +266,19 @@ def normal(name: str) -> str:
 _SEPARATORS = {ord(c): None for c in " _.-"}
 
 
-def _names(cameras: CameraFile) -> list[tuple[str, ...]]:
-    return [(a, b) if b else (a,) for a, b in zip(cameras.names, cameras.other_names, strict=True)]
+def _names(cameras: CameraSet) -> list[tuple[str, ...]]:
+    return [
+        (a, b) if b else (a,)
+        for a, b in zip(cameras.names, cameras.other_names or ("",) * len(cameras), strict=True)
+    ]
 
 
-def _unmatched(
-    where: str, views: Sequence[str], cameras: CameraFile, problem: str
-) -> GhptDataError:
+def _unmatched(where: str, views: Sequence[str], cameras: CameraSet, problem: str) -> GhptDataError:
     sides = f"views: {', '.join(views)}; cameras of {cameras.path}: {', '.join('/'.join(n) for n in _names(cameras))}"
     return GhptDataError(where, "views", f"{problem} ({sides})", _HINT)
 
 
-def image_size(cameras: CameraFile) -> Float[np.ndarray, "V 2"]:
+def image_size(cameras: CameraSet) -> Float[np.ndarray, "V 2"]:
     """Width and height of the images; where the file does not say, twice the principal point."""
     if cameras.size is not None:
         return cameras.size.numpy().astype(np.float64)
@@ -289,7 +289,7 @@ def check_pixels(
     where: str,
     pixels: Float[np.ndarray, "T V K 2"],
     valid: Bool[np.ndarray, "T V K"],
-    cameras: CameraFile,
+    cameras: CameraSet,
 ) -> None:
     """Raise GhptDataError for key points in [0, 1] or [-1, 1], as shares of the image, where pixels
     are wanted.
@@ -314,7 +314,7 @@ def check_pixels(
         raise GhptDataError(where, f"view {name}", problem, hint)
 
 
-def _check_sizes(where: str, pixels: np.ndarray, valid: np.ndarray, cameras: CameraFile) -> None:
+def _check_sizes(where: str, pixels: np.ndarray, valid: np.ndarray, cameras: CameraSet) -> None:
     """Detectors place some joints beyond the image's edge; many there are those of an image of
     another size.
     """

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from ghpt.data.synthetic.body import occlusion, stature, trunk_frame
 from ghpt.data.synthetic.random_processes import generator, process
-from ghpt.data.synthetic.rigs import Rig
 from ghpt.geometry import lens
+from ghpt.geometry.cameras import CameraSet
 from ghpt.skeleton import BONES, JOINT, JOINTS, MIRROR, PELVIS
 
 SWAPS = tuple(
@@ -117,7 +117,7 @@ class Detector:
     def __call__(
         self,
         points: Float[np.ndarray, "T J 3"],
-        rig: Rig,
+        rig: CameraSet,
         rate_hz: float,
         seed: int,
         subject: str,
@@ -192,7 +192,7 @@ class Detector:
         self,
         points: Float[np.ndarray, "T J 3"],
         shown: Float[np.ndarray, "T J 3"],
-        rig: Rig,
+        rig: CameraSet,
         view: int,
         processes: Processes,
         familiar: bool,

@@ -14,8 +14,9 @@ from ghpt.data.synthetic.body import random_body
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.motion import actions, move
 from ghpt.data.synthetic.random_processes import generator
-from ghpt.data.synthetic.rigs import ARRANGEMENTS, Rig, human36m_rig, panoptic_rig
+from ghpt.data.synthetic.rigs import ARRANGEMENTS, human36m_rig, panoptic_rig
 from ghpt.errors import check
+from ghpt.geometry.cameras import CameraSet
 from ghpt.recording import Recording
 
 SPLITS = ("train", "validation", "test")
@@ -42,7 +43,7 @@ class Take:
     subject: str
     action: str
     rate_hz: float
-    rig: Rig
+    rig: CameraSet
     truth: Float[np.ndarray, "T J 3"]
     """World frame, mm."""
     familiar: bool
@@ -96,7 +97,7 @@ def _human36m(split: str, seed: int) -> Iterator[Take]:
                 yield Take(name, subject, action, HUMAN36M_RATE, rig, truth, split != "test", 0)
 
 
-def _panoptic(rig: Rig, split: str, seed: int) -> Iterator[Take]:
+def _panoptic(rig: CameraSet, split: str, seed: int) -> Iterator[Take]:
     first, last = (round(part * PANOPTIC_FRAMES) for part in PANOPTIC_PARTS[split])
     for subject in PANOPTIC_SUBJECTS:
         truth = motion(seed, subject, subject, "RangeOfMotion", PANOPTIC_FRAMES, PANOPTIC_RATE)[

@@ -7,17 +7,15 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghpt.errors import GhptDataError
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 
 ARRANGEMENTS: dict[str, tuple[int, ...]] = {
     "cmu1": (1, 2, 3, 4, 6, 7, 10),
@@ -31,23 +29,7 @@ of name.
 """
 
 
-@dataclass(frozen=True)
-class Rig:
-    """V calibrated cameras with their lenses."""
-
-    names: tuple[str, ...]
-    cameras: Cameras
-    """K, R, t with leading dimension V, float64, mm."""
-    distortion: Float[Tensor, "V 5"]
-    """OpenCV's k1, k2, p1, p2, k3."""
-    size: Int[Tensor, "V 2"]
-    """Width and height of the images, pixels."""
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-
-def human36m_rig(subject: str) -> Rig:
+def human36m_rig(subject: str) -> CameraSet:
     """Human3.6M's four cameras as they stood for a subject, ``S1`` to ``S11``; mm, world z up."""
     table = _load("human36m_cameras.json")
     names = tuple(table["intrinsics"])
@@ -65,7 +47,7 @@ def human36m_rig(subject: str) -> Rig:
     )
 
 
-def panoptic_rig(numbers: Sequence[int]) -> Rig:
+def panoptic_rig(numbers: Sequence[int]) -> CameraSet:
     """HD cameras of CMU Panoptic Studio by number (sequence 160906_band1); mm, world y down.
 
     Raises GhptDataError for an unknown number, a camera listed twice, or fewer than two cameras.
@@ -105,9 +87,10 @@ def _load(name: str) -> dict[str, Any]:
     )
 
 
-def _rig(names: tuple[str, ...], entries: list[dict[str, Any]], mm_per_unit: float) -> Rig:
+def _rig(names: tuple[str, ...], entries: list[dict[str, Any]], mm_per_unit: float) -> CameraSet:
     def stack(field: str) -> Tensor:
         return torch.tensor([entry[field] for entry in entries], dtype=torch.float64)
 
     cameras = Cameras(stack("K"), stack("R"), stack("t") * mm_per_unit)
-    return Rig(names, cameras, stack("distortion"), stack("size").to(torch.int64))
+    size = stack("size").to(torch.int64)
+    return CameraSet.from_cameras(names, cameras, stack("distortion"), size)

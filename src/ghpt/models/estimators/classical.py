@@ -48,7 +48,7 @@ def otherwise(first: Triangulation, second: Triangulation) -> Triangulation:
 
 
 def poses_of(result: Triangulation, batch: Observations) -> PoseEstimate:
-    return PoseEstimate(result.points.to(batch.key_points.dtype), result.placed)
+    return PoseEstimate(result.points.to(batch.key_points.dtype), result.has_position)
 
 
 def everywhere(value: float, batch: Observations) -> Float[Tensor, " B"]:

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
 from ghpt.geometry.normal_equations import usable_views
-from ghpt.geometry.triangulation import Status, Triangulation
+from ghpt.geometry.triangulation import Triangulation
 from ghpt.models.estimators.classical import Baseline, poses_of
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.rejection import Rejection
@@ -23,15 +23,6 @@ from ghpt.recording import Observations
 
 FAR = 20.0
 """A key point so many times as far from its view's median as the median one belongs to nobody."""
-
-_STATE = {
-    Status.OK: State.OBSERVED,
-    Status.NOT_CONVERGED: State.OBSERVED,
-    Status.FEW_VIEWS: State.FEW_VIEWS,
-    Status.PARALLEL: State.PARALLEL,
-    Status.BEHIND: State.BEHIND,
-    Status.NONFINITE_INPUT: State.BAD_INPUT,
-}
 
 
 class Predictor(Protocol):
@@ -69,9 +60,9 @@ class Classical:
 
     def fitted(self, batch: Observations) -> Classical:
         clean, _, _, result = _prepared(batch, self.flips, self.estimator)
-        views, _ = self.estimator.inlier_views(clean, result.points, result.placed)
+        views, _ = self.estimator.inlier_views(clean, result.points, result.has_position)
         uncertainty = self.uncertainty.fitted(clean, result.points, views)
-        reject = self.reject and self.reject.fitted(clean, result.points, result.placed)
+        reject = self.reject and self.reject.fitted(clean, result.points, result.has_position)
         return Classical(self.estimator, uncertainty, self.flips, reject)
 
     def rejecting_nothing(self) -> Classical:
@@ -115,7 +106,7 @@ class Learned:
         weighed = self.view_weights.weigh(clean, robust)
         found = weighed.triangulation
         uncertainty = self.uncertainty.fitted(clean, found.points, weighed.views)
-        reject = self.reject and self.reject.fitted(clean, found.points, found.placed)
+        reject = self.reject and self.reject.fitted(clean, found.points, found.has_position)
         return Learned(self.view_weights, uncertainty, self.flips, reject)
 
     def rejecting_nothing(self) -> Learned:
@@ -171,11 +162,12 @@ def cleaned(batch: Observations) -> tuple[Observations, Bool[Tensor, "B V J"]]:
 
 
 def _states(status: Int8[Tensor, "B J"], spoilt: Bool[Tensor, "B V J"]) -> Int8[Tensor, "B J"]:
-    table = torch.tensor([int(_STATE[s]) for s in Status], dtype=torch.int8, device=status.device)
-    state = table[status.long()]
-    return torch.where((state == State.FEW_VIEWS) & spoilt.any(1), int(State.BAD_INPUT), state).to(
-        torch.int8
-    )
+    """The states of a reconstruction: a point that has not converged is observed, and a joint that
+    lacks views because some of its key points are ``spoilt`` has bad input.
+    """
+    state = torch.where(status == State.NOT_CONVERGED, int(State.OBSERVED), status)
+    bad = (state == State.FEW_VIEWS) & spoilt.any(1)
+    return torch.where(bad, int(State.BAD_INPUT), state).to(torch.int8)
 
 
 def _rejected(

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import Cameras, reprojection_error
+from ghpt.geometry.state import State
 from ghpt.geometry.triangulation import (
-    Status,
     System,
     Triangulation,
     flat_cameras,
@@ -216,7 +216,7 @@ class _Candidates:
         """The fields of Triangulation, of the inliers; of all views where those have no point."""
         system = self.system
         robust = system.fields(*system.solve(inlier.double()), inlier, torch.zeros_like(inlier[0]))
-        ok = robust[1] == Status.OK
+        ok = robust[1] == State.OBSERVED
         if ok.all():
             return robust
         linear = system.fields(*self.of_all_views, system.used, (self.valid & ~system.used).any(0))

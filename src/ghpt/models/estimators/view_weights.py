@@ -70,7 +70,7 @@ class ViewWeights(Baseline):
         model = self.model
         problem = self.model.problem
         robust = robust or self.consensus.triangulate(batch)
-        views, _ = self.consensus.inlier_views(batch, robust.points, robust.placed)
+        views, _ = self.consensus.inlier_views(batch, robust.points, robust.has_position)
         agreed = replace(batch, valid=views)
         hypotheses = problem.generate(agreed, model.hypotheses, model.keys("view weights", batch))
         logits = model.scorer(problem.featurize(hypotheses))
