@@ -149,7 +149,7 @@ def test_the_same_command_again_predicts_nothing_and_gives_the_same_bytes(tmp_pa
         settings | {"seed": 1, "fill": 3, "formats": ["npz"]}, tmp_path / "out"
     )  # none of the prediction's business
     predict(settings | {"evaluated_frames": 9}, tmp_path / "out")
-    assert calls == [0, 1, 3, 3] or calls[2:] == [0, 0]
+    assert calls == [0, 1, 0, 0]
 
 
 def refusing(real, calls):
