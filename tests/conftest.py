@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shutil
 import signal
 import sys
 import tempfile
@@ -11,10 +12,13 @@ from typing import Any
 
 import pytest
 import torch
+import yaml
 
 import children
+import toys
 from ghpt.commands.app import Command, run
 
+ROOT = Path(__file__).resolve().parents[1]
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if WORKER:  # each of several test processes has its own core, and so have the commands that it runs
     os.environ["OMP_NUM_THREADS"] = "1"
@@ -74,9 +78,18 @@ def shared_data() -> Path:
     """The folder of real calibrations, motion and detections that developers have beside the
     project.
     """
-    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = ROOT.parent / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"the developers' real data is not at {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project's configuration with one more data set, ``toy``, which is made at once."""
+    folder = tmp_path_factory.mktemp("conf") / "conf"
+    shutil.copytree(ROOT / "conf", folder)
+    (folder / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
     return folder
 
 

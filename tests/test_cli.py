@@ -5,7 +5,6 @@ goes on.
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -16,7 +15,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import children
@@ -35,15 +33,6 @@ SMALL = (
     "trainer.accelerator=cpu",
     "progress_bar=false",
 )
-
-
-@pytest.fixture(scope="module")
-def conf(tmp_path_factory):
-    """The project's own configuration with one more data set, which is made at once."""
-    folder = tmp_path_factory.mktemp("conf") / "conf"
-    shutil.copytree(ROOT / "conf", folder)
-    (folder / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
-    return folder
 
 
 @pytest.fixture
