@@ -17,6 +17,7 @@ import yaml
 import children
 import toys
 from ghpt.commands.app import Command, run
+from ghpt.data.synthetic import recordings as synthetic
 
 ROOT = Path(__file__).resolve().parents[1]
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
@@ -82,6 +83,20 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"the developers' real data is not at {folder}")
     return folder
+
+
+@pytest.fixture
+def little_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Synthetic data sets of one subject a split and some frames, in a cache of their own, which
+    all tests share.
+    """
+    frames = {"train": 16, "validation": 16, "test": 80}
+    subjects = {"train": ("S1",), "validation": ("S8",), "test": ("S9",)}
+    monkeypatch.setattr(synthetic, "HUMAN36M_FRAMES", frames)
+    monkeypatch.setattr(synthetic, "HUMAN36M_SUBJECTS", subjects)
+    monkeypatch.setattr(synthetic, "PANOPTIC_FRAMES", 400)
+    monkeypatch.setattr(synthetic, "PANOPTIC_SUBJECTS", ("P1",))
+    monkeypatch.setenv("GHPT_CACHE", os.path.join(os.environ["GHPT_CACHE"], "little"))
 
 
 @pytest.fixture(scope="session")
