@@ -26,6 +26,14 @@ if WORKER:  # each of several test processes has its own core, and so have the c
     torch.set_num_threads(1)
 
 
+FIRST = (
+    "test_docs.py",
+    "test_ddp.py",
+    "test_checkup.py",
+    "test_reproduce.py",
+    "test_geometry_battery.py",
+)
+"""The files that take longest: begun first, so that no test process waits for another's last."""
 CACHE = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
 SERVER = pytest.StashKey[children.Server]()
 
@@ -57,8 +65,24 @@ def own_children() -> Iterator[None]:
     children.close_all()
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Have one of several test processes run all tests of a file, in the order of the files: what
+    the tests of a file share is then made once.
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    config.option.loadscopereorder = False
+    return LoadFileScheduling(config, log)
+
+
+def _place(item: pytest.Item) -> int:
+    return FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip on Windows what is marked ``posix``."""
+    """Put the files of ``FIRST`` first; skip on Windows what is marked ``posix``."""
+    items.sort(key=_place)
     if os.name != "nt":
         return
     for item in items:
