@@ -392,7 +392,7 @@ def part_of(found: Any, whole: Any) -> bool:
     rows, views = len(one["row"]), [other["views"].index(view) for view in one["views"]]
     kept = np.isin(other["view"], views) & np.isin(other["frame"][other["row"]], one["frame"])
     at = np.flatnonzero(kept)
-    valid = one["seen"]
+    valid = one["valid"]
     return rows <= len(at) and all(
         np.array_equal(one[name][valid], other[name][at[:rows]][valid])
         for name in ("key_points", "confidence")
