@@ -35,5 +35,19 @@ TRAINING_STEPS = _size(450, 20_000)
 """E3: steps of a long training."""
 STREAMED_FRAMES = _size(18_000, 1_000_000)
 """E2: frames of a prediction whose memory stays flat."""
+LENSES = _size(200, 10_000)
+"""D1: rigs whose lenses are undone."""
+ESTIMATED_FRAMES = _size(60, 1000)
+"""D2: frames of the batch that a degenerate frame is put into."""
+BROKEN_NUMBERS = _size(100, 5_000)
+"""D3: cameras, key points and weights with a number that is broken."""
+BATCHED_FRAMES = _size(3, 64)
+"""C4: frames that are computed one by one."""
+ADJUSTMENTS = _size(75, 10_000)
+"""D5: starts of the bundle adjustment."""
+GOOD_RIGS = _size(2, 100)
+"""D6: recordings that give a good rig."""
+SCALED_RIGS = _size(8, 300)
+"""D6: recordings that are scaled by the person."""
 MANY_FILES = _size(1_000, 50_000)
 """E4: files of a recording, and twice as many."""
