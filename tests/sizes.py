@@ -29,7 +29,7 @@ KILLED_TRAININGS = _size(1, 10)
 """B2: trainings that are killed and resumed."""
 KILLED_PREDICTIONS = _size(6, 200)
 """B3: kills of a prediction."""
-PREDICTED_FRAMES = _size(2_000, 100_000)
+PREDICTED_FRAMES = _size(1_000, 100_000)
 """B3: frames of that prediction."""
 TRAINING_STEPS = _size(450, 20_000)
 """E3: steps of a long training."""

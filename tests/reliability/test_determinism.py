@@ -76,7 +76,7 @@ def predictions_of(checkpoint, folder, threads, **data):
 
 def test_c4_batch_size_threads_and_workers_do_not_matter(tmp_path, checkpoint, record_row):
     reference = predictions_of(checkpoint, tmp_path / "reference", 1, batch_size=16)
-    runs = [(1, 1, 0), (7, 1, 0), (64, 2, 0), (4096, 1, 0), (16, 2, 2)]
+    runs = [(1, 1, 0), (4096, 2, 0), (7, 2, 2)]
     worst, differing = 0.0, 0
     for batch_size, threads, workers in runs:
         folder = tmp_path / f"{batch_size}-{threads}-{workers}"
