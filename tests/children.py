@@ -161,7 +161,7 @@ def start(
     ``env`` is added to the environment of the tests; scripts find the modules of ``tests/``. A child
     whose start is the point is not forked.
     """
-    paths = [str(TESTS), os.environ.get("PYTHONPATH", "")]
+    paths = [str(TESTS.parent / "src"), str(TESTS), os.environ.get("PYTHONPATH", "")]
     ours = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
     environment = {**os.environ, "HYDRA_FULL_ERROR": "0", **ours, **(env or {})}
     texts = [str(word) for word in words]
