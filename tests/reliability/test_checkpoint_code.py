@@ -177,7 +177,7 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.models.callbacks.Progress": {},
         "ghpt.models.callbacks.LogHyperparameters": {"values": {}},
         "ghpt.report.logger.ForgivingTensorBoard": {"folder": {"_target_": "ghpt.files.Path"}},
-        "ghpt.errors.GhptConfigError": {"key": "a", "problem": "b", "mend": "c"},
+        "ghpt.errors.GhptConfigError": {"key": "a", "problem": "b", "hint": "c"},
         "ghpt.models.estimators.classical.Linear": {},
         "ghpt.data.datasets.pairs.PairSettings": {"frames": 8, "draws": 1, "points": 10},
         "torch.nn.Identity": {},
