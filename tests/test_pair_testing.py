@@ -12,12 +12,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 import toys
 from ghpt.commands.test import summary
-from toys import train
 from ghpt.config import plain
 from ghpt.errors import GhptConfigError
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.predictions import open_predictions
 from ghpt.models.relative_pose.schema import PAIRS
+from toys import train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SMALL = [

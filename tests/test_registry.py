@@ -15,7 +15,6 @@ import pytest
 import torch
 
 import toys
-from toys import train
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.models.checkpoint import FIELD, load_model, read_checkpoint
 from ghpt.models.module import StochasticEstimator
@@ -24,6 +23,7 @@ from ghpt.paper.ablations.tables import ARTEFACTS
 from ghpt.paper.engine.setup import Setup, compose
 from ghpt.paper.engine.tasks import with_dependencies
 from signing import save_signed
+from toys import train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 ABLATED = {

@@ -18,9 +18,8 @@ from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.formats.stored_npz import members_of
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import WRITERS, Scene
-from ghpt.files import atomic_write
+from ghpt.files import atomic_write, write_json
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO
-from ghpt.files import write_json
 from ghpt.models.rows import RowWriter
 from ghpt.paper.engine.tasks import Task, perform
 from ghpt.skeleton import JOINTS

@@ -39,9 +39,7 @@ class Start:
     """Why this is not the last checkpoint; empty where it is."""
 
 
-def resumable(
-    output: Path, settings: Mapping[str, Any], model: StochasticEstimator
-) -> Start:
+def resumable(output: Path, settings: Mapping[str, Any], model: StochasticEstimator) -> Start:
     """Return the checkpoint in ``output`` to go on from: the last, or the previous one.
 
     ``settings``: ``model``, ``data`` and ``seed``, as the checkpoint must have them. Raises

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.lost import told
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
-from ghpt.commands.display import display_path
 from ghpt.commands.trainer import make_trainer, progress
 from ghpt.config import Target, build
 from ghpt.errors import GhptCheckpointError
@@ -156,3 +157,7 @@ def summary(result: TestResult | None) -> str:
 
 
 COMMAND = Command(name="test", settings=TestSettings, task=test, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("test")

@@ -9,6 +9,7 @@ from typing import Any, Literal
 import torch
 
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path, shell_override
 from ghpt.commands.lost import told
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
@@ -209,3 +210,7 @@ def _say_stopped(last: Path, step: int | None) -> None:
 
 
 COMMAND = Command(name="train", settings=TrainSettings, task=train, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("train")
