@@ -57,7 +57,8 @@ class CollectPredictions(Callback):
         self._writer.finish(self.path, self.problem.tables(self._dataset), self.meta)
 
     def on_test_start(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        self.open(trainer.datamodule.frames["test"])
+        data = trainer.datamodule  # type: ignore[attr-defined]  # Lightning does not declare it
+        self.open(data.frames["test"])
 
     @torch.no_grad()
     def on_test_batch_end(

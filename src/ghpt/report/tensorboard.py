@@ -5,6 +5,7 @@ anything.
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,7 @@ def write_parts(folder: str | Path, parts: Mapping[str, Callable[[SummaryWriter]
     writer = attempt("the event file", lambda: SummaryWriter(str(folder)))
     if writer is not None:
         for part, write in parts.items():
-            attempt(part, lambda write=write: write(writer))
+            attempt(part, partial(write, writer))
         attempt("the event file", writer.close)
     return len(failures)
 
