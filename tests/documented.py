@@ -127,8 +127,8 @@ def workplace(folder: Path) -> Path:
         (0,) * len(rig),
     )
     write_key_points(folder / "points.npz", given)
-    same = replace(rig, R=rig.cameras.R[:1].expand(4, 3, 3), t=rig.cameras.t[:1].expand(4, 3))
-    write_pose2sim(folder / "intrinsics.toml", same, {})
+    R, t = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
+    write_pose2sim(folder / "intrinsics.toml", replace(rig, R=R, t=t), {})
     for name in ("Calib.toml", "Calib_qualisys.toml"):
         write_pose2sim(folder / name, rig, {})
     write_opencv(folder, rig)
