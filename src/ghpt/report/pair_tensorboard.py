@@ -73,7 +73,8 @@ def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[s
         for name in SHOWN
         if name in predictions.names
     }
-    heading = f"{title(metrics)}\nrig of {predictions.tables.rig_name[rig]}, the draw of median E_3D under {SHOWN[0]}"
+    which = f"rig of {predictions.tables.rig_name[rig]}"
+    heading = f"{title(metrics)}\n{which}, the draw of median E_3D under {SHOWN[0]}"
     figure = rig_figure(
         predictions.tables.cameras.index(rig),
         predictions.tables.camera_name[rig].tolist(),

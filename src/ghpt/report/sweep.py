@@ -27,7 +27,7 @@ def frames_sweep(results: Sweep, heading: str) -> Figure:
     figure = Figure(figsize=(6.4, 4.4), layout="constrained")
     axes = figure.subplots()
     for name, by_frames in results.items():
-        colour, style, marker = METHOD_STYLES.get(name, OTHER_STYLE)
+        style = METHOD_STYLES.get(name, OTHER_STYLE)
         frames = sorted(by_frames)
         mean, deviation, _ = np.array([statistics_of(by_frames[m]) for m in frames]).T
         low, high = (
@@ -35,14 +35,14 @@ def frames_sweep(results: Sweep, heading: str) -> Figure:
             for s in (-1, 1)
         )
         axes.fill_between(
-            frames, low, high, color=colour, alpha=0.2 if name in _BANDS else 0.08, linewidth=0
+            frames, low, high, color=style.colour, alpha=0.2 if name in _BANDS else 0.08, linewidth=0
         )
         axes.plot(
             frames,
             np.minimum(mean, CLIP),
-            color=colour,
-            linestyle=style,
-            marker=marker,
+            color=style.colour,
+            linestyle=style.dashes,
+            marker=style.marker,
             markersize=5,
             markeredgecolor="white",
             markeredgewidth=0.6,
