@@ -121,8 +121,8 @@ def _draw_panel(
         stalks = np.stack((start, end), axis=1)
         lines = LineCollection(list(stalks), colors=style.colour, linewidths=1.6, zorder=3)
         axes.add_collection(lines)
-        marks = {"color": style.colour, "markersize": 5, "zorder": 4}
-        axes.plot(end[:, 0], end[:, 1], style.marker, **marks)
+        x, y = end.T
+        axes.plot(x, y, style.marker, color=style.colour, markersize=5, zorder=4)
     centres = cameras.centre.numpy() @ view.T / 1000
     _set_limits(axes, np.concatenate((centres, dots)), size / 1000)
 
