@@ -35,7 +35,12 @@ def frames_sweep(results: Sweep, heading: str) -> Figure:
             for s in (-1, 1)
         )
         axes.fill_between(
-            frames, low, high, color=style.colour, alpha=0.2 if name in _BANDS else 0.08, linewidth=0
+            frames,
+            low,
+            high,
+            color=style.colour,
+            alpha=0.2 if name in _BANDS else 0.08,
+            linewidth=0,
         )
         axes.plot(
             frames,
