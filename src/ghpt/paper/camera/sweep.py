@@ -46,7 +46,7 @@ def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folde
     with torch.no_grad():
         for first in range(0, len(pairs), data.batch_size):
             batch = pairs[range(first, min(first + data.batch_size, len(pairs)))]
-            collect.write(model, batch, *model.test_step(batch, 0))
+            collect.write(model, batch, model.test_step(batch, 0))
     collect.finish()
     predictions = open_pairs(collect.path)
     result = {

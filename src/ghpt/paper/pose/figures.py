@@ -64,8 +64,8 @@ def _qualitative(results: Results) -> Section:
 
 
 def _draw_frame(chunk: PredictionChunk, row: int, heading: str) -> Figure:
-    up = up_axis(chunk.truth[::10].double().numpy())
-    truth = chunk.truth[row].double().numpy()
+    up = up_axis(chunk.truth.points[::10].double().numpy())
+    truth = chunk.truth.points[row].double().numpy()
     poses = {name: chunk.estimates[name].points[row].double().numpy() for name in SHOWN}
     return skeletons(truth, poses, up, heading)
 
@@ -84,7 +84,7 @@ def _order_claim(errors: Mapping[str, float]) -> Claim:
 def _relative_errors(chunk: PredictionChunk, name: str) -> Float[np.ndarray, " N"]:
     """Return the pelvis-relative MPJPE (mm) of each frame, NaN where a joint is missing."""
     estimate = chunk.estimates[name]
-    errors, measured = joint_errors(estimate, chunk.truth, chunk.truth_valid, "relative")
+    errors, measured = joint_errors(estimate, chunk.truth, "relative")
     return torch.where(measured.all(-1), errors.mean(-1), torch.nan).numpy()
 
 
