@@ -19,7 +19,7 @@ from ghpt.models.pose.predictions import PredictionChunk, Predictions
 from ghpt.models.rows import WEIGHTS
 from ghpt.observations import PoseEstimate
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
-from ghpt.report.tables import title, trained_on
+from ghpt.report.tables import title, training_data
 
 SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
@@ -131,7 +131,7 @@ def write_hyperparameters(
     writer: SummaryWriter, meta: Mapping[str, Any], metrics: Mapping[str, Any], error: str
 ) -> None:
     """The settings of a test run beside each selection's ``error``."""
-    trained, source = trained_on(metrics)
+    trained, source = training_data(metrics)
     values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
     values |= {
         "trained_on": trained,

@@ -196,7 +196,7 @@ def _mean_error(results: Results, method: str, pairs: Sequence[str]) -> float:
 
 
 def _shapes(results: Results) -> dict[str, Shape]:
-    """Return how each pair stands, the mean over the rigs; seen from the middle of the points X*."""
+    """Return how each pair stands about the middle of the points X*, the mean over the rigs."""
     predictions = open_pairs(results.paths("test")[0] / "predictions.npz")
     middle = predictions.points.mean(dim=1, keepdim=True)
     directions = predictions.cameras.centre - middle

@@ -132,7 +132,7 @@ def _compare(results: Results, trained: str) -> list[Comparison]:
 
 
 def _data_name(results: Results) -> str:
-    """Return the name of the test data, and of the other training data where one of both is real."""
+    """Return the name of the test data, and of CMU3 where only one of the two is real."""
     tested = results.display_name("h36m")
     trained = results.display_name("cmu3")
     if trained.startswith("synthetic") == tested.startswith("synthetic"):

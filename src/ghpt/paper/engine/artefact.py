@@ -1,4 +1,4 @@
-"""An artefact of the report, a table or a figure: the tasks behind it, and what it shows of them."""
+"""An artefact, a table or a figure of the report: the tasks behind it, and what it shows."""
 
 from __future__ import annotations
 
@@ -16,6 +16,8 @@ from ghpt.paper.engine.tasks import Task, read_json
 from ghpt.report.document import Block, Figure, Table, Text
 from ghpt.report.tables import NONE, display_name
 
+Number = int | float
+"""A quantity that is varied: a count or a measure."""
 TOLERANCE = 0.05
 """A number that is worse than the paper's by more than this share of it is a miss."""
 FIGURES = "figures"

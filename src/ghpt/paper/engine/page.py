@@ -146,7 +146,7 @@ class Counts:
 def document(page: Page) -> Document:
     """Return the report as a document."""
     entries = [block for entry in page.entries for block in entry.blocks()]
-    configuration = [
+    configuration: list[Block] = [
         Heading("Configuration", anchor="configuration"),
         CodeBlock(page.config.rstrip(), "yaml"),
     ]
@@ -250,9 +250,10 @@ def draw(figure: Figure, kind: str) -> bytes:
     It has no date and no random names. Letters are outlines, so that no font is needed.
     """
     drawn = BytesIO()
-    style = {"svg.hashsalt": "ghpt", "svg.fonttype": "path", "pdf.fonttype": 42}
     date = "Date" if kind == "svg" else "CreationDate"
-    with matplotlib.rc_context(style):
+    with matplotlib.rc_context(
+        {"svg.hashsalt": "ghpt", "svg.fonttype": "path", "pdf.fonttype": 42}
+    ):
         figure.savefig(drawn, format=kind, metadata={date: None})
     return drawn.getvalue()
 

@@ -83,7 +83,7 @@ def perform(task: Task, tasks: Path) -> None:
 
 
 def with_dependencies(tasks: Iterable[Task]) -> dict[str, Task]:
-    """Return the tasks and all that they depend on by key, in an order in which they can be done."""
+    """Return the tasks and all that they depend on, by key, in an order that works."""
     found: dict[str, Task] = {}
 
     def visit(task: Task) -> None:

@@ -44,7 +44,7 @@ _WITH_TRUTH = ("best", "worst")
 
 
 def on_itself(setup: Setup, *names: str) -> dict[str, Task]:
-    """Return tests of models on the arrangement of their training, with all classical estimators."""
+    """Return tests of models on their own arrangement, with all classical estimators."""
     return {SELF[data]: setup.tested(setup.trained(data), data) for data in names}
 
 
@@ -254,9 +254,7 @@ def _limitation(results: Results) -> Section:
             "design, for the paper's was trained on them."
         )
         blocks.append(Paragraph(note))
-    return Section(
-        results.display_name("h36m"), blocks, comparisons=comparisons, claims=[claim]
-    )
+    return Section(results.display_name("h36m"), blocks, comparisons=comparisons, claims=[claim])
 
 
 ARTEFACTS = (

@@ -83,8 +83,8 @@ def _remelli(results: Results) -> Section:
     for train, published_range in REMELLI_OURS.items():
         errors = [results.relative(f"{train} on {test}") for test in PANOPTIC]
         base_error = results.relative(f"{train} on {train}")
-        novel = [results.relative(f"{train} on {test}") for test in PANOPTIC if test != train]
-        honest = _mean_drop(base_error, novel)
+        others = [results.relative(f"{train} on {test}") for test in PANOPTIC if test != train]
+        honest = _mean_drop(base_error, others)
         rows.append(_remelli_row(f"ours ({train.upper()})", published_range, errors, honest))
         comparisons += _compare_ends(train, published_range, errors)
         intra.append(_largest_drop(errors).mean)

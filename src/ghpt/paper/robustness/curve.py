@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ghpt.config import settings
-from ghpt.paper.engine.artefact import Results, Spread
+from ghpt.paper.engine.artefact import Number, Results, Spread
 from ghpt.paper.engine.settings import Robustness
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
@@ -29,7 +29,7 @@ class Curve:
     perturbation: str
     argument: str
     """The perturbation's argument that is varied."""
-    levels_of: Callable[[Robustness], Sequence[float]]
+    levels_of: Callable[[Robustness], Sequence[Number]]
     """Returns the levels of the argument; 0 means the data as they are."""
     x: str
     """The axis and the head of the table, with the unit."""
@@ -39,10 +39,10 @@ class Curve:
     """From the argument to what is shown."""
     data: str = "h36m"
     logarithmic: bool = False
-    constants_of: Callable[[Robustness], Mapping[str, float]] = lambda sizes: {}
+    constants_of: Callable[[Robustness], Mapping[str, Number]] = lambda sizes: {}
     """Returns the perturbation's other arguments."""
 
-    def levels(self, setup: Setup) -> Sequence[float]:
+    def levels(self, setup: Setup) -> Sequence[Number]:
         return self.levels_of(setup.sizes.robustness)
 
     def task(self, setup: Setup) -> Task:
@@ -86,7 +86,7 @@ class CurveResult:
     """The results of a curve."""
 
     levels: list[str]
-    places: list[float]
+    places: Sequence[Number]
     """The levels as numbers."""
     errors: Mapping[str, Mapping[str, Sequence[Spread]]]
     """Kind -> estimator -> MPJPE at each level, mm; NaN where nothing was measured."""
@@ -129,7 +129,7 @@ def read_curve(results: Results, curve: Curve) -> CurveResult:
     if 0 in levels:
         for of_seed, clean in zip(seeds, _contents(results, CLEAN), strict=True):
             of_seed.insert(list(levels).index(0), clean.levels[0])
-    errors = {kind: _spreads(seeds, kind) for kind in KINDS}
+    errors = {str(kind): _spreads(seeds, kind) for kind in KINDS}
     coverage = []
     for level in range(len(levels)):
         shares = [
