@@ -23,11 +23,11 @@ from ghpt.calibration.check.mending import MENDED, write_mended
 from ghpt.calibration.check.setup import Setup, as_filed
 from ghpt.calibration.check.units import UNITS_MM
 from ghpt.commands.app import Command
-from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.calibrate import people_note
+from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.key_points import KeyPoints
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig

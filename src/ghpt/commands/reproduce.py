@@ -16,9 +16,9 @@ import yaml
 
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.jobs import Job
 from ghpt.commands.outputs import Files
-from ghpt.commands.train import display_path
 from ghpt.config import check_type, suggest
 from ghpt.errors import GhptConfigError, check
 from ghpt.paper.ablations import tables as ablations
