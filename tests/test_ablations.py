@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from ghpt.commands.train import train
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
@@ -21,7 +20,7 @@ from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import read_json
 from sections import markdown
 from sections import setup as whole_setup
-from toys import DATA, TRAIN
+from toys import DATA, TRAIN, train
 
 BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}
 SIZES = {

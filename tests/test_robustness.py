@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 
-from ghpt.commands.train import train
 from ghpt.files import write_json
 from ghpt.paper.engine.artefact import Results, Section
 from ghpt.paper.engine.setup import Setup
@@ -18,7 +17,7 @@ from ghpt.paper.robustness.actions import measure_curve
 from ghpt.paper.robustness.curves import ARTEFACTS
 from sections import markdown
 from sections import setup as whole_setup
-from toys import DATA, TRAIN
+from toys import DATA, TRAIN, train
 
 BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}
 SIZES = {

@@ -13,9 +13,10 @@ from pathlib import Path
 import yaml
 
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.jobs import Job
 from ghpt.commands.outputs import Files, OutputSettings
-from ghpt.commands.train import display_path
 from ghpt.config import suggest
 from ghpt.errors import GhptConfigError, check
 from ghpt.paper.ablations import tables as ablations
@@ -118,22 +119,6 @@ def gather(jobs: Sequence[Job[ReproduceSettings, Counts]], conf: Path) -> None:
 def _without_share(settings: ReproduceSettings) -> ReproduceSettings:
     """Return what the jobs of a sweep that belong together have in common."""
     return replace(settings, only=None, seed=0, seeds=1)
-
-
-def spread(command: Sequence[str]) -> list[str]:
-    """Return a command line in which a sweep has a job for each seed.
-
-    In a sweep ``seeds=5`` becomes ``seed=0,1,2,3,4``.
-    """
-    words = dict(word.split("=", 1) for word in command if "=" in word)
-    count = words.get("seeds", "")
-    first = words.get("seed", "0")
-    sweep = bool({"-m", "--multirun"} & set(command))
-    if not (sweep and count.isdecimal() and first.isdecimal() and int(count) > 1):
-        return list(command)
-    others = [word for word in command if not word.startswith(("seeds=", "seed="))]
-    seeds = range(int(first), int(first) + int(count))
-    return [*others, "seed=" + ",".join(map(str, seeds))]
 
 
 def _reproduce(
@@ -264,3 +249,7 @@ def command(conf: Path) -> Command[ReproduceSettings, Counts]:
         files=files,
         after=partial(gather, conf=conf),
     )
+
+
+if __name__ == "__main__":
+    run_by_name("reproduce")

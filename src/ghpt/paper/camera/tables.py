@@ -8,7 +8,8 @@ from statistics import fmean
 
 import torch
 
-from ghpt.models.relative_pose.predictions import open_pairs
+from ghpt.models.predictions import open_predictions
+from ghpt.models.relative_pose import schema
 from ghpt.paper.camera.dissection import DISSECTION
 from ghpt.paper.camera.figures import SWEEP
 from ghpt.paper.camera.tasks import PAIRS, pair_error, scaled, tested_pairs
@@ -197,9 +198,10 @@ def _mean_error(results: Results, method: str, pairs: Sequence[str]) -> float:
 
 def _shapes(results: Results) -> dict[str, Shape]:
     """Return how each pair stands about the middle of the points X*, the mean over the rigs."""
-    predictions = open_pairs(results.paths("test")[0] / "predictions.npz")
-    middle = predictions.points.mean(dim=1, keepdim=True)
-    directions = predictions.cameras.centre - middle
+    file = results.paths("test")[0] / "predictions.npz"
+    rigs = open_predictions(file, schema.PAIRS).tables
+    middle = rigs.points.mean(dim=1, keepdim=True)
+    directions = rigs.cameras.centre - middle
     shapes = {}
     for a, b in FUNDAMENTAL:
         one = directions[:, a - 1]

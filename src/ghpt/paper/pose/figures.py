@@ -12,7 +12,8 @@ from matplotlib.figure import Figure
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.models.pose.predictions import PredictionChunk, open_predictions
+from ghpt.models.pose.schema import POSES, PoseChunk
+from ghpt.models.predictions import open_predictions
 from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section, figure_block
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
@@ -31,7 +32,7 @@ TEST = SELF["h36m"]
 
 
 def _qualitative(results: Results) -> Section:
-    predictions = open_predictions(results.paths(TEST)[0] / "predictions.npz")
+    predictions = open_predictions(results.paths(TEST)[0] / "predictions.npz", POSES)
     chunk = predictions.read(0, len(predictions))
     errors = {name: _relative_errors(chunk, name) for name in SHOWN}
     whole = np.flatnonzero(np.isfinite(np.sum(list(errors.values()), axis=0)))
@@ -41,8 +42,8 @@ def _qualitative(results: Results) -> Section:
     captions = {}
     for kind, quantile in QUANTILES.items():
         row = int(ordered[int(quantile * (len(whole) - 1))])
-        take = predictions.recording_name[int(chunk.recording[row])]
-        frame = int(chunk.frame[row])
+        take = predictions.tables.recording_name[int(chunk.sample.recording[row])]
+        frame = int(chunk.sample.frame[row])
         heading = (
             f"{data}, test split: {take}, frame {frame}, "
             f"the {quantile:.0%} quantile of the errors under weight"
@@ -63,11 +64,10 @@ def _qualitative(results: Results) -> Section:
     )
 
 
-def _draw_frame(chunk: PredictionChunk, row: int, heading: str) -> Figure:
-    up = up_axis(chunk.truth.points[::10].double().numpy())
-    truth = chunk.truth.points[row].double().numpy()
+def _draw_frame(chunk: PoseChunk, row: int, heading: str) -> Figure:
+    truth = chunk.sample.as_truth().points.double().numpy()
     poses = {name: chunk.estimates[name].points[row].double().numpy() for name in SHOWN}
-    return skeletons(truth, poses, up, heading)
+    return skeletons(truth[row], poses, up_axis(truth[::10]), heading)
 
 
 def _order_claim(errors: Mapping[str, float]) -> Claim:
@@ -81,10 +81,10 @@ def _order_claim(errors: Mapping[str, float]) -> Claim:
     )
 
 
-def _relative_errors(chunk: PredictionChunk, name: str) -> Float[np.ndarray, " N"]:
+def _relative_errors(chunk: PoseChunk, name: str) -> Float[np.ndarray, " N"]:
     """Return the pelvis-relative MPJPE (mm) of each frame, NaN where a joint is missing."""
     estimate = chunk.estimates[name]
-    errors, measured = joint_errors(estimate, chunk.truth, "relative")
+    errors, measured = joint_errors(estimate, chunk.sample.as_truth(), "relative")
     return torch.where(measured.all(-1), errors.mean(-1), torch.nan).numpy()
 
 

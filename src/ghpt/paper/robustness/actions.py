@@ -15,8 +15,8 @@ from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE, Kind
 from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
+from ghpt.models.problem import BaselineSettings
 from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
-from ghpt.report.poses import estimators
 from ghpt.skeleton import JOINTS
 
 KINDS: tuple[Kind, ...] = ("relative", "absolute")
@@ -84,7 +84,8 @@ def measure_curve(config: dict[str, Any], dependencies: dict[str, Path], folder:
     frames = data.frames["test"]
     seed = config["seed"]
     model, _ = load_model(dependencies["model"] / LAST, seed=seed)
-    estimate = all_estimators(model.eval(), estimators(config, model))
+    groups = BaselineSettings(config["baselines"], {}, config.get("view_weights"))
+    estimate = all_estimators(model.eval(), model.problem.baselines(groups, model))
     perturbations = build(config["perturbations"], "perturbations")
     levels = [LevelMetrics() for _ in perturbations]
     for first in range(0, len(frames), data.batch_size):
