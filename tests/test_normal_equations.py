@@ -8,8 +8,8 @@ from ghpt.geometry.normal_equations import (
     local_cameras,
     minors,
     solve_symmetric,
-    valid_key_points,
     valid_cameras,
+    valid_key_points,
     view_equations,
     weighted_sum,
 )

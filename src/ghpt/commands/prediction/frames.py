@@ -21,9 +21,8 @@ from ghpt.export import Evidence
 from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.normal_equations import local_cameras
 from ghpt.models.estimators.classical import Baseline
+from ghpt.observations import Observations
 from ghpt.reconstruction import Reconstruction
-from ghpt.recording import Observations
-from ghpt.skeleton import JOINTS
 
 _NEAR = 1e5
 """Distance (mm, along an axis) from the world's zero up to which a rig stays where it is.
@@ -89,20 +88,18 @@ class Frames:
     def batch(self, rows: Int[np.ndarray, " N"]) -> Observations:
         """Some rows, before cameras in a world whose zero is ``origin``.
 
-        A frame's ``sample`` is its own number, so its random draws are the same in any batch.
+        A frame's ``index`` is its own number, so its random draws are the same in any batch.
         """
         key_points, confidence, valid = (torch.from_numpy(values) for values in self.read(rows))
         count = len(rows)
         rig = self.cameras.relative_to(self.origin)
         return Observations(
-            sample=torch.from_numpy(self.frame[rows]),
+            index=torch.from_numpy(self.frame[rows]),
             recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
             key_points=key_points,
             confidence=confidence,
             valid=valid,
-            truth=torch.zeros(count, len(JOINTS), 3),
-            truth_valid=torch.zeros(count, len(JOINTS), dtype=torch.bool),
         )
 
     def spread(self, most: int) -> Int[np.ndarray, " N"]:

@@ -17,8 +17,8 @@ from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, SEGMENTS, stature
+from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import FILE_STATES, Reconstruction, State
-from ghpt.recording import Observations, PoseEstimate
 from ghpt.report.rig_comparison import segment_variation
 
 Estimate = Callable[[Observations], PoseEstimate]

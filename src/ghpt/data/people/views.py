@@ -20,8 +20,7 @@ from ghpt.data.people.association import associate
 from ghpt.data.people.people import Detections, KeyPoints
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras, CameraSet
-from ghpt.recording import Recording
-from ghpt.skeleton import JOINTS
+from ghpt.observations import Recording
 
 _log = logging.getLogger(__name__)
 _HINT = "Rename them, say which is which (match={view: camera}), or name the views to use (views=[...])."
@@ -59,7 +58,7 @@ class Views:
         return Views(self.cameras.select(at), *arrays, self.frame, self.rate_hz)
 
     def recording(self, name: str, cameras: Cameras) -> Recording:
-        """The recording as any calibration of its cameras sees it; without a truth."""
+        """The recording as any calibration of its cameras sees it."""
         return Recording(
             name=name,
             subject=name,
@@ -70,8 +69,6 @@ class Views:
             key_points=self.key_points,
             confidence=self.confidence,
             valid=self.valid,
-            truth=np.zeros((len(self), len(JOINTS), 3), np.float32),
-            truth_valid=np.zeros((len(self), len(JOINTS)), bool),
             frame=self.frame,
         )
 

@@ -17,7 +17,7 @@ from ghpt.data.synthetic.random_processes import generator
 from ghpt.data.synthetic.rigs import ARRANGEMENTS, human36m_rig, panoptic_rig
 from ghpt.errors import check
 from ghpt.geometry.cameras import CameraSet
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 
 SPLITS = ("train", "validation", "test")
 HUMAN36M_SUBJECTS = {
@@ -58,7 +58,7 @@ def synthetic_recordings(
     seed: int,
     detector: Detector,
     cameras: Sequence[int] | None = None,
-) -> Iterator[Recording]:
+) -> Iterator[LabelledRecording]:
     """Return the synthetic recordings of ``h36m``, of ``cmu1`` to ``cmu4``, or of ``panoptic``.
 
     ``panoptic`` takes any HD ``cameras``. The recordings are a pure function of the arguments; a
@@ -141,7 +141,7 @@ def _panoptic_takes(rig: CameraSet, split: str, seed: int) -> Iterator[Take]:
         )
 
 
-def _detect(take: Take, seed: int, detector: Detector) -> Recording:
+def _detect(take: Take, seed: int, detector: Detector) -> LabelledRecording:
     found = detector(
         take.truth,
         take.rig,
@@ -152,7 +152,7 @@ def _detect(take: Take, seed: int, detector: Detector) -> Recording:
         take.familiar,
     )
     frames, joints, _ = take.truth.shape
-    return Recording(
+    return LabelledRecording(
         name=take.name,
         subject=take.subject,
         action=take.action,

@@ -14,7 +14,7 @@ from ghpt.errors import check_positive
 from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.estimators.classical import Baseline, Linear, everywhere, otherwise, person_scale
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 
 @dataclass(frozen=True)

@@ -22,8 +22,8 @@ from ghpt.geometry.triangulation import (
     triangulate_subsets,
 )
 from ghpt.models.estimators.classical import Baseline, everywhere, person_scale
+from ghpt.observations import Observations
 from ghpt.randomness import key, uniform
-from ghpt.recording import Observations
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Ransac(Baseline):
         valid = batch.valid.mT[:, None]
         count = valid.sum(-1)
         draw = uniform(
-            key(self.seed, "ransac", batch.sample, device=device), (self.pairs, joints, 2)
+            key(self.seed, "ransac", batch.index, device=device), (self.pairs, joints, 2)
         )
         one = (draw[..., 0] * count).long()
         other = (draw[..., 1] * (count - 1)).long()

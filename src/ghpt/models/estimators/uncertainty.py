@@ -18,7 +18,7 @@ from ghpt.geometry.normal_equations import (
 )
 from ghpt.geometry.triangulation import flat_cameras
 from ghpt.models.estimators.classical import person_scale
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 
 @dataclass(frozen=True)
