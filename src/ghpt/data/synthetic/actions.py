@@ -68,8 +68,8 @@ def action_spec(action: str) -> ActionSpec:
 def _specs() -> dict[str, ActionSpec]:
     file = resources.files("ghpt.data.synthetic") / "actions.yaml"
     tables = yaml.safe_load(file.read_text(encoding="utf-8"))
-    arms: Mapping[str, list[float]] = tables["arms"]
-    legs: Mapping[str, list[float]] = tables["legs"]
+    arms: Mapping[str, list[int]] = tables["arms"]
+    legs: Mapping[str, list[int]] = tables["legs"]
     entries: Mapping[str, Any] = tables["actions"]
     specs = {}
     for name, entry in entries.items():
@@ -83,6 +83,6 @@ def _specs() -> dict[str, ActionSpec]:
     return specs
 
 
-def _select_postures(table: Mapping[str, list[float]], weights: Mapping[str, int]) -> Postures:
+def _select_postures(table: Mapping[str, list[int]], weights: Mapping[str, int]) -> Postures:
     angles = [table[posture] for posture in weights]
     return Postures(np.array(angles, dtype=float), np.array(list(weights.values()), dtype=float))

@@ -32,11 +32,11 @@ of name.
 class _Camera:
     """One camera as the package's JSON files have it, in the file's unit of length."""
 
-    K: list[list[float]]
-    distortion: list[float]
+    K: list[list[int | float]]
+    distortion: list[int | float]
     size: list[int]
-    R: list[list[float]]
-    t: list[float]
+    R: list[list[int | float]]
+    t: list[int | float]
 
 
 def human36m_rig(subject: str) -> CameraSet:
