@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from ghpt.commands.train import train
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
@@ -19,7 +18,7 @@ from ghpt.paper.ablations.tables import ARTEFACTS
 from ghpt.paper.engine.artefact import Results, Section
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import read_json
-from toys import DATA, TRAIN
+from toys import DATA, TRAIN, train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}

@@ -24,7 +24,7 @@ from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
-from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.cameras import project
 from ghpt.geometry.lens import distort
 from ghpt.report.rig_comparison import rig_difference
 from ghpt.skeleton import JOINT, JOINTS
@@ -80,8 +80,8 @@ def scene():
 def write(folder, scene, extrinsics: bool = True):
     rig, points, _ = scene
     if not extrinsics:
-        same = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
-        rig = replace(rig, cameras=Cameras(rig.cameras.K, *same))
+        R, t = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
+        rig = replace(rig, R=R, t=t)
     write_pose2sim(folder / "cameras.toml", rig, {})
     write_key_points(folder / "points.npz", points)
     return (

@@ -35,7 +35,7 @@ class Numbers(Samples):
     number: torch.Tensor
 
 
-class GuessTheNumber:
+class GuessTheNumber(Problem):
     """Hypotheses are the truth plus noise; the feature is the noise, so a scorer can learn to
     prefer little of it.
     """

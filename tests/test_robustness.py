@@ -9,14 +9,13 @@ from typing import Any
 
 import pytest
 
-from ghpt.commands.train import train
 from ghpt.files import write_json
 from ghpt.paper.engine.artefact import Results, Section
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import read_json
 from ghpt.paper.robustness.actions import curve
 from ghpt.paper.robustness.curves import ARTEFACTS
-from toys import DATA, TRAIN
+from toys import DATA, TRAIN, train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}

@@ -4,13 +4,12 @@ happens.
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
+import children
 from ghpt.errors import GhptDataError
 from ghpt.paper.engine.pool import perform_all
 from ghpt.paper.engine.tasks import read_json, with_dependencies
@@ -98,15 +97,12 @@ def slow(diary):
 def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_path, stop, status):
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
-    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(program), str(diary), str(tmp_path / "tasks")]
-    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as run:
-        until(lambda: {2, 3} <= set(numbers(diary)), 300)
-        run.send_signal(getattr(signal, stop))
-        assert run.wait(60) == status
+    run = children.start(program, diary, tmp_path / "tasks")
+    until(lambda: {2, 3} <= set(numbers(diary)))
+    run.send_signal(getattr(signal, stop))
+    assert run.wait(children.LIMIT) == status
     workers = {int(line.split()[1]) for line in diary.read_text().splitlines()}
-    until(lambda: not any(alive(worker) for worker in workers), 60)
+    until(lambda: not any(alive(worker) for worker in workers))
     first, *others = slow(diary)
     assert first.done(tmp_path / "tasks")
     assert not any(other.done(tmp_path / "tasks") for other in others)
@@ -125,8 +121,8 @@ def alive(process):
         return False
 
 
-def until(condition, seconds):
-    end = time.monotonic() + seconds
+def until(condition):
+    end = time.monotonic() + children.LIMIT
     while not condition():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.1)

@@ -9,11 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import yaml
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 import ghpt.commands.test as testing
-import toys
 from ghpt.commands import predict as prediction
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.commands.train import COMMAND
@@ -55,14 +53,6 @@ def contents(folder: Path) -> dict[str, bytes]:
         for path in sorted(folder.glob("*"))
         if path.suffix[1:] in names and not path.name.startswith(".")
     }
-
-
-@pytest.fixture(scope="module")
-def conf(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("conf") / "conf"
-    shutil.copytree(ROOT / "conf", folder)
-    (folder / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
-    return folder
 
 
 @pytest.fixture
@@ -172,11 +162,10 @@ def test_rows_are_not_written_through_a_memory_map(tmp_path, no_space):
     """A full disk would end the process with SIGBUS."""
     import torch
 
-    writer = RowWriter(tmp_path / ".rows", 3, "frames", ["linear"], {"x": ("<f4", (2,))})
-    weights = {name: torch.zeros(3) for name in ("entropy", "max", "effective")}
+    writer = RowWriter(tmp_path / ".rows", 3, {"x": ("<f4", (2,))})
     no_space("x")
     with pytest.raises(OSError, match=r"No space left on device: '.*\.rows/x'"):
-        writer.write(torch.arange(3), {"x": torch.ones(3, 2)}, weights)
+        writer.write(torch.arange(3), {"x": torch.ones(3, 2)})
 
 
 def test_the_manifest_is_named(tmp_path, monkeypatch):

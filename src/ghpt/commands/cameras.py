@@ -24,9 +24,10 @@ from ghpt.calibration.check.setup import Setup, as_filed
 from ghpt.calibration.check.units import UNITS_MM
 from ghpt.commands.app import Command
 from ghpt.commands.calibrate import people_note
+from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.key_points import KeyPoints
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
@@ -268,3 +269,7 @@ def _stature(numbers: dict[str, Any]) -> str:
 
 
 COMMAND = Command(name="cameras", settings=dict, task=examine, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("cameras")

@@ -15,6 +15,8 @@ from jaxtyping import Int
 
 from ghpt.commands.app import Command
 from ghpt.commands.calibrate import from_data
+from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.inputs import InputSettings, own_cameras
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
@@ -34,7 +36,6 @@ from ghpt.commands.prediction.run import predicted
 from ghpt.commands.prediction.statistics import Estimate, counts, estimate_of, evaluate
 from ghpt.commands.prediction.stored import frames_of_stored, open_stored
 from ghpt.commands.prediction.verdict import Level
-from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.key_points import read_people
 from ghpt.data.formats.skeletons import joints17
@@ -363,3 +364,7 @@ def _check(config: dict[str, Any]) -> None:
 
 
 COMMAND = Command(name="predict", settings=dict, task=predict, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("predict")

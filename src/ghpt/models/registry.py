@@ -25,7 +25,6 @@ from ghpt.models.relative_pose.problem import RelativePose
 from ghpt.models.relative_pose.scale import BodyHeight, KnownScale, Scale, SegmentLengths
 from ghpt.models.scorer import Scorer
 
-_METHODS = ("generate", "featurize", "aggregate", "as_estimates", "error")
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", re.ASCII)
 _NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {"__main__", "ghpt", "torch"}
 """Packages that are not the user's own. What is harmless of ghpt and torch is in ``PARTS``."""
@@ -40,7 +39,7 @@ class Part:
     """A key of a model's configuration that holds a class."""
 
     kind: type
-    """What a class must be derived from (``Problem``: what methods it must have)."""
+    """What a class must be derived from."""
     partial: bool = False
     """Whether the model gives the last arguments itself (``_partial_: true``)."""
     classes: dict[str, type] = field(default_factory=dict)
@@ -195,11 +194,7 @@ def _users_class(node: Mapping[str, Any], path: str, kind: type, trust: Sequence
     if not _is_within(found.__module__, trust):
         problem = f"{target} is defined elsewhere, in {found.__module__}"
         raise GhptConfigError(key, problem, "Train with the name of the module that defines it.")
-    if kind is Problem:
-        fits = all(callable(getattr(found, name, None)) for name in _METHODS)
-    else:
-        fits = issubclass(found, kind)
-    if not fits:
+    if not issubclass(found, kind):
         name = f"{kind.__module__}.{kind.__qualname__}"
         raise GhptConfigError(key, f"{target} is no {name}", "Derive it from that class.")
     return found

@@ -3,7 +3,9 @@ anything.
 """
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,12 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from ghpt.metrics.pose_error import joint_errors
-from ghpt.models.pose.predictions import PredictionChunk, Predictions
-from ghpt.models.rows import WEIGHTS
+from ghpt.models.aggregation import WeightSummary
+from ghpt.models.pose.schema import PoseChunk, PosePredictions
 from ghpt.observations import PoseEstimate
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
-from ghpt.report.tables import title, trained_on
+from ghpt.report.report import Report
+from ghpt.report.tables import print_table, title, trained_on, write_report
 
 SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
@@ -30,7 +33,9 @@ _BLOCK = 1000
 _log = logging.getLogger(__name__)
 
 
-def write_events(folder: str | Path, predictions: Predictions, metrics: Mapping[str, Any]) -> int:
+def write_events(
+    folder: str | Path, predictions: PosePredictions, metrics: Mapping[str, Any]
+) -> int:
     """Write a test run's scalars, histograms, figures and hyper-parameters, as ``write_parts``
     does.
     """
@@ -71,7 +76,7 @@ def write_parts(folder: str | Path, parts: Mapping[str, Callable[[SummaryWriter]
     writer = attempt("the event file", lambda: SummaryWriter(str(folder)))
     if writer is not None:
         for part, write in parts.items():
-            attempt(part, lambda write=write: write(writer))
+            attempt(part, partial(write, writer))
         attempt("the event file", writer.close)
     return len(failures)
 
@@ -83,22 +88,21 @@ def _scalars(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
                 writer.add_scalar(f"{scalar}/{name}", numbers[scalar], 0)
 
 
-def _weights(writer: SummaryWriter, predictions: Predictions) -> None:
-    chunks = [chunk.weights for _, chunk in _sample(predictions)]
-    write_weights(
-        writer,
-        {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS},
-    )
+def _weights(writer: SummaryWriter, predictions: PosePredictions) -> None:
+    write_weights(writer, [chunk.weights for _, chunk in _sample(predictions)])
 
 
-def write_weights(writer: SummaryWriter, weights: Mapping[str, Float[Tensor, " N"]]) -> None:
-    """Mean and histogram of each summary of the weights."""
-    for summary, values in weights.items():
-        writer.add_scalar(f"weights/{summary}", values.mean().item(), 0)
-        writer.add_histogram(f"weights/{summary}", values.numpy(), 0)
+def write_weights(writer: SummaryWriter, weights: Sequence[WeightSummary]) -> None:
+    """Write mean and histogram of each summary of the weights, over all chunks."""
+    for summary in fields(WeightSummary):
+        values = torch.cat([getattr(chunk, summary.name) for chunk in weights])
+        writer.add_scalar(f"weights/{summary.name}", values.mean().item(), 0)
+        writer.add_histogram(f"weights/{summary.name}", values.numpy(), 0)
 
 
-def _skeletons(writer: SummaryWriter, predictions: Predictions, metrics: Mapping[str, Any]) -> None:
+def _skeletons(
+    writer: SummaryWriter, predictions: PosePredictions, metrics: Mapping[str, Any]
+) -> None:
     """The whole frame whose error under ``weight`` is the median: neither a good nor a bad one."""
     rows = []
     errors = []
@@ -107,16 +111,17 @@ def _skeletons(writer: SummaryWriter, predictions: Predictions, metrics: Mapping
         error, whole = _relative_error(chunk)
         rows.append(start + whole.nonzero()[:, 0])
         errors.append(error[whole])
-        truth.append(chunk.truth.points[whole][::10])
+        truth.append(chunk.sample.as_truth().points[whole][::10])
     if not len(torch.cat(rows)):
         return
     row = int(torch.cat(rows)[torch.cat(errors).median(dim=0).indices])
     chunk = predictions.read(row, row + 1)
     poses = {name: _with_nan(chunk.estimates[name]) for name in SHOWN if name in predictions.names}
-    take = predictions.recording_name[int(chunk.recording)]
-    heading = f"{title(metrics)}\n{take}, frame {int(chunk.frame)}: the median of the errors under {SHOWN[0]}"
+    truth_of_row = chunk.sample.as_truth()
+    take = predictions.tables.recording_name[int(chunk.sample.recording)]
+    heading = f"{title(metrics)}\n{take}, frame {int(chunk.sample.frame)}: the median of the errors under {SHOWN[0]}"
     up = up_axis(torch.cat(truth).double().numpy())
-    figure = skeletons(chunk.truth.points[0].double().numpy(), poses, up, heading)
+    figure = skeletons(truth_of_row.points[0].double().numpy(), poses, up, heading)
     writer.add_image("skeletons", image(figure), 0, dataformats="HWC")
 
 
@@ -150,7 +155,7 @@ def write_hyperparameters(
         writer.add_scalar(name, number, 0)
 
 
-def _sample(predictions: Predictions) -> Iterator[tuple[int, PredictionChunk]]:
+def _sample(predictions: PosePredictions) -> Iterator[tuple[int, PoseChunk]]:
     """At most ``_SAMPLE`` blocks with their first row, so that memory does not grow with the
     frames.
     """
@@ -162,9 +167,9 @@ def _sample(predictions: Predictions) -> Iterator[tuple[int, PredictionChunk]]:
     )
 
 
-def _relative_error(chunk: PredictionChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
+def _relative_error(chunk: PoseChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
     """Each frame's error under the first shown selection, mm, and which frames are whole."""
-    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], chunk.truth, "relative")
+    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], chunk.sample.as_truth(), "relative")
     return errors.mean(-1), counted.all(-1)
 
 
@@ -172,3 +177,7 @@ def _with_nan(estimate: PoseEstimate) -> Float[np.ndarray, "J 3"]:
     return (
         estimate.points[0].double().masked_fill(~estimate.estimated[0, :, None], torch.nan).numpy()
     )
+
+
+REPORT = Report(print_table, write_report, write_events)
+"""Of the pose problem."""

@@ -9,11 +9,11 @@ import torch
 
 from ghpt.config import build
 from ghpt.files import write_json
-from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.checkpoint import LAST, load_model
-from ghpt.models.collect import CollectPairs
+from ghpt.models.collect import CollectPredictions
+from ghpt.models.predictions import open_predictions
 from ghpt.models.relative_pose.evaluation import errors_of_pair, pair_name
-from ghpt.models.relative_pose.predictions import open_pairs
+from ghpt.models.relative_pose.schema import PAIRS
 
 
 def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
@@ -40,15 +40,15 @@ def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folde
         "split": data.evaluate,
         "seed": config["seed"],
     }
-    collect = CollectPairs(folder, build(config["camera_baselines"], "camera_baselines"), meta)
-    collect.data = pairs
-    collect.open([*AGGREGATIONS, *collect.estimators])
+    baselines = build(config["camera_baselines"], "camera_baselines")
+    collect = CollectPredictions(folder, model.problem, baselines, meta)
+    collect.open(pairs)
     with torch.no_grad():
         for first in range(0, len(pairs), data.batch_size):
             batch = pairs[range(first, min(first + data.batch_size, len(pairs)))]
-            collect.write(model, batch, model.test_step(batch, 0))
+            collect.write(batch, model.test_step(batch, 0))
     collect.finish()
-    predictions = open_pairs(collect.path)
+    predictions = open_predictions(collect.path, PAIRS)
     result = {
         pair_name(pair): {
             name: [value if math.isfinite(value) else None for value in values]

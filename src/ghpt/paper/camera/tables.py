@@ -7,7 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import torch
 
-from ghpt.models.relative_pose.predictions import open_pairs
+from ghpt.models.predictions import open_predictions
+from ghpt.models.relative_pose.schema import PAIRS
 from ghpt.paper.camera.dissection import DISSECTION
 from ghpt.paper.camera.figures import SWEEP
 from ghpt.paper.camera.tasks import measured, of_pair, tested_pairs, three_rows
@@ -164,8 +165,9 @@ def _shapes(results: Results) -> dict[str, tuple[str, str]]:
     """Pair -> distance of its cameras (m) and the angle (degrees) between them as seen from the
     middle of the points X*, the mean of the rigs.
     """
-    predictions = open_pairs(results.paths("test")[0] / "predictions.npz")
-    to = predictions.cameras.centre - predictions.points.mean(dim=1, keepdim=True)
+    predictions = open_predictions(results.paths("test")[0] / "predictions.npz", PAIRS)
+    rigs = predictions.tables
+    to = rigs.cameras.centre - rigs.points.mean(dim=1, keepdim=True)
     shapes = {}
     for a, b in FUNDAMENTAL:
         one = to[:, a - 1]

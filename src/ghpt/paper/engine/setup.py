@@ -12,7 +12,7 @@ from typing import Any
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 
-from ghpt.commands.train import shell_override
+from ghpt.commands.display import shell_override
 from ghpt.config import build, plain
 from ghpt.paper.engine.tasks import Task
 

@@ -8,7 +8,8 @@ from jaxtyping import Float
 
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.metrics.pose_prior import PARTS
-from ghpt.models.pose.predictions import PredictionChunk, Predictions, open_predictions
+from ghpt.models.pose.schema import POSES, PoseChunk, PosePredictions
+from ghpt.models.predictions import open_predictions
 from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
@@ -26,16 +27,17 @@ TEST = SELF["h36m"]
 
 
 def _qualitative(results: Results) -> Section:
-    predictions = open_predictions(results.paths(TEST)[0] / "predictions.npz")
+    predictions = open_predictions(results.paths(TEST)[0] / "predictions.npz", POSES)
     chunk = predictions.read(0, len(predictions))
     errors = {name: _relative_errors(chunk, name) for name in SHOWN}
     whole = np.flatnonzero(np.isfinite(sum(errors.values())))
-    up = up_axis(chunk.truth.points[::10].double().numpy())
+    truth = chunk.sample.as_truth().points
+    up = up_axis(truth[::10].double().numpy())
     figures = {}
     for kind, quantile in QUANTILES.items():
         row = whole[np.argsort(errors["weight"][whole])[int(quantile * (len(whole) - 1))]]
         figures[f"qualitative-{kind}"] = skeletons(
-            chunk.truth.points[row].double().numpy(),
+            truth[row].double().numpy(),
             {name: chunk.estimates[name].points[row].double().numpy() for name in SHOWN},
             up,
             _heading(
@@ -61,17 +63,17 @@ def _qualitative(results: Results) -> Section:
     return Section(results.display_name("h36m"), f"{text}\n\n{pictures}", figures, (), [claim])
 
 
-def _relative_errors(chunk: PredictionChunk, name: str) -> Float[np.ndarray, " N"]:
+def _relative_errors(chunk: PoseChunk, name: str) -> Float[np.ndarray, " N"]:
     """Pelvis-relative MPJPE (mm) of each frame; NaN where a joint is missing."""
-    errors, counted = joint_errors(chunk.estimates[name], chunk.truth, "relative")
+    errors, counted = joint_errors(chunk.estimates[name], chunk.sample.as_truth(), "relative")
     return torch.where(counted.all(-1), errors.mean(-1), torch.nan).numpy()
 
 
 def _heading(
-    results: Results, predictions: Predictions, chunk: PredictionChunk, row: int, which: str
+    results: Results, predictions: PosePredictions, chunk: PoseChunk, row: int, which: str
 ) -> str:
-    take = predictions.recording_name[int(chunk.recording[row])]
-    return f"{results.display_name('h36m')}, test split: {take}, frame {int(chunk.frame[row])}, {which}"
+    take = predictions.tables.recording_name[int(chunk.sample.recording[row])]
+    return f"{results.display_name('h36m')}, test split: {take}, frame {int(chunk.sample.frame[row])}, {which}"
 
 
 def _pose_prior(results: Results) -> Section:

@@ -14,8 +14,8 @@ from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
+from ghpt.models.problem import BaselineSettings
 from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
-from ghpt.report.poses import estimators
 from ghpt.skeleton import JOINTS
 
 KINDS = ("relative", "absolute")
@@ -39,7 +39,9 @@ def curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -
     data.setup("test")
     frames = data.frames["test"]
     model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
-    everybody = together(model.eval(), estimators(config, model))
+    groups = BaselineSettings(config["baselines"], {}, config.get("view_weights"))
+    baselines = model.problem.baselines(groups, model)
+    everybody = together(model.eval(), baselines)
     perturbations = build(config["perturbations"], "perturbations")
     levels: list[dict[str, dict[str, MPJPE]]] = [{} for _ in perturbations]
     for first in range(0, len(frames), data.batch_size):
