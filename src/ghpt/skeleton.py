@@ -27,6 +27,7 @@ one.
 JOINT = {name: index for index, name in enumerate(JOINTS)}
 """Index on the J axis by name."""
 
+
 def _bone(start: str, end: str) -> tuple[int, int]:
     return JOINT[start], JOINT[end]
 
