@@ -54,6 +54,19 @@ def linear_pose(
     return RelativePoseEstimate(R, t, ok), determined
 
 
+@dataclass(frozen=True)
+class Correspondences:
+    """N points that both cameras of a pair see."""
+
+    a: Float[Tensor, "N 2"]
+    b: Float[Tensor, "N 2"]
+    """Normalised image coordinates in the reference and the target camera, float64."""
+    size: float
+    """The person's size in the images, in these coordinates."""
+    index: Int[Tensor, ""]
+    """The pair's own: the key of its random draws."""
+
+
 class PairBaseline(ABC):
     """A classical estimator of pairs."""
 
@@ -74,14 +87,8 @@ class Robust(PairBaseline):
     """An estimator that tells inliers from outliers; ``EightPoint`` where it finds too few."""
 
     @abstractmethod
-    def pose(
-        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> RelativePoseEstimate | None:
-        """Return the pose of one pair, None where there is none.
-
-        It is made of N >= 8 correspondences (normalised image coordinates) of a person of that
-        ``size``.
-        """
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        """Return the pose of one pair with 8 correspondences or more, None where there is none."""
 
     @torch.no_grad()
     def __call__(self, batch: PairObservations) -> RelativePoseEstimate:
@@ -93,7 +100,8 @@ class Robust(PairBaseline):
         ok = linear.estimated.clone()
         for i in torch.nonzero(determined & (size > 0)).flatten().tolist():
             own = used[i]
-            found = self.pose(a[i, own], b[i, own], size[i].item(), batch.index[i])
+            pair = Correspondences(a[i, own], b[i, own], size[i].item(), batch.index[i])
+            found = self.pose(pair)
             if found is not None and found.estimated:
                 R[i] = found.R.to(R)
                 t[i] = found.t.to(t)
@@ -109,7 +117,7 @@ class Ransac(Robust):
     squared error (MSAC), then the 8-point algorithm on its inliers.
 
     ``threshold``: an inlier's largest Sampson error, as a fraction of the person's size. The
-    samples are keyed by ``seed`` and the pair's ``sample``.
+    samples are keyed by ``seed`` and the pair's ``index``.
     """
 
     samples: int
@@ -119,14 +127,14 @@ class Ransac(Robust):
     def __post_init__(self) -> None:
         check_positive(samples=self.samples, threshold=self.threshold)
 
-    def pose(
-        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> RelativePoseEstimate | None:
-        keys = key(self.seed, "pair ransac", sample, device=a.device)
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        a = pair.a
+        b = pair.b
+        keys = key(self.seed, "pair ransac", pair.index, device=a.device)
         chosen = _distinct(uniform(keys, (self.samples, MINIMUM)), len(a))
         ones = torch.ones(chosen.shape, dtype=a.dtype, device=a.device)
         E, ok = eight_point(a[chosen], b[chosen], ones)
-        error = sampson_error(E, a, b) / (self.threshold * size)
+        error = sampson_error(E, a, b) / (self.threshold * pair.size)
         gain = (1 - error.square()).clamp_min(0).sum(-1)
         score = torch.where(ok, gain, -1.0)
         best = score.argmax()
@@ -138,10 +146,11 @@ class Ransac(Robust):
 class Usac(Robust):
     """OpenCV's ``findEssentialMat`` with one of its USAC methods.
 
-    Of the four poses it takes the one with most of its inliers in front. ``threshold``: as a fraction of the person's size. ``pixels``: the person's size that OpenCV
-    sees. Its methods hold constants in pixels (MAGSAC's largest threshold, the cells of the
-    neighbourhoods), so that neither normalised coordinates nor the camera's own resolution would
-    do. Their random state is OpenCV's fixed one.
+    Of the four poses it takes the one with most of its inliers in front. ``threshold``: as a
+    fraction of the person's size. ``pixels``: the person's size that OpenCV sees. Its methods hold
+    constants in pixels (MAGSAC's largest threshold, the cells of the neighbourhoods), so that
+    neither normalised coordinates nor the camera's own resolution would do. Their random state is
+    OpenCV's fixed one.
     """
 
     method: str
@@ -158,12 +167,10 @@ class Usac(Robust):
         possible = 0 < self.confidence < 1
         check(possible, "confidence", f"is {self.confidence}", "It must be between 0 and 1.")
 
-    def pose(
-        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> RelativePoseEstimate | None:
-        focal = self.pixels / size
-        x = (focal * a).cpu().numpy()
-        y = (focal * b).cpu().numpy()
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        focal = self.pixels / pair.size
+        x = (focal * pair.a).cpu().numpy()
+        y = (focal * pair.b).cpu().numpy()
         K = np.diag([focal, focal, 1.0])
         method = getattr(cv2, self.method)
         threshold = self.threshold * self.pixels
@@ -175,18 +182,20 @@ class Usac(Robust):
             return None
         if E is None or E.shape != (3, 3) or not np.isfinite(E).all():
             return None
-        inlier = torch.from_numpy(mask[:, 0] > 0).to(a.device)
+        inlier = torch.from_numpy(mask[:, 0] > 0).to(pair.a.device)
         if inlier.sum() < MINIMUM:
             return None
-        return RelativePoseEstimate(*pose_in_front(torch.from_numpy(E).to(a), a, b, inlier))
+        essential = torch.from_numpy(E).to(pair.a)
+        R, t, ok = pose_in_front(essential, pair.a, pair.b, inlier)
+        return RelativePoseEstimate(R, t, ok)
 
 
 @dataclass(frozen=True)
 class PoseLib(Robust):
     """PoseLib's LO-RANSAC of the 5-point solver, then its refinement on the inliers.
 
-    The refinement has a robust loss. ``threshold`` (largest epipolar error of an inlier) and ``scale`` (of the loss) are fractions of
-    the person's size.
+    The refinement has a robust loss. ``threshold`` (largest epipolar error of an inlier) and
+    ``scale`` (of the loss) are fractions of the person's size.
     """
 
     threshold: float
@@ -200,24 +209,19 @@ class PoseLib(Robust):
         hint = f"Choose from {', '.join(_LOSSES)}."
         check(self.loss in _LOSSES, "loss", f"is {self.loss!r}", hint)
 
-    def pose(
-        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> RelativePoseEstimate | None:
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
         # pixels in units of the person's size
-        camera = {
-            "model": "PINHOLE",
-            "width": 1,
-            "height": 1,
-            "params": [1 / size, 1 / size, 0.0, 0.0],
-        }
+        focal = 1 / pair.size
+        parameters = [focal, focal, 0.0, 0.0]
+        camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": parameters}
         ransac = {
             "max_epipolar_error": self.threshold,
             "max_iterations": self.iterations,
             "seed": self.seed,
         }
         bundle = {"loss_type": self.loss, "loss_scale": self.scale}
-        x = (a / size).cpu().numpy()
-        y = (b / size).cpu().numpy()
+        x = (pair.a / pair.size).cpu().numpy()
+        y = (pair.b / pair.size).cpu().numpy()
         found, info = poselib.estimate_relative_pose(x, y, camera, camera, ransac, bundle)
         t = torch.tensor(found.t)
         determined = torch.isfinite(t).all() and t.any()
