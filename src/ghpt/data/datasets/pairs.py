@@ -103,7 +103,7 @@ class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
         rig = int(of_rig * len(self.rigs))
         return rig, sample, self.pairs[int(of_pair * len(self.pairs))]
 
-    def frames_of(self, rig: int, draw: int) -> list[tuple[int, Int[np.ndarray, " F"]]]:
+    def locate_frames(self, rig: int, draw: int) -> list[tuple[int, Int[np.ndarray, " F"]]]:
         """Return the frames of a draw: recording and positions in it, in order of time.
 
         There are at most M of them.
@@ -165,7 +165,7 @@ class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
         views, joints = self.recordings[0].key_points.shape[1:3]
         seen = _Seen.empty(views, self.settings.frames, joints)
         row = 0
-        for index, positions in self.frames_of(rig, draw):
+        for index, positions in self.locate_frames(rig, draw):
             recording = self.recordings[index]
             rows = slice(row, row + len(positions))
             seen.key_points[:, rows] = recording.key_points[positions].swapaxes(0, 1)

@@ -52,7 +52,7 @@ def evaluate_pairs(predictions: PairPredictions) -> dict[str, Any]:
     pairs = [tuple(views) for views in np.unique(measured.pair, axis=0).tolist()]
     selections = {}
     for name in names:
-        of_pairs = {pair_name(pair): _pair_numbers(measured.of(name, pair)) for pair in pairs}
+        of_pairs = {pair_name(pair): _pair_numbers(measured.select(name, pair)) for pair in pairs}
         means = {
             key: _mean([numbers[key] for numbers in of_pairs.values()])
             for key in (*ERRORS, "coverage")
@@ -112,7 +112,7 @@ def errors_of_pair(
     frames plots these.
     """
     measured = _measure(predictions, list(predictions.names))
-    return {name: measured.of(name, pair)[error].tolist() for name in predictions.names}
+    return {name: measured.select(name, pair)[error].tolist() for name in predictions.names}
 
 
 def camera_after(
@@ -151,7 +151,7 @@ class _Measured:
     pair: Int[np.ndarray, "N 2"]
     draw: Int[np.ndarray, " N"]
 
-    def of(self, name: str, pair: tuple[int, ...]) -> dict[str, Float[np.ndarray, " D"]]:
+    def select(self, name: str, pair: tuple[int, ...]) -> dict[str, Float[np.ndarray, " D"]]:
         """Return the errors under a name on a pair, draw by draw."""
         rows = (self.pair == pair).all(-1)
         return {error: values[rows] for error, values in self.errors[name].items()}
