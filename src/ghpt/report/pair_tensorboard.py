@@ -1,7 +1,6 @@
 """A test run of the camera problem in TensorBoard."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +25,7 @@ _CHUNK = 2048
 def write_pair_events(
     folder: str | Path, predictions: PairPredictions, metrics: Mapping[str, Any]
 ) -> int:
-    """Write a test run's scalars, histograms, figure and hyper-parameters, as ``write_parts`` does."""
+    """Write a test run's scalars, histograms, figure and settings, as ``write_parts`` does."""
     return write_parts(
         folder,
         {
@@ -59,25 +58,25 @@ def _weights(writer: SummaryWriter, predictions: PairPredictions) -> None:
 
 
 def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[str, Any]) -> None:
-    """The draw whose mean E_3D over its pairs is the median: neither a good nor a bad one."""
+    """Draw the rig in the draw whose mean E_3D over its pairs is the median."""
     rows = _typical_draw(predictions)
     chunks = [predictions.read(row, row + 1) for row in rows]
     rig = int(chunks[0].sample.rig[0])
-    estimates = {
-        name: RelativePoseEstimate(
-            *(
-                torch.cat([getattr(c.estimates[name], field.name) for c in chunks])
-                for field in fields(RelativePoseEstimate)
-            )
-        )
-        for name in SHOWN
-        if name in predictions.names
-    }
-    heading = f"{title(metrics)}\nrig of {predictions.tables.rig_name[rig]}, the draw of median E_3D under {SHOWN[0]}"
+    estimates = {}
+    for name in SHOWN:
+        if name in predictions.names:
+            each = [chunk.estimates[name] for chunk in chunks]
+            R = torch.cat([estimate.R for estimate in each])
+            t = torch.cat([estimate.t for estimate in each])
+            estimated = torch.cat([estimate.estimated for estimate in each])
+            estimates[name] = RelativePoseEstimate(R, t, estimated)
+    which = f"rig of {predictions.tables.rig_name[rig]}"
+    heading = f"{title(metrics)}\n{which}, the draw of median E_3D under {SHOWN[0]}"
+    tables = predictions.tables
     figure = rig_figure(
-        predictions.tables.cameras.index(rig),
-        predictions.tables.camera_name[rig].tolist(),
-        predictions.tables.points[rig],
+        tables.cameras.index(rig),
+        tables.camera_name[rig].tolist(),
+        tables.points[rig],
         torch.cat([chunk.sample.pair for chunk in chunks]),
         estimates,
         heading,
@@ -86,7 +85,7 @@ def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[s
 
 
 def _typical_draw(predictions: PairPredictions) -> list[int]:
-    """The rows of a draw that is median in E_3D under the first shown selection."""
+    """Return the rows of a draw that is median in E_3D under the first shown name."""
     errors = []
     draws = []
     for chunk in predictions.chunks(_CHUNK):

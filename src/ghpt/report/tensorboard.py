@@ -1,6 +1,4 @@
-"""A test run in TensorBoard. It shows what metrics.json holds; it can fail without costing the run
-anything.
-"""
+"""A test run in TensorBoard: it shows what metrics.json holds, and costs nothing if it fails."""
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -22,7 +20,7 @@ from ghpt.models.pose.schema import PoseChunk, PosePredictions
 from ghpt.observations import PoseEstimate
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
 from ghpt.report.report import Report
-from ghpt.report.tables import print_table, title, trained_on, write_report
+from ghpt.report.tables import print_table, title, training_data, write_report
 
 SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
@@ -103,40 +101,41 @@ def write_weights(writer: SummaryWriter, weights: Sequence[WeightSummary]) -> No
 def _skeletons(
     writer: SummaryWriter, predictions: PosePredictions, metrics: Mapping[str, Any]
 ) -> None:
-    """The whole frame whose error under ``weight`` is the median: neither a good nor a bad one."""
+    """Write the whole frame whose error under ``weight`` is the median: neither good nor bad."""
     rows = []
     errors = []
-    truth = []
+    points = []
     for start, chunk in _sample(predictions):
         error, whole = _relative_error(chunk)
         rows.append(start + whole.nonzero()[:, 0])
         errors.append(error[whole])
-        truth.append(chunk.sample.as_truth().points[whole][::10])
-    if not len(torch.cat(rows)):
+        points.append(chunk.sample.as_truth().points[whole][::10])
+    candidates = torch.cat(rows)
+    if not len(candidates):
         return
-    row = int(torch.cat(rows)[torch.cat(errors).median(dim=0).indices])
+    row = int(candidates[torch.cat(errors).median(dim=0).indices])
     chunk = predictions.read(row, row + 1)
     poses = {name: _with_nan(chunk.estimates[name]) for name in SHOWN if name in predictions.names}
-    truth_of_row = chunk.sample.as_truth()
     take = predictions.tables.recording_name[int(chunk.sample.recording)]
-    heading = f"{title(metrics)}\n{take}, frame {int(chunk.sample.frame)}: the median of the errors under {SHOWN[0]}"
-    up = up_axis(torch.cat(truth).double().numpy())
-    figure = skeletons(truth_of_row.points[0].double().numpy(), poses, up, heading)
+    frame = f"{take}, frame {int(chunk.sample.frame)}"
+    heading = f"{title(metrics)}\n{frame}: the median of the errors under {SHOWN[0]}"
+    up = up_axis(torch.cat(points).double().numpy())
+    truth = chunk.sample.as_truth().points[0].double().numpy()
+    figure = skeletons(truth, poses, up, heading)
     writer.add_image("skeletons", image(figure), 0, dataformats="HWC")
 
 
 def _pose_prior(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
     for subject in next(iter(metrics["selections"].values()))["pose_prior"]:
-        writer.add_image(
-            f"pose_prior/{subject}", image(pose_prior_bars(metrics, subject)), 0, dataformats="HWC"
-        )
+        figure = pose_prior_bars(metrics, subject)
+        writer.add_image(f"pose_prior/{subject}", image(figure), 0, dataformats="HWC")
 
 
 def write_hyperparameters(
     writer: SummaryWriter, meta: Mapping[str, Any], metrics: Mapping[str, Any], error: str
 ) -> None:
     """The settings of a test run beside each selection's ``error``."""
-    trained, source = trained_on(metrics)
+    trained, source = training_data(metrics)
     values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
     values |= {
         "trained_on": trained,
@@ -156,27 +155,25 @@ def write_hyperparameters(
 
 
 def _sample(predictions: PosePredictions) -> Iterator[tuple[int, PoseChunk]]:
-    """At most ``_SAMPLE`` blocks with their first row, so that memory does not grow with the
-    frames.
-    """
+    """Yield at most ``_SAMPLE`` blocks with their first row: memory does not grow with frames."""
     starts = range(0, len(predictions), _BLOCK)
-    chosen = sorted({round(i) for i in np.linspace(0, len(starts) - 1, min(len(starts), _SAMPLE))})
-    return (
-        (starts[i], predictions.read(starts[i], min(starts[i] + _BLOCK, len(predictions))))
-        for i in chosen
-    )
+    places = np.linspace(0, len(starts) - 1, min(len(starts), _SAMPLE))
+    for place in sorted({round(place) for place in places}):
+        start = starts[place]
+        yield start, predictions.read(start, min(start + _BLOCK, len(predictions)))
 
 
 def _relative_error(chunk: PoseChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
-    """Each frame's error under the first shown selection, mm, and which frames are whole."""
-    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], chunk.sample.as_truth(), "relative")
+    """Return each frame's error under the first shown name, mm, and which frames are whole."""
+    truth = chunk.sample.as_truth()
+    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], truth, "relative")
     return errors.mean(-1), counted.all(-1)
 
 
 def _with_nan(estimate: PoseEstimate) -> Float[np.ndarray, "J 3"]:
-    return (
-        estimate.points[0].double().masked_fill(~estimate.estimated[0, :, None], torch.nan).numpy()
-    )
+    """Return the first pose, NaN where a joint is missing."""
+    missing = ~estimate.estimated[0, :, None]
+    return estimate.points[0].double().masked_fill(missing, torch.nan).numpy()
 
 
 REPORT = Report(print_table, write_report, write_events)
