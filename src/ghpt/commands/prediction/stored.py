@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ghpt.commands.prediction.frames import Detected, Frames, Seen, calibrated
-from ghpt.data.datasets.detections import undistorted
+from ghpt.data.datasets.detections import undistort_key_points
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.skeletons import joints17, recognise
 from ghpt.data.formats.stored_npz import Member, members_of, read_rows, text_table
@@ -172,7 +172,7 @@ def frames_of_stored(
         for view, of in enumerate(at):
             K = ordered.K[view].numpy()
             lens = ordered.distortion[view].numpy()
-            pixels[:, view], valid[:, view] = undistorted(
+            pixels[:, view], valid[:, view] = undistort_key_points(
                 part.key_points[:, of], valid[:, view], K, lens
             )
         return joints17(path, part.joints, pixels, part.confidence[:, at], valid)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ghpt.data.datasets.detections import in_image
+from ghpt.data.datasets.detections import uncrop
 from ghpt.data.formats.validate import check_view_count, read_json, read_npy
 from ghpt.data.people.people import KeyPoints, joints_for
 from ghpt.errors import GhptDataError
@@ -42,7 +42,7 @@ def read_authors(path: Path, skeleton: str | None) -> KeyPoints:
             )
             raise GhptDataError(predictions, "", problem, "Keep the chunks of one rig in a folder.")
         with np.errstate(over="ignore", invalid="ignore"):
-            found, valid = in_image(crop.astype(np.float64), corners)
+            found, valid = uncrop(crop.astype(np.float64), corners)
         pixels.append(found)
         there.append(valid & np.isfinite(found).all(-1))
     valid = np.concatenate(there)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ghpt.data.datasets.detections import undistorted
+from ghpt.data.datasets.detections import undistort_key_points
 from ghpt.data.formats.names import Name, chosen_name
 from ghpt.data.formats.openpose import follow_views
 from ghpt.data.formats.skeletons import joints17
@@ -95,7 +95,7 @@ def undistort_and_match(
     for view in range(len(at)):
         K = ordered.K[view].numpy()
         lens = ordered.distortion[view].numpy()
-        pixels[:, view], valid[:, view] = undistorted(
+        pixels[:, view], valid[:, view] = undistort_key_points(
             points.key_points[:, at[view]], valid[:, view], K, lens
         )
     values = joints17(points.path, points.joints, pixels, points.confidence[:, at], valid)
@@ -175,7 +175,7 @@ def _across(
         of = np.flatnonzero(people.view == view)
         K = cameras.K[place].numpy()
         lens = cameras.distortion[place].numpy()
-        points, there = undistorted(people.key_points[of], people.valid[of], K, lens)
+        points, there = undistort_key_points(people.key_points[of], people.valid[of], K, lens)
         chosen.append(of)
         pixels.append(points)
         valid.append(there)
