@@ -1,10 +1,6 @@
 """A test run of the camera problem in TensorBoard."""
 
-<<<<<<< HEAD
 from collections.abc import Mapping, Sequence
-=======
-from collections.abc import Mapping
->>>>>>> main
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +22,6 @@ SHOWN = ("weight", "rig")
 _CHUNK = 2048
 
 
-<<<<<<< HEAD
 def write_pair_events(folder: str | Path, predictions: PairPredictions, metrics: Metrics) -> int:
     """Write scalars, histograms, the figure and hyper-parameters, as ``write_parts`` does."""
 
@@ -40,23 +35,6 @@ def write_pair_events(folder: str | Path, predictions: PairPredictions, metrics:
         "the hyper-parameters": hyperparameters,
     }
     return write_parts(folder, parts)
-=======
-def write_pair_events(
-    folder: str | Path, predictions: PairPredictions, metrics: Mapping[str, Any]
-) -> int:
-    """Write a test run's scalars, histograms, figure and settings, as ``write_parts`` does."""
-    return write_parts(
-        folder,
-        {
-            "scalars": lambda writer: _scalars(writer, metrics),
-            "the weights": lambda writer: _weights(writer, predictions),
-            "the rig": lambda writer: _rig(writer, predictions, metrics),
-            "the hyper-parameters": lambda writer: write_hyperparameters(
-                writer, predictions.meta, metrics, "E_3D"
-            ),
-        },
-    )
->>>>>>> main
 
 
 def _write_scalars(writer: SummaryWriter, metrics: Metrics) -> None:
@@ -78,7 +56,6 @@ def _write_weights(writer: SummaryWriter, predictions: PairPredictions) -> None:
     write_weights(writer, [chunk.weights for chunk in predictions.chunks(_CHUNK)])
 
 
-<<<<<<< HEAD
 def _write_rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Metrics) -> None:
     """Write the draw whose mean E_3D over its pairs is the median, neither good nor bad."""
     rows = _typical_draw(predictions)
@@ -92,24 +69,6 @@ def _write_rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Met
     heading = (
         f"{title(metrics)}\nrig of {tables.rig_name[rig]}, the draw of median E_3D under {SHOWN[0]}"
     )
-=======
-def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[str, Any]) -> None:
-    """Draw the rig in the draw whose mean E_3D over its pairs is the median."""
-    rows = _typical_draw(predictions)
-    chunks = [predictions.read(row, row + 1) for row in rows]
-    rig = int(chunks[0].sample.rig[0])
-    estimates = {}
-    for name in SHOWN:
-        if name in predictions.names:
-            each = [chunk.estimates[name] for chunk in chunks]
-            R = torch.cat([estimate.R for estimate in each])
-            t = torch.cat([estimate.t for estimate in each])
-            estimated = torch.cat([estimate.estimated for estimate in each])
-            estimates[name] = RelativePoseEstimate(R, t, estimated)
-    which = f"rig of {predictions.tables.rig_name[rig]}"
-    heading = f"{title(metrics)}\n{which}, the draw of median E_3D under {SHOWN[0]}"
-    tables = predictions.tables
->>>>>>> main
     figure = rig_figure(
         tables.cameras.index(rig),
         tables.camera_name[rig].tolist(),
@@ -130,11 +89,7 @@ def _concatenate(estimates: Sequence[RelativePoseEstimate]) -> RelativePoseEstim
 
 
 def _typical_draw(predictions: PairPredictions) -> list[int]:
-<<<<<<< HEAD
     """Return the rows of a draw that is median in E_3D under the first shown selection."""
-=======
-    """Return the rows of a draw that is median in E_3D under the first shown name."""
->>>>>>> main
     errors = []
     draws = []
     for chunk in predictions.chunks(_CHUNK):

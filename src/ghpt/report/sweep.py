@@ -88,11 +88,7 @@ def _draw_method(axes: Axes, name: str, by_frames: Mapping[int, Sequence[float]]
         frames,
         np.minimum(mean, CLIP),
         color=style.colour,
-<<<<<<< HEAD
         linestyle=style.line,
-=======
-        linestyle=style.dashes,
->>>>>>> main
         marker=style.marker,
         markersize=5,
         markeredgecolor="white",
