@@ -1,4 +1,4 @@
-"""The ablations: pools and temperatures on a toy, the cells of each item, and what is said of
+"""The ablations: pools and temperatures on a toy, the tasks of each artefact, and what is said of
 made-up numbers.
 """
 
@@ -14,15 +14,15 @@ from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import load_model
-from ghpt.paper.ablations.tables import ITEMS
-from ghpt.paper.ablations.work import evaluate
-from ghpt.paper.engine.cells import read_json
-from ghpt.paper.engine.item import Results, Section
+from ghpt.paper.ablations.actions import evaluate
+from ghpt.paper.ablations.tables import ARTEFACTS
+from ghpt.paper.engine.artefact import Results, Section
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import read_json
 from toys import DATA, TRAIN
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-BY_LABEL = {item.label: item for item in ITEMS}
+BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}
 SIZES = {
     "stride": {"validation": 512, "test": 512},
     "also_trained_on": ["cmu3"],
@@ -89,42 +89,48 @@ def setup(seed: int = 0, **sizes: Any) -> Setup:
 def section(
     label: str, error: Callable[[int, str, str, int], float], folder: Path, seeds: int = 1
 ) -> Section:
-    """Of cells in which ``weight`` has ``error(seed, cell, split, setting)``, the average 40 and
+    """Of tasks in which ``weight`` has ``error(seed, task, split, setting)``, the average 40 and
     the best 20 mm.
     """
     setups = [setup(seed) for seed in range(seeds)]
-    cells = [BY_LABEL[label].cells(one) for one in setups]
-    for one, by_name in zip(setups, cells, strict=True):
-        for name, cell in by_name.items():
-            own = cell.folder(folder)
+    tasks = [BY_LABEL[label].tasks(one) for one in setups]
+    for one, by_name in zip(setups, tasks, strict=True):
+        for name, task in by_name.items():
+            own = task.folder(folder)
             own.mkdir(parents=True, exist_ok=True)
-            write_json(own / "cell.json", {"seconds": 90.0 + 20 * one.seed})
-            if "sets" in cell.config:
+            write_json(own / "task.json", {"seconds": 90.0 + 20 * one.seed})
+            if "sets" in task.config:
                 result = {
                     split: [
                         {"weight": error(one.seed, name, split, i), "average": 40.0, "best": 20.0}
-                        for i in range(len(cell.config["settings"]))
+                        for i in range(len(task.config["settings"]))
                     ]
-                    for split in cell.config["sets"]
+                    for split in task.config["sets"]
                 }
                 write_json(own / "result.json", result)
-    return BY_LABEL[label].section(Results(setups, cells, folder))
+    return BY_LABEL[label].section(Results(setups, tasks, folder))
 
 
 @pytest.mark.parametrize(("label", "settings"), [("gumbel", 2), ("features", 3), ("selection", 2)])
 def test_each_setting_is_trained_twice_and_the_default_is_the_reports_own_model(
     label: str, settings: int
 ):
-    cells = BY_LABEL[f"ablation-{label}"].cells(setup())
-    assert len({cell.needs["model"].key for cell in cells.values()}) == len(cells) == 2 * settings
+    tasks = BY_LABEL[f"ablation-{label}"].tasks(setup())
+    assert (
+        len({task.dependencies["model"].key for task in tasks.values()})
+        == len(tasks)
+        == 2 * settings
+    )
     defaults = {
-        data: next(cell for name, cell in cells.items() if name.startswith(data))
+        data: next(task for name, task in tasks.items() if name.startswith(data))
         for data in ("h36m", "cmu3")
     }
-    for data, cell in defaults.items():
-        assert cell.needs["model"].key == setup().trained(data).key
+    for data, task in defaults.items():
+        assert task.dependencies["model"].key == setup().trained(data).key
     assert set(defaults["cmu3"].config["sets"]) == {"test"}
-    others = [cell.needs["model"].config for name, cell in cells.items() if "default" not in name]
+    others = [
+        task.dependencies["model"].config for name, task in tasks.items() if "default" not in name
+    ]
     assert all(config["model"] != setup().trained("h36m").config["model"] for config in others)
 
 
@@ -139,17 +145,19 @@ def test_each_setting_is_trained_twice_and_the_default_is_the_reports_own_model(
 def test_each_quantity_is_what_the_models_are_trained_with(
     label: str, keys: tuple[str, str], trained: set[float]
 ):
-    cells = BY_LABEL[f"ablation-{label}"].cells(setup())
+    tasks = BY_LABEL[f"ablation-{label}"].tasks(setup())
     models = [
-        cell.needs["model"].config for name, cell in cells.items() if name not in ("model", "cmu3")
+        task.dependencies["model"].config
+        for name, task in tasks.items()
+        if name not in ("model", "cmu3")
     ]
     assert {config[keys[0]][keys[1]] for config in models} == trained
     assert len(models) == len(trained)
 
 
 def test_a_table_says_what_validation_chooses_and_what_that_is_worth(tmp_path: Path):
-    def error(seed: int, cell: str, split: str, setting: int) -> float:
-        better = ("without" in cell) == (split == "validation")
+    def error(seed: int, task: str, split: str, setting: int) -> float:
+        better = ("without" in task) == (split == "validation")
         return (20.0 if better else 25.0) + seed
 
     found = section("ablation-gumbel", error, tmp_path, seeds=2)
@@ -159,27 +167,27 @@ def test_a_table_says_what_validation_chooses_and_what_that_is_worth(tmp_path: P
     assert "| average of the same pool " in found.body
     assert found.data == "synthetic Human3.6M"
     equal = section(
-        "ablation-gumbel", lambda seed, cell, split, i: 20.0 + 0.1 * ("default" in cell), tmp_path
+        "ablation-gumbel", lambda seed, task, split, i: 20.0 + 0.1 * ("default" in task), tmp_path
     )
     assert "Validation keeps the default." in equal.body
 
 
 def test_a_table_without_another_training_set_has_none(tmp_path: Path):
-    cells = BY_LABEL["ablation-features"].cells(setup(also_trained_on=[]))
-    assert len(cells) == 3
-    assert all(name.startswith("h36m") for name in cells)
+    tasks = BY_LABEL["ablation-features"].tasks(setup(also_trained_on=[]))
+    assert len(tasks) == 3
+    assert all(name.startswith("h36m") for name in tasks)
 
 
 def test_five_hundred_samples_are_enough_only_where_no_other_number_is_better(tmp_path: Path):
-    def falls(seed: int, cell: str, split: str, setting: int) -> float:
-        return {"50": 35.0, "500": 30.0, "5000": 25.0}[cell]
+    def falls(seed: int, task: str, split: str, setting: int) -> float:
+        return {"50": 35.0, "500": 30.0, "5000": 25.0}[task]
 
     enough, minutes = section("ablation-samples", falls, tmp_path).claims
     assert not enough.holds
     assert enough.by == "30.0 mm of 500; the best of 50, 500, 5000 is 5000 with 25.0 mm (-16.7 %)"
     assert minutes.holds
     assert "90 s" in minutes.by
-    enough, _ = section("ablation-samples", lambda seed, cell, split, i: 30.0, tmp_path).claims
+    enough, _ = section("ablation-samples", lambda seed, task, split, i: 30.0, tmp_path).claims
     assert enough.holds
 
 
@@ -194,7 +202,7 @@ def test_five_hundred_samples_are_enough_only_where_no_other_number_is_better(tm
 def test_a_figure_has_validation_and_test_on_logarithmic_axes(
     label: str, places: list[float], tmp_path: Path
 ):
-    found = section(f"ablation-{label}", lambda seed, cell, split, i: 30.0 + i, tmp_path)
+    found = section(f"ablation-{label}", lambda seed, task, split, i: 30.0 + i, tmp_path)
     ((name, figure),) = found.figures.items()
     assert f"]({name}.svg)" in found.body
     assert "synthetic Human3.6M" in figure.get_suptitle()

@@ -1,5 +1,5 @@
-"""The camera problem's tables and figure: cells on a small copy of the real layout, text on made-up
-cells.
+"""The camera problem's tables and figure: tasks on a small copy of the real layout, text on made-up
+results.
 """
 
 from pathlib import Path
@@ -10,10 +10,10 @@ import pytest
 
 import real_layout as layout
 from ghpt.files import write_json
-from ghpt.paper.camera.tables import ITEMS
-from ghpt.paper.engine.cells import Cell, perform, read_json, with_needs
-from ghpt.paper.engine.item import Item, Results, Section
+from ghpt.paper.camera.tables import ARTEFACTS
+from ghpt.paper.engine.artefact import Artefact, Results, Section
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task, perform, read_json, with_dependencies
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SIZES = {
@@ -28,7 +28,7 @@ SMALL = (
 )
 OF_CAMERAS = ("model.problem.draws=1", "model.problem.points=20")
 NONE = {"train": (), "test": ()}
-BY_LABEL = {item.label: item for item in ITEMS}
+BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}
 PAIRS = ("1-2", "1-3", "1-4", "2-3", "2-4", "3-4")
 
 
@@ -42,45 +42,45 @@ def sized(real: tuple[dict[str, str | None], Path], *overrides: str, **sizes: An
 
 @pytest.fixture(scope="module")
 def real(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, str | None], Path]:
-    """Human3.6M in the layout of the real one, with perfect detections; and a folder for cells."""
+    """Human3.6M in the layout of the real one, with perfect detections; and a folder for tasks."""
     folder = tmp_path_factory.mktemp("real")
     rng = np.random.default_rng(0)
     takes = [
         (subject, "Walking-1", layout.person(rng, 40, (0, 0, 1000))) for subject in layout.SUBJECTS
     ]
     layout.write_human36m_layout(folder / "human36m", takes, chunk=40)
-    return {"human36m": str(folder / "human36m"), "panoptic": None}, folder / "cells"
+    return {"human36m": str(folder / "human36m"), "panoptic": None}, folder / "tasks"
 
 
-def made(cells: dict[str, Cell], folder: Path) -> None:
-    for cell in with_needs(cells.values()).values():
-        perform(cell, folder)
+def made(tasks: dict[str, Task], folder: Path) -> None:
+    for task in with_dependencies(tasks.values()).values():
+        perform(task, folder)
 
 
 def made_up(
-    setups: list[Setup], item: Item, folder: Path, contents: Any, file: str = "result.json"
+    setups: list[Setup], artefact: Artefact, folder: Path, contents: Any, file: str = "result.json"
 ) -> Section:
-    """The item's section of cells that hold ``contents(seed, name)``."""
-    cells = [item.cells(setup) for setup in setups]
-    for setup, by_name in zip(setups, cells, strict=True):
-        for name, cell in by_name.items():
-            cell.folder(folder).mkdir(parents=True, exist_ok=True)
-            write_json(cell.folder(folder) / file, contents(setup.seed, name))
-    return item.section(Results(setups, cells, folder))
+    """The artefact's section of tasks that hold ``contents(seed, name)``."""
+    tasks = [artefact.tasks(setup) for setup in setups]
+    for setup, by_name in zip(setups, tasks, strict=True):
+        for name, task in by_name.items():
+            task.folder(folder).mkdir(parents=True, exist_ok=True)
+            write_json(task.folder(folder) / file, contents(setup.seed, name))
+    return artefact.section(Results(setups, tasks, folder))
 
 
 def test_sweep_of_perfect_detections_has_no_error(real):
     setup, folder = sized(real, *OF_CAMERAS), real[1]
-    item = BY_LABEL["comparison-to-8-point"]
-    cells = item.cells(setup)
-    made(cells, folder)
-    result = read_json(cells["12"].folder(folder) / "result.json")
+    artefact = BY_LABEL["comparison-to-8-point"]
+    tasks = artefact.tasks(setup)
+    made(tasks, folder)
+    result = read_json(tasks["12"].folder(folder) / "result.json")
     assert set(result) == set(PAIRS)
     assert all(
         len(values) == 2 for errors in result.values() for values in errors.values()
     )  # a draw of each rig
     assert max(result["2-3"]["eight_point"]) < 3
-    section = item.section(Results([setup], [cells], folder))
+    section = artefact.section(Results([setup], [tasks], folder))
     assert "Human3.6M from" in section.data
     assert (
         "synthetic"
@@ -93,23 +93,23 @@ def test_sweep_of_perfect_detections_has_no_error(real):
 def test_sweep_of_one_pair_tests_no_other(real):
     folder = real[1]
     alone = sized(real, *OF_CAMERAS, frames_sweep={"frames": [12], "draws": 1, "all_pairs": False})
-    cells = BY_LABEL["comparison-to-8-point"].cells(alone)
-    made(cells, folder)
-    assert set(read_json(cells["12"].folder(folder) / "result.json")) == {"2-3"}
-    section = BY_LABEL["comparison-to-8-point"].section(Results([alone], [cells], folder))
+    tasks = BY_LABEL["comparison-to-8-point"].tasks(alone)
+    made(tasks, folder)
+    assert set(read_json(tasks["12"].folder(folder) / "result.json")) == {"2-3"}
+    section = BY_LABEL["comparison-to-8-point"].section(Results([alone], [tasks], folder))
     assert "All pairs" not in section.body
 
 
 def test_tables_of_perfect_detections(real):
     setup, folder = sized(real, *OF_CAMERAS), real[1]
-    cells = BY_LABEL["fundamental-evaluation"].cells(setup)
-    made(cells, folder)
-    results = Results([setup], [cells], folder)
+    tasks = BY_LABEL["fundamental-evaluation"].tasks(setup)
+    made(tasks, folder)
+    results = Results([setup], [tasks], folder)
     evaluation, dissection = (
         BY_LABEL[f"fundamental-{name}"].section(results) for name in ("evaluation", "dissection")
     )
-    assert (len(evaluation.compared), len(dissection.compared)) == (24, 24)
-    first = evaluation.compared[0]
+    assert (len(evaluation.comparisons), len(dissection.comparisons)) == (24, 24)
+    first = evaluation.comparisons[0]
     assert (first.what, first.paper) == ("1-3 E_R", pytest.approx(17.0))
     for row in ("1-3 paper", "1-3 ours", "1-3 difference", "PoseLib", "rig (all views)"):
         assert f"| {row} " in evaluation.body
@@ -117,26 +117,26 @@ def test_tables_of_perfect_detections(real):
     narrow, wide = (_shape(evaluation.body, pair) for pair in ("1-3", "1-4"))
     assert narrow == pytest.approx((3.7, 43), rel=0.1)  # m, degrees
     assert wide == pytest.approx((9.5, 170), rel=0.1)
-    assert "estimated t" in dissection.compared[-1].what
+    assert "estimated t" in dissection.comparisons[-1].what
 
 
 def _shape(body: str, pair: str) -> tuple[float, ...]:
     """Baseline and angle in the table."""
     row = next(line for line in body.splitlines() if line.startswith(f"| {pair} ours"))
-    return tuple(float(cell) for cell in row.split("|")[-3:-1])
+    return tuple(float(task) for task in row.split("|")[-3:-1])
 
 
 def test_estimated_extrinsics_of_perfect_detections_cost_nothing(real):
     setup, folder = sized(real), real[1]
-    cells = BY_LABEL["unknown-extrinsics-evaluation"].cells(setup)
-    cells = {name: cells[name] for name in ("h36m", "h36m poselib", "h36m rig")}
-    made(cells, folder)
-    known = read_json(cells["h36m"].folder(folder) / "result.json")["known"]
+    tasks = BY_LABEL["unknown-extrinsics-evaluation"].tasks(setup)
+    tasks = {name: tasks[name] for name in ("h36m", "h36m poselib", "h36m rig")}
+    made(tasks, folder)
+    known = read_json(tasks["h36m"].folder(folder) / "result.json")["known"]
     for source in ("poselib", "rig"):
-        estimated = read_json(cells[f"h36m {source}"].folder(folder) / "result.json")
+        estimated = read_json(tasks[f"h36m {source}"].folder(folder) / "result.json")
         assert set(estimated) == {"both"}
         assert estimated["both"] == pytest.approx(known, abs=1)
-    rigs = read_json(cells["h36m rig"].needs["extrinsics"].folder(folder) / "result.json")
+    rigs = read_json(tasks["h36m rig"].dependencies["extrinsics"].folder(folder) / "result.json")
     assert sorted(index for rig in rigs for index in rig["recordings"]) == [0, 1]
     assert np.shape(rigs[0]["draws"][0][0]) == (4, 3, 3)
 
@@ -225,13 +225,13 @@ def test_claims_of_the_tables(tmp_path, monkeypatch, e3d, alone, evaluated, diss
     ]
     assert [claim.holds for claim in sections[0].claims] == evaluated
     assert [claim.holds for claim in sections[1].claims] == dissected
-    assert [c.what for c in sections[0].compared if c.ours is None] == (
+    assert [c.what for c in sections[0].comparisons if c.ours is None] == (
         [] if e3d[0] else ["1-2 E_2D", "1-2 E_3D"]
     )
 
 
 def poses(known: float, R: float, t: float, both: float) -> dict[str, dict[str, float]]:
-    """What a model's cells hold."""
+    """What a model's tasks hold."""
     numbers = {"known": known, "R": R, "t": t, "both": both}
     return {part: {"relative": x, "absolute": 2 * x} for part, x in numbers.items()}
 
@@ -244,15 +244,15 @@ def poses(known: float, R: float, t: float, both: float) -> dict[str, dict[str, 
     ],
 )
 def test_claims_on_unknown_extrinsics(tmp_path, base, inter, held):
-    item = BY_LABEL["unknown-extrinsics-evaluation"]
+    artefact = BY_LABEL["unknown-extrinsics-evaluation"]
     section = made_up(
         [synthetic(0), synthetic(1)],
-        item,
+        artefact,
         tmp_path,
         lambda _, name: base if "h36m" in name else inter,
     )
     assert [claim.holds for claim in section.claims] == held
-    assert len(section.compared) == 8
-    assert section.compared[3].ours.values == (base["both"]["relative"],) * 2
+    assert len(section.comparisons) == 8
+    assert section.comparisons[3].ours.values == (base["both"]["relative"],) * 2
     share = 100 * (base["both"]["relative"] / 20 - 1)
     assert f" {base['both']['relative']:.1f} ± 0.0 (+{share:.1f} %) " in section.body

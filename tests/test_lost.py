@@ -29,7 +29,7 @@ from ghpt.errors import GhptConfigError
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
 from ghpt.paper.engine import pool
-from toy_cells import cell
+from toy_tasks import task
 
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="kills processes with SIGKILL")
@@ -138,7 +138,7 @@ def test_other_errors_keep_their_trace(training, monkeypatch):
 def test_a_killed_process_of_a_pool_is_named_with_what_it_made(tmp_path, monkeypatch):
     @contextmanager
     def executor(jobs):
-        yield lambda cell, cells: broken()
+        yield lambda task, tasks: broken()
 
     def broken():
         future = Future()
@@ -146,9 +146,9 @@ def test_a_killed_process_of_a_pool_is_named_with_what_it_made(tmp_path, monkeyp
         return future
 
     monkeypatch.setattr(pool, "_executor", executor)
-    cells = [cell(tmp_path / "diary", number) for number in (1, 2)]
+    tasks = [task(tmp_path / "diary", number) for number in (1, 2)]
     with pytest.raises(GhptConfigError, match=r"^jobs: .* add-1, add-2; .* Give fewer") as caught:
-        pool.perform_all(cells, tmp_path / "cells", 2, show=False)
+        pool.perform_all(tasks, tmp_path / "tasks", 2, show=False)
     assert isinstance(caught.value.__cause__, BrokenProcessPool)
 
 

@@ -21,9 +21,9 @@ from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.models.checkpoint import FIELD, load_model, read_checkpoint
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.registry import PARTS, build_registered, packages_to_trust
-from ghpt.paper.ablations.tables import ITEMS
-from ghpt.paper.engine.cells import with_needs
+from ghpt.paper.ablations.tables import ARTEFACTS
 from ghpt.paper.engine.setup import Setup, compose
+from ghpt.paper.engine.tasks import with_dependencies
 from signing import save_signed
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -123,11 +123,13 @@ def of_the_ablations() -> dict[str, dict[str, Any]]:
         {"ablation": ABLATED},
         0,
     )
-    cells = with_needs(itertools.chain.from_iterable(item.cells(setup).values() for item in ITEMS))
+    tasks = with_dependencies(
+        itertools.chain.from_iterable(item.tasks(setup).values() for item in ARTEFACTS)
+    )
     return {
-        cell.name: cell.config["model"]
-        for cell in cells.values()
-        if cell.work.endswith(".train_model")
+        task.name: task.config["model"]
+        for task in tasks.values()
+        if task.work.endswith(".train_model")
     }
 
 

@@ -9,7 +9,7 @@ import pytest
 from markdown_it import MarkdownIt
 from matplotlib.figure import Figure
 
-from ghpt.paper.engine.item import Claim, Compared, Item, Section, Spread
+from ghpt.paper.engine.artefact import Artefact, Claim, Comparison, Section, Spread
 from ghpt.paper.engine.page import Entry, Page, write_page
 from ghpt.report.escape import code
 
@@ -22,8 +22,8 @@ def figure():
 
 @pytest.fixture
 def page():
-    good = Compared("weight", 29.1, Spread((26.0, 27.0)))
-    bad = Compared("most <b>", 20.0, Spread((26.0, 27.0)))
+    good = Comparison("weight", 29.1, Spread((26.0, 27.0)))
+    bad = Comparison("most <b>", 20.0, Spread((26.0, 27.0)))
     claims = [
         Claim("most < least", "4.2", True, "1 < 2"),
         Claim("a & b", "4.3", False, "by 3 mm"),
@@ -31,7 +31,7 @@ def page():
     ]
     entries = [
         Entry(
-            Item("first", "table", "A table", dict, dict),
+            Artefact("first", "table", "A table", dict, dict),
             Section(
                 "synthetic Human3.6M",
                 "A table of *x*:\n\n| a | b |\n|---|---|\n| 1 | 2 |",
@@ -43,7 +43,7 @@ def page():
             ["python train.py data=h36m"],
         ),
         Entry(
-            Item("second", "figure", "A figure", dict, dict),
+            Artefact("second", "figure", "A figure", dict, dict),
             Section("Human3.6M from /data", "Look:\n\n![curve](curve.svg)", {"curve": figure()}),
             [],
         ),
@@ -101,7 +101,7 @@ def test_every_entry_says_its_data_its_claims_and_its_command(page, tmp_path):
 
 def test_a_table_that_the_paper_lacks_has_no_label_of_its(page):
     entry = page.entries[0]
-    own = Entry(replace(entry.item, of_paper=False), entry.section, [])
+    own = Entry(replace(entry.artefact, of_paper=False), entry.section, [])
     assert (
         own.heading == entry.heading.removeprefix("tab:") == "first: A table · synthetic Human3.6M"
     )
@@ -111,7 +111,7 @@ def test_explanations_of_embedded_numbers_are_not_given_for_real_ones(page, tmp_
     entry = page.entries[0]
     real = Section("Human3.6M from /data", *list(vars(entry.section).values())[1:])
     assert "Because of this." in entry.text()
-    assert "Because of this." not in Entry(entry.item, real, entry.commands).text()
+    assert "Because of this." not in Entry(entry.artefact, real, entry.commands).text()
 
 
 def test_figures_are_vectors_and_the_same_bytes_twice(page, tmp_path):
@@ -143,11 +143,11 @@ def test_numbers_and_claims_for_programs(page, tmp_path):
 
 def test_a_comparison_without_a_number_is_shown_as_a_dash(page, tmp_path):
     """Whether the paper's or ours is missing: beside others, and alone."""
-    known = page.entries[0].section.compared
-    missing = [Compared("theirs", None, Spread((1.0,))), Compared("ours", 2.0, None)]
+    known = page.entries[0].section.comparisons
+    missing = [Comparison("theirs", None, Spread((1.0,))), Comparison("ours", 2.0, None)]
     lines = []
     for compared in ([*known, *missing], missing):
-        entry = Entry(page.entries[0].item, Section("x", "y", {}, compared), [])
+        entry = Entry(page.entries[0].artefact, Section("x", "y", {}, compared), [])
         changed = replace(page, entries=[entry, page.entries[1]])
         write_page(changed, tmp_path)
         text = (tmp_path / "report.md").read_text()
@@ -162,7 +162,7 @@ def test_a_comparison_without_a_number_is_shown_as_a_dash(page, tmp_path):
 def test_a_folder_s_name_is_shown_as_it_is(page, tmp_path):
     name = "/d/a|b<c>[red]`x`"
     section = replace(page.entries[0].section, data=f"Human3.6M from {name}")
-    entry = Entry(page.entries[0].item, section, [f"python train.py data.root='{name}\n```'"])
+    entry = Entry(page.entries[0].artefact, section, [f"python train.py data.root='{name}\n```'"])
     about = {"data": name, "command": code(f"a `b` {name}")}
     write_page(replace(page, entries=[entry, page.entries[1]], about=about), tmp_path)
     markdown = MarkdownIt("gfm-like", {"linkify": False, "html": False}).render(

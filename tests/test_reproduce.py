@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ghpt.commands import reproduce
-from ghpt.commands.reproduce import ITEMS, chosen, spread
+from ghpt.commands.reproduce import ARTEFACTS, chosen, spread
 from ghpt.errors import GhptConfigError
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -39,7 +39,7 @@ def command(typed, tmp_path):
     def call(*words):
         flags = [word for word in words if word == "-m"]  # Hydra wants them first
         settings = [*SMALL, *(word for word in words if word not in flags)]
-        folders = [f"output={tmp_path / 'report'}", f"cells={tmp_path / 'cells'}"]
+        folders = [f"output={tmp_path / 'report'}", f"tasks={tmp_path / 'tasks'}"]
         return typed(CONF, reproduce.command(CONF), [*spread([*flags, *settings]), *folders])
 
     return call
@@ -61,11 +61,11 @@ def test_one_table_then_nothing_to_do_then_another_seed(command, tmp_path):
         in text
     )
     assert (
-        "for 5 cells that were not there before" in text
+        "for 5 tasks that were not there before" in text
     )  # three splits prepared, a training, a test
     first = numbers(tmp_path / "report")
     assert command("only=[tab:iskakov-comparison]")[0] == 0
-    assert "for 0 cells" in (tmp_path / "report" / "report.md").read_text()
+    assert "for 0 tasks" in (tmp_path / "report" / "report.md").read_text()
     assert numbers(tmp_path / "report") == first
 
     status, printed, said = command("only=[iskakov-comparison]", "-m", "seeds=2")
@@ -78,14 +78,14 @@ def test_one_table_then_nothing_to_do_then_another_seed(command, tmp_path):
     assert both[0]["ours"][0] != both[0]["ours"][1]
     text = (tmp_path / "report" / "report.md").read_text()
     assert "seeds: 2 (0, 1)" in text
-    assert "for 0 cells" in text  # the jobs have made them
+    assert "for 0 tasks" in text  # the jobs have made them
     assert "±" in text
 
 
 def test_hyperparameters_need_no_cell(command, tmp_path):
     assert command("only=[hyperparameters]")[0] == 0
     text = (tmp_path / "report" / "report.md").read_text()
-    assert "for 0 cells" in text
+    assert "for 0 tasks" in text
     assert "| hypotheses" in text
 
 
@@ -119,16 +119,18 @@ def test_what_cannot_be_done_is_said_in_one_line(command, tmp_path, words, said)
 
 def test_every_table_and_figure_of_the_paper_is_an_item():
     assert {
-        label for label, item in ITEMS.items() if item.kind in ("table", "figure") and item.of_paper
+        label
+        for label, artefact in ARTEFACTS.items()
+        if artefact.kind in ("table", "figure") and artefact.of_paper
     } == set(PAPER)
-    assert sum(item.kind == "ablation" for item in ITEMS.values()) >= 5
-    assert sum(item.kind == "robustness" for item in ITEMS.values()) >= 5
-    assert [item.label for item in chosen(["fig:pose-prior", "tab:sota-comparison"])] == [
+    assert sum(artefact.kind == "ablation" for artefact in ARTEFACTS.values()) >= 5
+    assert sum(artefact.kind == "robustness" for artefact in ARTEFACTS.values()) >= 5
+    assert [artefact.label for artefact in chosen(["fig:pose-prior", "tab:sota-comparison"])] == [
         "sota-comparison",
         "pose-prior",
     ]
     assert chosen("pose-prior") == chosen(["pose-prior"])
-    assert {item.kind for item in chosen(["ablation", "figure"])} == {"ablation", "figure"}
+    assert {artefact.kind for artefact in chosen(["ablation", "figure"])} == {"ablation", "figure"}
     with pytest.raises(GhptConfigError, match="there is no 'nothing'"):
         chosen(["nothing"])
 

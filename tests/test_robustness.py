@@ -11,15 +11,15 @@ import pytest
 
 from ghpt.commands.train import train
 from ghpt.files import write_json
-from ghpt.paper.engine.cells import read_json
-from ghpt.paper.engine.item import Results, Section
+from ghpt.paper.engine.artefact import Results, Section
 from ghpt.paper.engine.setup import Setup
-from ghpt.paper.robustness.curves import ITEMS
-from ghpt.paper.robustness.work import curve
+from ghpt.paper.engine.tasks import read_json
+from ghpt.paper.robustness.actions import curve
+from ghpt.paper.robustness.curves import ARTEFACTS
 from toys import DATA, TRAIN
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-BY_LABEL = {item.label: item for item in ITEMS}
+BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}
 SIZES = {
     "trained_on": "cmu2",
     "stride": {"h36m": 512, "panoptic": 512},
@@ -140,26 +140,26 @@ def setup(seed: int = 0) -> Setup:
 def section(
     label: str, errors: Callable[[int, str, int], Mapping[str, float]], folder: Path, seeds: int = 1
 ) -> Section:
-    """Of cells in which an estimator has ``errors(seed, cell, level)[name]``; the levels of a cell
+    """Of tasks in which an estimator has ``errors(seed, task, level)[name]``; the levels of a task
     are counted.
     """
     setups = [setup(seed) for seed in range(seeds)]
-    cells = [BY_LABEL[label].cells(one) for one in setups]
-    for one, by_name in zip(setups, cells, strict=True):
-        for name, cell in by_name.items():
+    tasks = [BY_LABEL[label].tasks(one) for one in setups]
+    for one, by_name in zip(setups, tasks, strict=True):
+        for name, task in by_name.items():
             levels = [
                 {
                     n: {"relative": e, "absolute": e, "coverage": {"relative": 0.9 if i else 1.0}}
                     for n, e in errors(one.seed, name, i).items()
                 }
-                for i in range(len(cell.config["perturbations"]))
+                for i in range(len(task.config["perturbations"]))
             ]
-            cell.folder(folder).mkdir(parents=True, exist_ok=True)
-            write_json(cell.folder(folder) / "result.json", {"frames": 5, "levels": levels})
-    return BY_LABEL[label].section(Results(setups, cells, folder))
+            task.folder(folder).mkdir(parents=True, exist_ok=True)
+            write_json(task.folder(folder) / "result.json", {"frames": 5, "levels": levels})
+    return BY_LABEL[label].section(Results(setups, tasks, folder))
 
 
-def equal(seed: int, cell: str, level: int) -> dict[str, float]:
+def equal(seed: int, task: str, level: int) -> dict[str, float]:
     return {
         "weight": 30.0,
         "average": 32.0,
@@ -172,7 +172,7 @@ def equal(seed: int, cell: str, level: int) -> dict[str, float]:
 
 
 def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
-    def errors(seed: int, cell: str, level: int) -> dict[str, float]:
+    def errors(seed: int, task: str, level: int) -> dict[str, float]:
         clean = {
             "weight": 20.0 + seed,
             "average": 40.0,
@@ -184,7 +184,7 @@ def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
         }
         return (
             clean
-            if cell == "clean"
+            if task == "clean"
             else {n: 2 * e if n == "lo_ransac" else 5 * e for n, e in clean.items()}
         )
 
@@ -244,18 +244,18 @@ def test_every_figure_has_every_estimator_and_says_which_data(label: str, tmp_pa
 
 
 def test_what_is_unperturbed_is_measured_once(tmp_path: Path):
-    cells = {label: item.cells(setup()) for label, item in BY_LABEL.items()}
-    clean = {by_name["clean"].key for by_name in cells.values() if "clean" in by_name}
+    tasks = {label: artefact.tasks(setup()) for label, artefact in BY_LABEL.items()}
+    clean = {by_name["clean"].key for by_name in tasks.values() if "clean" in by_name}
     assert len(clean) == 1
-    assert "clean" not in cells["robustness-views"]
-    for by_name in cells.values():
-        models = {cell.needs["model"].key for cell in by_name.values()}
+    assert "clean" not in tasks["robustness-views"]
+    for by_name in tasks.values():
+        models = {task.dependencies["model"].key for task in by_name.values()}
         assert models == {setup().trained("cmu2").key}
 
 
 def test_an_estimator_without_a_number_has_a_dash(tmp_path: Path):
-    def errors(seed: int, cell: str, level: int) -> dict[str, Any]:
-        return equal(seed, cell, level) | ({"lo_ransac": None} if cell == "noise" else {})
+    def errors(seed: int, task: str, level: int) -> dict[str, Any]:
+        return equal(seed, task, level) | ({"lo_ransac": None} if task == "noise" else {})
 
     found = section("robustness-noise", errors, tmp_path)
     row = next(line for line in found.body.splitlines() if line.startswith("| 1 "))

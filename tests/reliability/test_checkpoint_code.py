@@ -194,7 +194,7 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.commands.train.make_trainer": {"settings": {"logger": False}},
         "ghpt.commands.train.train": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
         "ghpt.commands.test.test": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
-        "ghpt.paper.engine.cells.read_json": {"path": {"_target_": "ghpt.files.Path"}},
+        "ghpt.paper.engine.tasks.read_json": {"path": {"_target_": "ghpt.files.Path"}},
         "ghpt.paper.engine.setup.compose": {
             "conf": {"_target_": "ghpt.files.Path"},
             "name": "x",

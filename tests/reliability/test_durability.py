@@ -22,7 +22,7 @@ from ghpt.files import atomic_write
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO
 from ghpt.models.pose.evaluation import write_metrics
 from ghpt.models.rows import RowWriter
-from ghpt.paper.engine.cells import Cell, perform
+from ghpt.paper.engine.tasks import Task, perform
 from ghpt.skeleton import JOINTS
 from reconstructions import about, in_parts, random_reconstruction, rig
 from toys import recording
@@ -150,7 +150,7 @@ def save_store(folder: Path) -> None:
 
 def save_cell(folder: Path) -> None:
     diary = folder.parent / "diary"
-    perform(Cell("add", "toy_cells.add", {"number": 1, "diary": str(diary)}), folder)
+    perform(Task("add", "toy_tasks.add", {"number": 1, "diary": str(diary)}), folder)
 
 
 def save_poses(name: str) -> Any:
@@ -169,7 +169,7 @@ SAVERS = {
     "a rig": save_rig,
     "key points": save_key_points,
     "prepared recordings": save_store,
-    "a cell": save_cell,
+    "a task": save_cell,
     **{name: save_poses(name) for name in ("npz", "csv", "parquet", "trc", "c3d", "html")},
 }
 

@@ -22,7 +22,7 @@ from ghpt.models.rows import RowWriter
 from ghpt.paper.engine.pool import perform_all
 from predicting import frames_of
 from reconstructions import random_reconstruction
-from toy_cells import cell
+from toy_tasks import task
 
 resource = pytest.importorskip("resource", reason="limits the size of files")
 ROOT = Path(__file__).resolve().parents[2]
@@ -130,11 +130,11 @@ def test_a_command_names_the_file_and_keeps_what_was_there(request, tmp_path, na
 def test_a_cell_names_its_file(tmp_path):
     diary = tmp_path / "diary"
     diary.touch()
-    wanted = [cell(diary, 1, long="x" * 4_000)]
+    wanted = [task(diary, 1, long="x" * 4_000)]
     with files_of_at_most(1_000), pytest.raises(OSError, match="File too large: ") as caught:
-        perform_all(wanted, tmp_path / "cells", 1, show=False)
-    assert str(tmp_path / "cells") in str(caught.value)
-    assert list((tmp_path / "cells").iterdir()) == []
+        perform_all(wanted, tmp_path / "tasks", 1, show=False)
+    assert str(tmp_path / "tasks") in str(caught.value)
+    assert list((tmp_path / "tasks").iterdir()) == []
 
 
 def test_prepared_recordings_name_their_folder(train_command, tmp_path):

@@ -1,4 +1,4 @@
-"""Every table and figure of the paper again: the cells that are missing, then the report from all
+"""Every table and figure of the paper again: the tasks that are missing, then the report from all
 of them.
 """
 
@@ -22,11 +22,11 @@ from ghpt.config import check_type, suggest
 from ghpt.errors import GhptConfigError, check
 from ghpt.paper.ablations import tables as ablations
 from ghpt.paper.camera import tables as camera_tables
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Item, Results
+from ghpt.paper.engine.artefact import Artefact, Results
 from ghpt.paper.engine.page import Entry, Page, write_page
 from ghpt.paper.engine.pool import perform_all
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
 from ghpt.paper.pose import figures as pose_figures
 from ghpt.paper.robustness import curves as robustness
@@ -44,8 +44,10 @@ _PARTS = (
     ablations,
     robustness,
 )
-ITEMS: dict[str, Item] = {item.label: item for part in _PARTS for item in part.ITEMS}
-"""Every item by its label, in the report's order."""
+ARTEFACTS: dict[str, Artefact] = {
+    artefact.label: artefact for part in _PARTS for artefact in part.ARTEFACTS
+}
+"""Every artefact by its label, in the report's order."""
 MOST_JOBS = 8
 _log = logging.getLogger(__name__)
 
@@ -75,7 +77,7 @@ class Settings(TypedDict):
     overrides: Overrides
     data: Data
     sizes: dict[str, Any]
-    cells: str
+    tasks: str
     progress_bar: bool
 
 
@@ -87,11 +89,11 @@ def files(config: dict[str, Any]) -> Files:
 
 
 def reproduce(config: dict[str, Any], output: Path, conf: Path) -> dict[str, Any]:
-    """Compute what is missing of the items that are asked for, and write their report into
+    """Compute what is missing of the artefacts that are asked for, and write their report into
     ``output``.
 
     ``conf`` is the folder of train.yaml and test.yaml. Returns what the report says of itself.
-    Raises GhptConfigError for a label that there is not, and whatever a cell raises, with its name;
+    Raises GhptConfigError for a label that there is not, and whatever a task raises, with its name;
     what was finished by then is kept.
     """
     check_type(config, Settings, "")
@@ -106,8 +108,8 @@ def reproduce(config: dict[str, Any], output: Path, conf: Path) -> dict[str, Any
 
 
 def gather(jobs: Sequence[Job[dict[str, Any], dict[str, Any]]], conf: Path) -> None:
-    """After a sweep over seeds or items: one report of them all in the sweep's folder, from the
-    cells that they kept.
+    """After a sweep over seeds or artefacts: one report of them all in the sweep's folder, from the
+    tasks that they kept.
 
     Where the jobs differ in anything else there is nothing to gather, and each has its own report.
     """
@@ -119,7 +121,7 @@ def gather(jobs: Sequence[Job[dict[str, Any], dict[str, Any]]], conf: Path) -> N
     only = (
         None
         if everything
-        else [item.label for config in configs for item in chosen(config["only"])]
+        else [artefact.label for config in configs for artefact in chosen(config["only"])]
     )
     with_all = {"only": only, "seed": seeds[0], "seeds": len(seeds)}
     _reproduce(configs[0] | with_all, seeds, Path(configs[0]["output"]), conf)
@@ -153,16 +155,16 @@ def _reproduce(
     config: dict[str, Any], seeds: Sequence[int], output: Path, conf: Path
 ) -> dict[str, Any]:
     start = time.perf_counter()
-    items = chosen(config["only"])
+    artefacts = chosen(config["only"])
     setups = [
         Setup(conf, _roots(config["data"]), config["overrides"], config["sizes"], seed)
         for seed in seeds
     ]
-    cells = {item.label: [item.cells(setup) for setup in setups] for item in items}
+    tasks = {artefact.label: [artefact.tasks(setup) for setup in setups] for artefact in artefacts}
     wanted = [
-        cell for of_item in cells.values() for of_seed in of_item for cell in of_seed.values()
+        task for of_item in tasks.values() for of_seed in of_item for task in of_seed.values()
     ]
-    folder = Path(config["cells"])
+    folder = Path(config["tasks"])
     jobs = config["jobs"] or min(processors(), MOST_JOBS)
     try:
         done = perform_all(wanted, folder, jobs, config["progress_bar"])
@@ -173,11 +175,11 @@ def _reproduce(
         raise
     entries = [
         Entry(
-            item,
-            item.section(Results(setups, cells[item.label], folder)),
-            _commands(cells[item.label][0]),
+            artefact,
+            artefact.section(Results(setups, tasks[artefact.label], folder)),
+            _commands(tasks[artefact.label][0]),
         )
-        for item in items
+        for artefact in artefacts
     ]
     page = Page(
         entries, _about(config, setups, done, start), yaml.safe_dump(config, sort_keys=False)
@@ -185,7 +187,7 @@ def _reproduce(
     write_page(page, output)
     held = sum(claim.holds for claim in page.claims)
     misses = sum(len(entry.misses) for entry in entries)
-    numbers = sum(len(entry.section.compared) for entry in entries)
+    numbers = sum(len(entry.section.comparisons) for entry in entries)
     _log.info(
         "%d of %d claims hold, %d of %d numbers miss the paper's.",
         held,
@@ -202,21 +204,23 @@ def summary(told: dict[str, Any]) -> str:
     return f"{told['held']} of {told['claims']} claims hold, {told['misses']} of {told['numbers']} numbers miss"
 
 
-def chosen(only: Sequence[str] | str | None) -> list[Item]:
-    """The items of these labels, with or without ``tab:`` or ``fig:``, or kinds, in the report's
+def chosen(only: Sequence[str] | str | None) -> list[Artefact]:
+    """The artefacts of these labels, with or without ``tab:`` or ``fig:``, or kinds, in the report's
     order; None: all.
     """
     if only is None:
-        return list(ITEMS.values())
+        return list(ARTEFACTS.values())
     wanted = [
         word.removeprefix("tab:").removeprefix("fig:")
         for word in ([only] if isinstance(only, str) else only)
     ]
-    existing = {*ITEMS, *(item.kind for item in ITEMS.values())}
+    existing = {*ARTEFACTS, *(artefact.kind for artefact in ARTEFACTS.values())}
     for word in wanted:
         if word not in existing:
             raise GhptConfigError("only", f"there is no {word!r}", suggest(word, existing))
-    return [item for item in ITEMS.values() if {item.label, item.kind} & set(wanted)]
+    return [
+        artefact for artefact in ARTEFACTS.values() if {artefact.label, artefact.kind} & set(wanted)
+    ]
 
 
 def processors() -> int:
@@ -236,11 +240,11 @@ def _roots(data: Data) -> dict[str, str | None]:
     return roots
 
 
-def _commands(cells: dict[str, Cell]) -> list[str]:
-    """What makes these cells by hand: trainings, then tests."""
+def _commands(tasks: dict[str, Task]) -> list[str]:
+    """What makes these tasks by hand: trainings, then tests."""
     found: dict[str, None] = {}
-    for cell in cells.values():
-        for before in (*cell.needs.values(), cell):
+    for task in tasks.values():
+        for before in (*task.dependencies.values(), task):
             if before.command:
                 found[before.command] = None
     return sorted(found, key=lambda command: "train.py" not in command)
@@ -260,7 +264,7 @@ def _about(
         "made by": f"ghpt {origin['ghpt']}, commit {origin['commit'] or 'unknown'}, torch {origin['torch']}, "
         f"numpy {origin['numpy']}, Python {origin['python']}",
         "command": code(origin["command"]),
-        "run time": f"{minutes:.1f} minutes on {processors()} processors, for {done} cells that were not there before",
+        "run time": f"{minutes:.1f} minutes on {processors()} processors, for {done} tasks that were not there before",
     }
 
 

@@ -1,3 +1,3 @@
-"""The paper's tables and figures again: cells that are computed once and kept, items made of them,
+"""The paper's tables and figures again: tasks that are computed once and kept, artefacts made of them,
 one report.
 """

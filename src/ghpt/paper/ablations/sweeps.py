@@ -5,17 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ghpt.paper.ablations.cells import BASE, CHANCE, DEFAULT, NOTE, SETS, evaluated, number, trained
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Claim, Results, Section, Spread, signed
+from ghpt.paper.ablations.tasks import BASE, CHANCE, DEFAULT, NOTE, SETS, evaluated, number, trained
+from ghpt.paper.engine.artefact import Claim, Results, Section, Spread, signed
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.paper.robustness.figure import LABELS, Panel, curves
 from ghpt.report.tables import NAMES, NONE, markdown
 
 Place = float | int
 """A number of hypotheses, say."""
 Row = tuple[str, str, int]
-"""Cell, selection, number of the setting."""
+"""Task, selection, number of the setting."""
 Lines = Mapping[str, Mapping[Place, Row]]
 """Style -> place -> what stands there."""
 
@@ -33,17 +33,17 @@ def levels(setup: Setup, name: str, *keys: str) -> list[Place]:
     return sorted({*setup.sizes["ablation"][name], default(setup, *keys)})
 
 
-def temperature_cells(setup: Setup) -> dict[str, Cell]:
+def temperature_tasks(setup: Setup) -> dict[str, Task]:
     values = levels(setup, "temperature", "model", "temperature")
-    cells = {
+    tasks = {
         name: evaluated(setup, setup.trained(data), [(None, value) for value in values])
         for name, data in {DEFAULT: BASE, **{novel: novel for novel in _novel(setup)}}.items()
     }
     for value in values:
         if value != default(setup, "model", "temperature"):
             model = trained(setup, BASE, f"model.temperature={value}", name=f"temperature{value:g}")
-            cells[f"{value:g}"] = evaluated(setup, model)
-    return cells
+            tasks[f"{value:g}"] = evaluated(setup, model)
+    return tasks
 
 
 def _novel(setup: Setup) -> list[str]:
@@ -78,10 +78,10 @@ def temperature(results: Results) -> Section:
     return _section(results, "temperature", "temperature", lines, labels, text, usual)
 
 
-def hypotheses_cells(setup: Setup) -> dict[str, Cell]:
+def hypotheses_tasks(setup: Setup) -> dict[str, Task]:
     values = levels(setup, "hypotheses", "model", "hypotheses")
     usual = default(setup, "model", "hypotheses")
-    cells = {
+    tasks = {
         DEFAULT: evaluated(
             setup, setup.trained(BASE), [(value, None) for value in values], seconds=30.0
         )
@@ -92,8 +92,8 @@ def hypotheses_cells(setup: Setup) -> dict[str, Cell]:
             model = trained(
                 setup, BASE, f"model.hypotheses={value}", name=f"hypotheses{value}", seconds=seconds
             )
-            cells[f"{value}"] = evaluated(setup, model, [(usual, None)])
-    return cells
+            tasks[f"{value}"] = evaluated(setup, model, [(usual, None)])
+    return tasks
 
 
 def hypotheses(results: Results) -> Section:
@@ -118,11 +118,11 @@ def hypotheses(results: Results) -> Section:
     return _section(results, "hypotheses", "hypotheses", lines, labels, text, usual)
 
 
-def samples_cells(setup: Setup) -> dict[str, Cell]:
+def samples_tasks(setup: Setup) -> dict[str, Task]:
     usual = default(setup, "data", "train_samples")
     hypotheses = default(setup, "model", "hypotheses")
     pool = setup.sizes["ablation"]["samples_hypotheses"]
-    cells = {"model": setup.trained(BASE)}
+    tasks = {"model": setup.trained(BASE)}
     for value in levels(setup, "samples", "data", "train_samples"):
         changes = [f"model.hypotheses={pool}"]
         seconds = 4 + 25 * value / usual * pool / hypotheses
@@ -131,8 +131,8 @@ def samples_cells(setup: Setup) -> dict[str, Cell]:
             changes = [*changes, f"data.train_samples={value}"]
             name = f"samples{value}-{name}"
         model = trained(setup, BASE, *changes, name=name, seconds=seconds)
-        cells[f"{value}"] = evaluated(setup, model, [(hypotheses, None)])
-    return cells
+        tasks[f"{value}"] = evaluated(setup, model, [(hypotheses, None)])
+    return tasks
 
 
 def samples(results: Results) -> Section:
@@ -157,12 +157,12 @@ def samples(results: Results) -> Section:
     return _section(results, "samples", "training samples", lines, LABELS, text, usual, claims)
 
 
-def _enough(results: Results, cells: Mapping[Place, str], usual: Place) -> Claim:
+def _enough(results: Results, tasks: Mapping[Place, str], usual: Place) -> Claim:
     """Appendix C on the number of samples."""
-    errors = {n: number(results, cell, "test").mean for n, cell in cells.items()}
+    errors = {n: number(results, task, "test").mean for n, task in tasks.items()}
     best = min(errors, key=lambda n: errors[n])
     by = (
-        f"{errors[usual]:.1f} mm of {usual:g}; the best of {', '.join(f'{n:g}' for n in cells)} is {best:g} with "
+        f"{errors[usual]:.1f} mm of {usual:g}; the best of {', '.join(f'{n:g}' for n in tasks)} is {best:g} with "
         f"{errors[best]:.1f} mm ({signed(100 * (errors[best] / errors[usual] - 1))} %)"
     )
     return Claim(
@@ -174,7 +174,7 @@ def _enough(results: Results, cells: Mapping[Place, str], usual: Place) -> Claim
 
 
 def _minutes(results: Results) -> Claim:
-    seconds = Spread(tuple(about["seconds"] for about in results.read("model", "cell.json")))
+    seconds = Spread(tuple(about["seconds"] for about in results.read("model", "task.json")))
     return Claim(
         "about 3 minutes to train",
         "C",
@@ -197,8 +197,8 @@ def _section(
     numbers = {
         split: {
             style: {
-                x: number(results, cell, split, selection, i)
-                for x, (cell, selection, i) in row.items()
+                x: number(results, task, split, selection, i)
+                for x, (task, selection, i) in row.items()
             }
             for style, row in lines.items()
         }

@@ -8,10 +8,10 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from ghpt.paper.ablations import sweeps
-from ghpt.paper.ablations.cells import BASE, CHANCE, NOTE, SETS, evaluated, number, trained
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Item, Results, Section, Spread, signed
+from ghpt.paper.ablations.tasks import BASE, CHANCE, NOTE, SETS, evaluated, number, trained
+from ghpt.paper.engine.artefact import Artefact, Results, Section, Spread, signed
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.report.tables import NAMES, markdown
 
 Variants = Mapping[str, str]
@@ -28,8 +28,8 @@ SELECTION: Variants = {
 }
 
 
-def _cells(setup: Setup, variants: Variants) -> dict[str, Cell]:
-    def model(data: str, experiment: str) -> Cell:
+def _tasks(setup: Setup, variants: Variants) -> dict[str, Task]:
+    def model(data: str, experiment: str) -> Task:
         if not experiment:
             return setup.trained(data)
         return trained(setup, data, f"experiment={experiment}", name=experiment)
@@ -84,17 +84,17 @@ def _chosen(numbers: Mapping[str, Sequence[Spread]]) -> str:
     return " ".join([*parts, NOTE])
 
 
-def _training(label: str, title: str, variants: Variants, about: str) -> Item:
-    return Item(
+def _training(label: str, title: str, variants: Variants, about: str) -> Artefact:
+    return Artefact(
         label,
         "ablation",
         title,
-        partial(_cells, variants=variants),
+        partial(_tasks, variants=variants),
         partial(_section, variants=variants, about=about),
     )
 
 
-ITEMS = (
+ARTEFACTS = (
     _training(
         "ablation-gumbel",
         "Gumbel noise in training",
@@ -115,25 +115,25 @@ ITEMS = (
         "The estimation loss is that of the weighted average, or of one hypothesis drawn from the weights (its "
         "gradient is that of the weights).",
     ),
-    Item(
+    Artefact(
         "ablation-temperature",
         "ablation",
         "Temperature of the softmax",
-        sweeps.temperature_cells,
+        sweeps.temperature_tasks,
         sweeps.temperature,
     ),
-    Item(
+    Artefact(
         "ablation-hypotheses",
         "ablation",
         "Number of hypotheses",
-        sweeps.hypotheses_cells,
+        sweeps.hypotheses_tasks,
         sweeps.hypotheses,
     ),
-    Item(
+    Artefact(
         "ablation-samples",
         "ablation",
         "Number of training samples",
-        sweeps.samples_cells,
+        sweeps.samples_tasks,
         sweeps.samples,
     ),
 )

@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ghpt.models.relative_pose.evaluation import ALONE
-from ghpt.paper.camera.cells import measured, of_pair, tested_pairs, three_rows
-from ghpt.paper.engine.item import Claim, Compared, Item, Results, Section
+from ghpt.paper.camera.tasks import measured, of_pair, tested_pairs, three_rows
+from ghpt.paper.engine.artefact import Artefact, Claim, Comparison, Results, Section
 from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_DISSECTION
 from ghpt.report.tables import markdown
 
@@ -19,7 +19,7 @@ def _dissection(results: Results) -> Section:
     for ab, printed in FUNDAMENTAL_DISSECTION.items():
         pair = f"{ab[0]}-{ab[1]}"
         numbers = [
-            Compared(
+            Comparison(
                 f"{pair} {error}, {part.replace('_', ' ')}",
                 printed[part][error],
                 measured(of_pair(results, "weight", pair, part, error)),
@@ -79,7 +79,7 @@ def _compensation(results: Results, alone: Mapping[str, Sequence[float]]) -> str
     )
 
 
-DISSECTION = Item(
+DISSECTION = Artefact(
     "fundamental-dissection",
     "table",
     "Relative camera poses, one part estimated",

@@ -24,8 +24,8 @@ from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.relative_pose.evaluation import camera_after
-from ghpt.paper.engine.cells import read_json
-from ghpt.paper.engine.work import CHECKPOINT
+from ghpt.paper.engine.actions import CHECKPOINT
+from ghpt.paper.engine.tasks import read_json
 from ghpt.recording import PairBatch, RelativePoseEstimate
 from ghpt.skeleton import JOINTS
 
@@ -85,9 +85,11 @@ def from_rig(calibration: Any, batch: PairBatch) -> Extrinsics:
 
 
 @torch.no_grad()
-def estimate_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+def estimate_extrinsics(
+    config: dict[str, Any], dependencies: dict[str, Path], folder: Path
+) -> None:
     """Extrinsics from ``draws`` draws of ``frames`` frames of each rig, by ``source``: ``weight``,
-    the camera model of ``needs["model"]``; ``rig``; or one of the pairs' classical estimators. What
+    the camera model of ``dependencies["model"]``; ``rig``; or one of the pairs' classical estimators. What
     is not ``weight`` is built from ``estimator``, and a pair's t gets its length from ``scale``.
 
     result.json: for each rig the numbers of its recordings, and R and t (mm) of its cameras after
@@ -106,7 +108,7 @@ def estimate_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: 
             "hypotheses": config["hypotheses"],
             "problem.frames": config["frames"],
         }
-        model = load_model(needs["model"] / CHECKPOINT, **changes)[0].eval()
+        model = load_model(dependencies["model"] / CHECKPOINT, **changes)[0].eval()
     else:
         estimator = build(config["estimator"], "estimator")
         scale = build(config["scale"], "scale")
@@ -130,19 +132,21 @@ def estimate_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: 
     write_json(folder / "result.json", rigs)
 
 
-def poses_from_extrinsics(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Test the pose model of ``needs["model"]`` with some ``parts`` of the extrinsics from
-    ``needs["extrinsics"]``, or where there are none with the true ones.
+def poses_from_extrinsics(
+    config: dict[str, Any], dependencies: dict[str, Path], folder: Path
+) -> None:
+    """Test the pose model of ``dependencies["model"]`` with some ``parts`` of the extrinsics from
+    ``dependencies["extrinsics"]``, or where there are none with the true ones.
 
     result.json: part of `PARTS` (or ``known``) -> kind -> MPJPE (mm) of ``weight``.
     """
     changes = {"seed": config["seed"], "hypotheses": config["hypotheses"]}
-    model = load_model(needs["model"] / CHECKPOINT, **changes)[0].eval()
+    model = load_model(dependencies["model"] / CHECKPOINT, **changes)[0].eval()
     data = build(config["data"], "data")
     data.setup("test")
     frames = {"known": data.frames["test"]}
-    if "extrinsics" in needs:
-        rigs = read_json(needs["extrinsics"] / "result.json")
+    if "extrinsics" in dependencies:
+        rigs = read_json(dependencies["extrinsics"] / "result.json")
         frames = {
             part: seen_by(data.frames["test"], rigs, *PARTS[part]) for part in config["parts"]
         }

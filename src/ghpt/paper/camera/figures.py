@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ghpt.paper.camera.cells import camera_model, of_test
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Claim, Item, Results, Section
+from ghpt.paper.camera.tasks import camera_model, of_test
+from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.report.pair_tables import NAMES
 from ghpt.report.sweep import (
     CLIP,
@@ -26,7 +26,7 @@ MEAN, DEVIATION, MEDIAN = range(3)
 """Places in `statistics_of`."""
 
 
-def _cells(setup: Setup) -> dict[str, Cell]:
+def _tasks(setup: Setup) -> dict[str, Task]:
     size = setup.sizes["frames_sweep"]
     whole = setup.composed("test", "h36m", *setup.overrides["test"])
     config = of_test(whole)
@@ -35,17 +35,17 @@ def _cells(setup: Setup) -> dict[str, Cell]:
         "draws": size["draws"],
         "pairs": None if size["all_pairs"] else [list(PAPER_PAIR)],
     }
-    needs = {
+    dependencies = {
         "model": camera_model(setup),
         "data": setup.prepared("h36m", whole["data"]["evaluate"]),
     }
     work = "ghpt.paper.camera.sweep.errors_of_draws"
     return {
-        str(frames): Cell(
+        str(frames): Task(
             f"frames-sweep-{frames}-seed{setup.seed}",
             work,
             config | {"frames": frames},
-            needs,
+            dependencies,
             seconds=6.0,
         )
         for frames in size["frames"]
@@ -133,6 +133,6 @@ def _counted(sweeps: dict[str, Sweep]) -> str:
     )
 
 
-SWEEP = Item(
-    "comparison-to-8-point", "figure", "E_3D against the number of frames", _cells, _section
+SWEEP = Artefact(
+    "comparison-to-8-point", "figure", "E_3D against the number of frames", _tasks, _section
 )

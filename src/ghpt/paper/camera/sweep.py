@@ -14,11 +14,11 @@ from ghpt.models.checkpoint import load_model
 from ghpt.models.collect import CollectPairs
 from ghpt.models.relative_pose.evaluation import errors_of_pair, pair_name
 from ghpt.models.relative_pose.predictions import open_pairs
-from ghpt.paper.engine.work import CHECKPOINT
+from ghpt.paper.engine.actions import CHECKPOINT
 
 
-def errors_of_draws(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Test the camera model of ``needs["model"]`` on ``draws`` draws of ``frames`` frames of each
+def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
+    """Test the camera model of ``dependencies["model"]`` on ``draws`` draws of ``frames`` frames of each
     rig.
 
     ``pairs``: of views, counted from 1; None: all. result.json: pair -> selection or baseline ->
@@ -26,7 +26,7 @@ def errors_of_draws(config: dict[str, Any], needs: dict[str, Path], folder: Path
     """
     changes = {"problem.frames": config["frames"], "problem.draws": config["draws"]}
     changes |= {"seed": config["seed"], "hypotheses": config["hypotheses"]}
-    model = load_model(needs["model"] / CHECKPOINT, **changes)[0].eval()
+    model = load_model(dependencies["model"] / CHECKPOINT, **changes)[0].eval()
     data = build(config["data"], "data")
     data.bind(model.problem)
     data.setup("test")

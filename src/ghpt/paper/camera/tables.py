@@ -1,4 +1,4 @@
-"""tab:fundamental-evaluation (paper, section 4.4), and all items of the camera problem."""
+"""tab:fundamental-evaluation (paper, section 4.4), and all artefacts of the camera problem."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from ghpt.models.relative_pose.predictions import open_pairs
-from ghpt.paper.camera.cells import measured, of_pair, tested_pairs, three_rows
 from ghpt.paper.camera.dissection import DISSECTION
 from ghpt.paper.camera.figures import SWEEP
+from ghpt.paper.camera.tasks import measured, of_pair, tested_pairs, three_rows
 from ghpt.paper.camera.unknown_extrinsics import UNKNOWN
-from ghpt.paper.engine.item import Claim, Compared, Item, Results, Section, Spread
+from ghpt.paper.engine.artefact import Artefact, Claim, Comparison, Results, Section, Spread
 from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_FRAMES
 from ghpt.report.pair_tables import NAMES
 from ghpt.report.tables import markdown
@@ -51,7 +51,7 @@ def _fundamental(results: Results) -> Section:
         pair = f"{ab[0]}-{ab[1]}"
         ours = {error: of_pair(results, "weight", pair, error) for error in ERRORS}
         numbers = [
-            Compared(
+            Comparison(
                 f"{pair} {error}",
                 times * printed[error],
                 measured(ours[error], times),
@@ -179,8 +179,8 @@ def _mean(spreads: Sequence[Spread]) -> float:
     return float(np.mean([spread.mean for spread in spreads]))
 
 
-ITEMS = (
-    Item(
+ARTEFACTS = (
+    Artefact(
         "fundamental-evaluation",
         "table",
         "Relative camera poses on Human3.6M",

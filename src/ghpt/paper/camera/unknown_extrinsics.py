@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from ghpt.paper.camera.cells import camera_model, of_test
 from ghpt.paper.camera.extrinsics import KINDS, PARTS
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import (
+from ghpt.paper.camera.tasks import camera_model, of_test
+from ghpt.paper.engine.artefact import (
+    Artefact,
     Claim,
-    Compared,
-    Item,
+    Comparison,
     Results,
     Section,
     Spread,
@@ -16,6 +15,7 @@ from ghpt.paper.engine.item import (
     signed,
 )
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.paper.published import UNKNOWN_EXTRINSICS
 from ghpt.report.tables import NONE, markdown
 
@@ -31,7 +31,7 @@ GOAL = 0.05
 """Of this project: what estimated cameras may cost."""
 
 
-def _cells(setup: Setup) -> dict[str, Cell]:
+def _tasks(setup: Setup) -> dict[str, Task]:
     size = setup.sizes["unknown_extrinsics"]
     whole = setup.composed(
         "test", "h36m", *setup.overrides["test"], f"data.stride={size['stride']}"
@@ -45,7 +45,7 @@ def _cells(setup: Setup) -> dict[str, Cell]:
     scale = camera.config["model"]["problem"]["scale"]
     work = "ghpt.paper.camera.extrinsics."
     extrinsics = {
-        source: Cell(
+        source: Task(
             f"extrinsics-{source}-seed{setup.seed}",
             f"{work}estimate_extrinsics",
             draws
@@ -56,23 +56,23 @@ def _cells(setup: Setup) -> dict[str, Cell]:
         )
         for source in SOURCES
     }
-    cells = {}
+    tasks = {}
     for trained in MODELS:
-        needs = {"model": setup.trained(trained), "data": data}
+        dependencies = {"model": setup.trained(trained), "data": data}
         name = f"{trained}-seed{setup.seed}"
-        cells[trained] = Cell(
-            f"poses-known-{name}", f"{work}poses_from_extrinsics", config, needs, seconds=7.0
+        tasks[trained] = Task(
+            f"poses-known-{name}", f"{work}poses_from_extrinsics", config, dependencies, seconds=7.0
         )
         for source, estimated in extrinsics.items():
             parts = list(PARTS) if source == "weight" else ["both"]
-            cells[f"{trained} {source}"] = Cell(
+            tasks[f"{trained} {source}"] = Task(
                 f"poses-{source}-{name}",
                 f"{work}poses_from_extrinsics",
                 config | {"parts": parts},
-                needs | {"extrinsics": estimated},
+                dependencies | {"extrinsics": estimated},
                 seconds=7.0 * len(parts),
             )
-    return cells
+    return tasks
 
 
 def _section(results: Results) -> Section:
@@ -82,7 +82,7 @@ def _section(results: Results) -> Section:
     compared = []
     for trained, name in MODELS.items():
         numbers = [
-            Compared(
+            Comparison(
                 f"{name}, {head}",
                 UNKNOWN_EXTRINSICS[trained][part],
                 _error(results, trained, "weight", part),
@@ -225,6 +225,6 @@ def _explained(results: Results) -> str:
     )
 
 
-UNKNOWN = Item(
-    "unknown-extrinsics-evaluation", "table", "Poses from estimated cameras", _cells, _section
+UNKNOWN = Artefact(
+    "unknown-extrinsics-evaluation", "table", "Poses from estimated cameras", _tasks, _section
 )

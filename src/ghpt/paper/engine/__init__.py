@@ -1,1 +1,1 @@
-"""Cells that are computed once and kept, items made of them, and one report."""
+"""Tasks that are computed once and kept, artefacts made of them, and one report."""

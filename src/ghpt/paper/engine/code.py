@@ -1,4 +1,4 @@
-"""What of the source code decides a number: a cell is made again when this changes, and not for a
+"""What of the source code decides a number: a task is made again when this changes, and not for a
 comment.
 """
 
@@ -28,11 +28,11 @@ DECIDES = (
     "report/poses.py",
     "report/pairs.py",
 )
-"""Every cell depends on these files and folders of ghpt, and on the module of its own work."""
+"""Every task depends on these files and folders of ghpt, and on the module of its own work."""
 
 
 def code_digest(module: str) -> str:
-    """A digest of the code behind a cell whose work is in ``module``, and of the libraries that
+    """A digest of the code behind a task whose work is in ``module``, and of the libraries that
     compute.
     """
     own = importlib.util.find_spec(module)

@@ -19,7 +19,7 @@ from markdown_it import MarkdownIt
 from matplotlib.figure import Figure
 
 from ghpt.files import atomic_write, write_json
-from ghpt.paper.engine.item import TOLERANCE, Claim, Compared, Item, Section, signed
+from ghpt.paper.engine.artefact import TOLERANCE, Artefact, Claim, Comparison, Section, signed
 from ghpt.report.escape import Markdown, code_block, escaped
 from ghpt.report.tables import markdown
 
@@ -34,22 +34,22 @@ logging.getLogger("fontTools").setLevel(
 
 @dataclass(frozen=True)
 class Entry:
-    """An item with what it shows."""
+    """An artefact with what it shows."""
 
-    item: Item
+    artefact: Artefact
     section: Section
     commands: Sequence[str]
-    """What makes its cells, by hand."""
+    """What makes its results, by hand."""
 
     @property
     def heading(self) -> str:
         """Label, title and data: a synthetic number can never be mistaken for a real one."""
-        prefix = PREFIX.get(self.item.kind, "") if self.item.of_paper else ""
-        return f"{prefix}{self.item.label}: {self.item.title} · {self.section.data}"
+        prefix = PREFIX.get(self.artefact.kind, "") if self.artefact.of_paper else ""
+        return f"{prefix}{self.artefact.label}: {self.artefact.title} · {self.section.data}"
 
     @property
-    def misses(self) -> list[Compared]:
-        return [number for number in self.section.compared if number.miss]
+    def misses(self) -> list[Comparison]:
+        return [number for number in self.section.comparisons if number.miss]
 
     def text(self) -> str:
         """Body, claims, and what explains the misses; Markdown."""
@@ -63,7 +63,7 @@ class Entry:
 
     @property
     def again(self) -> str:
-        return f"python reproduce.py only=[{self.item.label}]"
+        return f"python reproduce.py only=[{self.artefact.label}]"
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Page:
         """What comes before the entries, Markdown."""
         lines = "\n".join(f"- {name}: {escaped(value)}" for name, value in self.about.items())
         held = sum(claim.holds for claim in self.claims)
-        compared = sum(len(entry.section.compared) for entry in self.entries)
+        compared = sum(len(entry.section.comparisons) for entry in self.entries)
         misses = [(entry, number) for entry in self.entries for number in entry.misses]
         parts = [
             lines,
@@ -108,7 +108,7 @@ class Page:
         ]
         if failed:
             rows = [
-                [entry.item.label, claim.statement, claim.where, claim.by]
+                [entry.artefact.label, claim.statement, claim.where, claim.by]
                 for entry, claim in failed
             ]
             parts += [
@@ -118,7 +118,9 @@ class Page:
                 ),
             ]
         if misses:
-            rows = [[entry.item.label, number.what, *number.cells()] for entry, number in misses]
+            rows = [
+                [entry.artefact.label, number.what, *number.cells()] for entry, number in misses
+            ]
             parts += [
                 "## Misses",
                 markdown(["in", "number", "paper", "ours", "difference"], rows, range(2)),
@@ -140,11 +142,11 @@ def told(entry: Entry) -> list[Claim]:
 
 def _summary_row(entry: Entry) -> list[str]:
     claims = told(entry)
-    numbers = entry.section.compared
+    numbers = entry.section.comparisons
     # a comparison may lack a number, the paper's or ours
     known = [number.difference for number in numbers if number.difference is not None]
     return [
-        Markdown(f"[{entry.item.label}](#{entry.item.label})"),
+        Markdown(f"[{entry.artefact.label}](#{entry.artefact.label})"),
         str(len(numbers) or "–"),
         f"{signed(100 * statistics.median(known))} %" if known else "–",
         str(len(entry.misses)) if numbers else "–",
@@ -192,7 +194,7 @@ def as_markdown(page: Page) -> str:
             body = body.replace(f"]({name}.svg)", f"]({FOLDER}/{name}.svg)")
         commands = "\n".join(entry.commands)
         parts += [
-            f'<a id="{entry.item.label}"></a>',
+            f'<a id="{entry.artefact.label}"></a>',
             f"## {escaped(entry.heading)}",
             body,
             f"Again: `{entry.again}`",
@@ -212,12 +214,13 @@ def as_html(page: Page, pictures: Mapping[str, bytes]) -> str:
         "image", lambda _, tokens, index, *__: _picture(tokens[index], pictures)
     )
     entries = "\n".join(
-        f'<section id="{entry.item.label}">\n<h2>{escape(entry.heading)}</h2>\n{renderer.render(entry.text())}'
+        f'<section id="{entry.artefact.label}">\n<h2>{escape(entry.heading)}</h2>\n{renderer.render(entry.text())}'
         f"<p class='again'>Again: <code>{escape(entry.again)}</code></p>{_details(entry.commands)}</section>"
         for entry in page.entries
     )
     links = "".join(
-        f'<li><a href="#{e.item.label}">{escape(e.item.label)}</a></li>' for e in page.entries
+        f'<li><a href="#{e.artefact.label}">{escape(e.artefact.label)}</a></li>'
+        for e in page.entries
     )
     template = files("ghpt.paper.engine").joinpath("page.html").read_text(encoding="utf-8")
     blocks = {
@@ -251,7 +254,7 @@ def as_data(page: Page) -> dict[str, Any]:
         "format_version": 1,
         "about": json.loads(json.dumps(page.about, default=str)),
         "items": {
-            entry.item.label: {
+            entry.artefact.label: {
                 "data": entry.section.data,
                 "numbers": [
                     {
@@ -260,7 +263,7 @@ def as_data(page: Page) -> dict[str, Any]:
                         "ours": None if n.ours is None else list(n.ours.values),
                         "miss": n.miss,
                     }
-                    for n in entry.section.compared
+                    for n in entry.section.comparisons
                 ],
                 "claims": [vars(claim) for claim in entry.section.claims],
             }

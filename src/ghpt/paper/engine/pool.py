@@ -1,4 +1,4 @@
-"""Cells on several processes, in the order of their needs, under one progress bar."""
+"""Tasks on several processes, in the order of their dependencies, under one progress bar."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ from rich.progress import (
 
 from ghpt.errors import GhptConfigError, GhptError
 from ghpt.files import sweep_temporaries
-from ghpt.paper.engine.cells import Cell, perform, with_needs
+from ghpt.paper.engine.tasks import Task, perform, with_dependencies
 from ghpt.signals import stopped_by_signals
 
 _log = logging.getLogger(__name__)
 
 
-def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> int:
-    """Do every cell that is wanted or needed and is not yet done, ``jobs`` at a time; returns how
+def perform_all(wanted: Iterable[Task], tasks: Path, jobs: int, show: bool) -> int:
+    """Do every task that is wanted or needed and is not yet done, ``jobs`` at a time; returns how
     many that were.
 
-    A cell's result is kept as soon as it is there: after an error or an interruption, which end
-    this at once, the same call goes on where it was. Raises what the cell raised, a GhptError with
-    the cell's name before it.
+    A task's result is kept as soon as it is there: after an error or an interruption, which end
+    this at once, the same call goes on where it was. Raises what the task raised, a GhptError with
+    the task's name before it.
     """
-    cells.mkdir(parents=True, exist_ok=True)
-    sweep_temporaries(cells)
-    missing = {key: cell for key, cell in with_needs(wanted).items() if not cell.done(cells)}
+    tasks.mkdir(parents=True, exist_ok=True)
+    sweep_temporaries(tasks)
+    missing = {key: task for key, task in with_dependencies(wanted).items() if not task.done(tasks)}
     number = len(missing)
     chain = _chains(missing)
     with (
@@ -57,10 +57,12 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
         running = {}
         while waiting or running:
             ready = [
-                c for c in waiting.values() if not any(b.key in missing for b in c.needs.values())
+                c
+                for c in waiting.values()
+                if not any(b.key in missing for b in c.dependencies.values())
             ]
-            for cell in sorted(ready, key=lambda c: -chain[c.key])[: jobs - len(running)]:
-                running[submit(cell, cells)] = waiting.pop(cell.key)
+            for task in sorted(ready, key=lambda c: -chain[c.key])[: jobs - len(running)]:
+                running[submit(task, tasks)] = waiting.pop(task.key)
                 tell(running.values(), None)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
                 try:
@@ -70,33 +72,33 @@ def perform_all(wanted: Iterable[Cell], cells: Path, jobs: int, show: bool) -> i
                     raise
                 except BrokenProcessPool as error:
                     raise _killed(running.values()) from error
-                cell = running.pop(future)
-                del missing[cell.key]
-                tell(running.values(), cell)
+                task = running.pop(future)
+                del missing[task.key]
+                tell(running.values(), task)
     return number
 
 
-def _killed(running: Iterable[Cell]) -> GhptConfigError:
-    made = ", ".join(cell.name for cell in running)
+def _killed(running: Iterable[Task]) -> GhptConfigError:
+    made = ", ".join(task.name for task in running)
     problem = f"a process was killed while these were made: {made}; the system does so where memory is short"
     return GhptConfigError("jobs", problem, "Give fewer (jobs=1, say); the same command goes on.")
 
 
-def _chains(cells: dict[str, Cell]) -> dict[str, float]:
-    """Seconds of the longest chain of cells that begins with each: what is first in a long one is
+def _chains(tasks: dict[str, Task]) -> dict[str, float]:
+    """Seconds of the longest chain of tasks that begins with each: what is first in a long one is
     done first.
     """
-    chain = {key: cell.seconds for key, cell in cells.items()}
-    for key, cell in reversed(cells.items()):  # needs come before those who need them
-        for before in cell.needs.values():
+    chain = {key: task.seconds for key, task in tasks.items()}
+    for key, task in reversed(tasks.items()):  # dependencies come before their dependents
+        for before in task.dependencies.values():
             if before.key in chain:
                 chain[before.key] = max(chain[before.key], before.seconds + chain[key])
     return chain
 
 
 @contextlib.contextmanager
-def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[None]]]:
-    """Submit cells to ``jobs`` processes, or with one to this process; on the way out nothing is
+def _executor(jobs: int) -> Iterator[Callable[[Task, Path], Future[None]]]:
+    """Submit tasks to ``jobs`` processes, or with one to this process; on the way out nothing is
     left running.
     """
     if jobs <= 1:
@@ -107,7 +109,7 @@ def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[None]]]:
         jobs, multiprocessing.get_context("spawn"), _start, (threads, os.getpid())
     )
     try:
-        yield lambda cell, cells: executor.submit(_quietly, cell, cells)
+        yield lambda task, tasks: executor.submit(_quietly, task, tasks)
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
@@ -117,10 +119,10 @@ def _executor(jobs: int) -> Iterator[Callable[[Cell, Path], Future[None]]]:
         executor.shutdown()
 
 
-def _here(cell: Cell, cells: Path) -> Future[None]:
+def _here(task: Task, tasks: Path) -> Future[None]:
     future: Future[None] = Future()
     try:
-        _quietly(cell, cells)
+        _quietly(task, tasks)
         future.set_result(None)
     except Exception as error:
         future.set_exception(error)
@@ -140,7 +142,7 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _quietly(cell: Cell, cells: Path) -> None:
+def _quietly(task: Task, tasks: Path) -> None:
     """`perform` without what the commands would say on the way."""
     loggers = [
         logging.getLogger(name) for name in ("ghpt", "lightning.pytorch", "lightning.fabric")
@@ -151,7 +153,7 @@ def _quietly(cell: Cell, cells: Path) -> None:
             logger.setLevel(logging.ERROR)
         with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
             warnings.simplefilter("ignore")
-            perform(cell, cells)
+            perform(task, tasks)
     finally:
         for logger, level in zip(loggers, levels, strict=True):
             logger.setLevel(level)
@@ -159,12 +161,12 @@ def _quietly(cell: Cell, cells: Path) -> None:
 
 @contextlib.contextmanager
 def _progress(
-    cells: Sequence[Cell], show: bool
-) -> Iterator[Callable[[Iterable[Cell], Cell | None], None]]:
-    """A bar over all cells, as long as their expected seconds; without it, or a terminal, a line
+    tasks: Sequence[Task], show: bool
+) -> Iterator[Callable[[Iterable[Task], Task | None], None]]:
+    """A bar over all tasks, as long as their expected seconds; without it, or a terminal, a line
     for each.
 
-    What it yields is told which cells are being made, and which one has been finished.
+    What it yields is told which tasks are being made, and which one has been finished.
     """
     columns = (
         TextColumn("{task.fields[count]}"),
@@ -175,21 +177,21 @@ def _progress(
         TextColumn("{task.description}"),
     )
     console = Console(stderr=True)
-    show = show and console.is_terminal and len(cells) > 0
+    show = show and console.is_terminal and len(tasks) > 0
     bar = Progress(*columns, console=console, disable=not show)
-    done: list[Cell] = []
+    done: list[Task] = []
 
     def count() -> str:
-        return f"{len(done)} of {len(cells)}"
+        return f"{len(done)} of {len(tasks)}"
 
     with bar:
-        task = bar.add_task("", total=sum(cell.seconds for cell in cells), count=count())
+        task = bar.add_task("", total=sum(task.seconds for task in tasks), count=count())
 
-        def tell(running: Iterable[Cell], finished: Cell | None) -> None:
+        def tell(running: Iterable[Task], finished: Task | None) -> None:
             if finished is not None:
                 done.append(finished)
                 bar.advance(task, finished.seconds)
                 (_log.debug if show else _log.info)("%s: %s", count(), finished.name)
-            bar.update(task, count=count(), description=", ".join(cell.name for cell in running))
+            bar.update(task, count=count(), description=", ".join(task.name for task in running))
 
         yield tell

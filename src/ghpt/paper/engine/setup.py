@@ -1,4 +1,4 @@
-"""What the cells of one seed share, and how the commonest of them are asked for."""
+"""What the tasks of one seed share, and how the commonest of them are asked for."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hydra.core.global_hydra import GlobalHydra
 
 from ghpt.commands.train import shell_override
 from ghpt.config import build, plain
-from ghpt.paper.engine.cells import Cell
+from ghpt.paper.engine.tasks import Task
 
 SECONDS = {"h36m": 40.0}
 """Of a test of the pose, where it is not 13."""
@@ -35,7 +35,7 @@ def compose(conf: Path, name: str, overrides: tuple[str, ...]) -> dict[str, Any]
 
 @dataclass(frozen=True)
 class Setup:
-    """Makes cells. All paths of real data and all sizes come from conf/reproduce.yaml."""
+    """Makes tasks. All paths of real data and all sizes come from conf/reproduce.yaml."""
 
     conf: Path
     roots: Mapping[str, str | None]
@@ -76,20 +76,20 @@ class Setup:
             {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
         )
 
-    def prepared(self, data: str, split: str) -> Cell:
+    def prepared(self, data: str, split: str) -> Task:
         """The recordings of a split in the cache."""
         config = {"data": _of_source(self.composed("test", data)["data"]), "split": split}
         files = {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
-        return Cell(
+        return Task(
             f"prepare-{data}-{split}",
-            "ghpt.paper.engine.work.prepare_split",
+            "ghpt.paper.engine.actions.prepare_split",
             config | files,
             seconds=8.0,
         )
 
     def trained(
         self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 30.0
-    ) -> Cell:
+    ) -> Task:
         """A model trained on a data set; ``overrides`` are those of train.py, ``name`` tells them
         apart.
         """
@@ -99,22 +99,24 @@ class Setup:
             for k, v in self.composed("train", data, *words).items()
             if k not in ("save_every", "resume")
         }
-        needs = {split: self.prepared(data, split) for split in ("train", "validation")}
+        dependencies = {split: self.prepared(data, split) for split in ("train", "validation")}
         name = "-".join(filter(None, ["train", model, data, name, f"seed{self.seed}"]))
         command = " ".join(["python train.py", *self.words(data), *words, _output(name)])
-        return Cell(name, "ghpt.paper.engine.work.train_model", config, needs, command, seconds)
+        return Task(
+            name, "ghpt.paper.engine.actions.train_model", config, dependencies, command, seconds
+        )
 
     def tested(
         self,
-        model: Cell,
+        model: Task,
         data: str,
         *overrides: str,
         name: str = "",
         baselines: bool = True,
         view_weights: bool = True,
         seconds: float | None = None,
-    ) -> Cell:
-        """The model of a `trained` cell on a data set; ``baselines`` False leaves the classical
+    ) -> Task:
+        """The model of a `trained` task on a data set; ``baselines`` False leaves the classical
         estimators out, ``view_weights`` False the learned view weights.
         """
         overrides = (*self.overrides["test"], *overrides)
@@ -128,7 +130,7 @@ class Setup:
             "view_weights": not view_weights,
         }
         config |= {key: {} for key, out in left_out.items() if out and key in config}
-        needs = {"model": model, "data": self.prepared(data, config["data"]["evaluate"])}
+        dependencies = {"model": model, "data": self.prepared(data, config["data"]["evaluate"])}
         trained = model.name.removeprefix("train-").removesuffix(f"-seed{self.seed}")
         name = "-".join(filter(None, ["test", trained, "on", data, name, f"seed{self.seed}"]))
         checkpoint = f"ckpt={_output(model.name).removeprefix('output=')}/last.ckpt"
@@ -136,7 +138,9 @@ class Setup:
             ["python test.py", checkpoint, *self.words(data), *overrides, _output(name)]
         )
         seconds = seconds or SECONDS.get(data, 13.0)
-        return Cell(name, "ghpt.paper.engine.work.test_model", config, needs, command, seconds)
+        return Task(
+            name, "ghpt.paper.engine.actions.test_model", config, dependencies, command, seconds
+        )
 
 
 def _output(name: str) -> str:

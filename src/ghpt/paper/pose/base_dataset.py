@@ -4,9 +4,17 @@ from __future__ import annotations
 
 from typing import Any
 
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Claim, Compared, Item, Results, Section, Spread, comparison
+from ghpt.paper.engine.artefact import (
+    Artefact,
+    Claim,
+    Comparison,
+    Results,
+    Section,
+    Spread,
+    comparison_table,
+)
 from ghpt.paper.engine.setup import Setup, compose
+from ghpt.paper.engine.tasks import Task
 from ghpt.paper.published import (
     HYPERPARAMETERS,
     LIMITATION,
@@ -32,7 +40,7 @@ BASELINES = ("ransac", "adaptive_ransac", "linear", "weighted_linear", "m_estima
 VIEW_WEIGHTS = "view weights (not in the paper)"
 
 
-def on_itself(setup: Setup, *names: str) -> dict[str, Cell]:
+def on_itself(setup: Setup, *names: str) -> dict[str, Task]:
     """Models tested on the arrangement that they were trained on, with all classical estimators."""
     return {SELF[data]: setup.tested(setup.trained(data), data) for data in names}
 
@@ -48,7 +56,7 @@ def _quantitative(results: Results) -> Section:
     ours = actions(SELF["h36m"], "weight")
     paper = [*QUANTITATIVE.values(), QUANTITATIVE_MEAN]
     compared = [
-        Compared(a, p, o) for a, p, o in zip([*QUANTITATIVE, "mean"], paper, ours, strict=True)
+        Comparison(a, p, o) for a, p, o in zip([*QUANTITATIVE, "mean"], paper, ours, strict=True)
     ]
     columns = list(zip(*(number.cells() for number in compared), strict=True))
     rows = [
@@ -102,7 +110,7 @@ def _hypotheses(results: Results) -> Section:
         name = "Human3.6M" if data == "h36m" else "Panoptic Studio"
         paper = QUANTITATIVE_HYPOTHESES["h36m" if data == "h36m" else "panoptic"]
         rows = [
-            Compared(
+            Comparison(
                 NAMES.get(s, s),
                 value,
                 results.relative(test, s),
@@ -110,14 +118,14 @@ def _hypotheses(results: Results) -> Section:
             )
             for s, value in paper.items()
         ]
-        others = [Compared(VIEW_WEIGHTS, None, results.relative(test, "view_weights"))]
+        others = [Comparison(VIEW_WEIGHTS, None, results.relative(test, "view_weights"))]
         others += [
-            Compared(NAMES.get(s, s), None, results.relative(test, s)) for s in BASELINES[1:]
+            Comparison(NAMES.get(s, s), None, results.relative(test, s)) for s in BASELINES[1:]
         ]
         about = f"**{escaped(results.display_name(data))}**, trained on the same"
-        tables.append(f"{about}\n\n{comparison([*rows, *others], 'hypothesis')}")
+        tables.append(f"{about}\n\n{comparison_table([*rows, *others], 'hypothesis')}")
         compared += [
-            Compared(f"{name}, {row.what}", row.paper, row.ours, row.better) for row in rows
+            Comparison(f"{name}, {row.what}", row.paper, row.ours, row.better) for row in rows
         ]
         claims += _hypotheses_claims(
             name, {s: results.relative(test, s).mean for s in paper}, paper
@@ -203,7 +211,7 @@ def _hypotheses_claims(name: str, ours: dict[str, float], paper: dict[str, float
     return claims
 
 
-def _limitation_cells(setup: Setup) -> dict[str, Cell]:
+def _limitation_tasks(setup: Setup) -> dict[str, Task]:
     model = setup.trained("h36m")
     splits = {
         split: setup.tested(
@@ -215,7 +223,9 @@ def _limitation_cells(setup: Setup) -> dict[str, Cell]:
 
 
 def _limitation(results: Results) -> Section:
-    rows = [Compared(split, value, results.relative(split)) for split, value in LIMITATION.items()]
+    rows = [
+        Comparison(split, value, results.relative(split)) for split, value in LIMITATION.items()
+    ]
     train, validation, test = (row.ours.mean for row in rows)
     claim = Claim(
         "validation is as good as training and the test subjects are far worse: the detector has not seen them",
@@ -227,7 +237,7 @@ def _limitation(results: Results) -> Section:
         "The synthetic detector is twice as precise on training and validation subjects by design, for the paper's was "
         "trained on them."
     )
-    text = comparison(rows, "split of Human3.6M")
+    text = comparison_table(rows, "split of Human3.6M")
     synthetic = results.setup.root("h36m") is None
     return Section(
         results.display_name("h36m"), f"{text}\n\n{note}" if synthetic else text, {}, rows, [claim]
@@ -269,27 +279,27 @@ def _settings(setup: Setup, name: str) -> dict[str, str]:
     }
 
 
-ITEMS = (
-    Item(
+ARTEFACTS = (
+    Artefact(
         "quantitative",
         "table",
         "Human3.6M, action by action",
         lambda setup: on_itself(setup, "h36m"),
         _quantitative,
     ),
-    Item(
+    Artefact(
         "quantitative-hypotheses",
         "table",
         "The hypotheses compared",
         lambda setup: on_itself(setup, *SELF),
         _hypotheses,
     ),
-    Item(
+    Artefact(
         "limitation-table",
         "table",
         "Train, validation and test subjects",
-        _limitation_cells,
+        _limitation_tasks,
         _limitation,
     ),
-    Item("hyperparameters", "table", "Hyper-parameters", lambda setup: {}, _hyperparameters),
+    Artefact("hyperparameters", "table", "Hyper-parameters", lambda setup: {}, _hyperparameters),
 )

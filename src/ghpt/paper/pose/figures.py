@@ -9,9 +9,9 @@ from jaxtyping import Float
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.pose.predictions import PredictionChunk, Predictions, open_predictions
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Claim, Item, Results, Section
+from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.paper.pose.base_dataset import SELF, on_itself
 from ghpt.report.figures import pose_prior_bars, skeletons, up_axis
 from ghpt.report.tables import markdown, prior_table
@@ -138,11 +138,11 @@ def _ratio(a: Float[np.ndarray, " L"], b: Float[np.ndarray, " L"]) -> float:
     return float(np.exp(np.mean(np.log(a / b))))
 
 
-def _cells(setup: Setup) -> dict[str, Cell]:
+def _tasks(setup: Setup) -> dict[str, Task]:
     return on_itself(setup, "h36m")
 
 
-ITEMS = (
-    Item("qualitative", "figure", "Hypotheses beside the truth", _cells, _qualitative),
-    Item("pose-prior", "figure", "The human pose prior", _cells, _pose_prior),
+ARTEFACTS = (
+    Artefact("qualitative", "figure", "Hypotheses beside the truth", _tasks, _qualitative),
+    Artefact("pose-prior", "figure", "The human pose prior", _tasks, _pose_prior),
 )

@@ -5,9 +5,17 @@ from __future__ import annotations
 from collections.abc import Sequence
 from itertools import product
 
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Claim, Compared, Item, Results, Section, Spread, over_seeds
+from ghpt.paper.engine.artefact import (
+    Artefact,
+    Claim,
+    Comparison,
+    Results,
+    Section,
+    Spread,
+    over_seeds,
+)
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.paper.published import (
     ARRANGEMENTS,
     GENERALIZATION,
@@ -20,7 +28,7 @@ PANOPTIC = ARRANGEMENTS[:4]
 
 def grid(
     setup: Setup, trained: Sequence[str] = ARRANGEMENTS, tested: Sequence[str] = ARRANGEMENTS
-) -> dict[str, Cell]:
+) -> dict[str, Task]:
     """Every training set with every test set: ``"cmu1 on h36m"``; classical estimators where the
     two are the same.
     """
@@ -36,7 +44,7 @@ def _generalization(results: Results) -> Section:
     compared = []
     for test in ARRANGEMENTS:
         numbers = [
-            Compared(
+            Comparison(
                 f"{a.upper()} on {test.upper()}",
                 GENERALIZATION[a, test],
                 results.relative(f"{a} on {test}"),
@@ -103,8 +111,8 @@ def _difference(results: Results, test: str) -> Spread:
     )
 
 
-ITEMS = (
-    Item(
+ARTEFACTS = (
+    Artefact(
         "generalization-evaluation",
         "table",
         "Generalisation between camera arrangements",

@@ -6,10 +6,10 @@ import statistics
 from collections.abc import Sequence
 from itertools import product
 
-from ghpt.paper.engine.item import (
+from ghpt.paper.engine.artefact import (
+    Artefact,
     Claim,
-    Compared,
-    Item,
+    Comparison,
     Results,
     Section,
     Spread,
@@ -34,8 +34,8 @@ def _iskakov(results: Results) -> Section:
     all_joints = results.relative("cmu3 on h36m")
     six = results.spread("cmu3 on h36m", "selections", "weight", "mpjpe_6_joints")
     rows = [
-        Compared("ours, 17 joints", ISKAKOV["ours"], all_joints),
-        Compared("ours, 6 joints", None, six),
+        Comparison("ours, 17 joints", ISKAKOV["ours"], all_joints),
+        Comparison("ours, 6 joints", None, six),
     ]
     theirs = [["Iskakov et al., 6 joints (as published)", f"{ISKAKOV['theirs']:.1f}", NONE, NONE]]
     table = markdown(
@@ -94,7 +94,7 @@ def _remelli(results: Results) -> Section:
         rows.append(_remelli_row(f"ours ({train.upper()})", published, column, drops[-1], honest))
         ends = (over_seeds(min, *column), over_seeds(max, *column))
         compared += [
-            Compared(f"{train.upper()} {end}", paper, ours)
+            Comparison(f"{train.upper()} {end}", paper, ours)
             for end, paper, ours in zip(("base", "novel"), published, ends, strict=True)
         ]
     row = [results.relative(f"{train} on h36m") for train in ARRANGEMENTS]
@@ -167,7 +167,7 @@ def _sota(results: Results) -> Section:
         )
         return over_seeds(_mean, *spreads)
 
-    ours = Compared("ours (mean of the 12 novel arrangements)", SOTA["ours"], novel("weight"))
+    ours = Comparison("ours (mean of the 12 novel arrangements)", SOTA["ours"], novel("weight"))
     rows = [
         [f"{name} (as published)", f"{SOTA[name]:.1f}", NONE, NONE]
         for name in ("RANSAC", "algebraic", "VoxelPose")
@@ -215,22 +215,22 @@ def _mean(*values: float) -> float:
     return statistics.fmean(values)
 
 
-ITEMS = (
-    Item(
+ARTEFACTS = (
+    Artefact(
         "iskakov-comparison",
         "table",
         "From Panoptic to Human3.6M, beside Iskakov et al.",
         lambda setup: grid(setup, ("cmu3",), ("h36m",)),
         _iskakov,
     ),
-    Item(
+    Artefact(
         "remelli-comparison",
         "table",
         "Drop from base to novel arrangement, beside Remelli et al.",
         grid,
         _remelli,
     ),
-    Item(
+    Artefact(
         "sota-comparison",
         "table",
         "Panoptic, novel arrangements, beside other systems",

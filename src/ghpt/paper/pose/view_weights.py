@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import product
 
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.paper.engine.item import Claim, Item, Results, Section, signed
+from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section, signed
 from ghpt.paper.pose.generalization import PANOPTIC, four, grid
 from ghpt.paper.published import ARRANGEMENTS
 from ghpt.report.tables import NAMES, markdown
@@ -18,12 +18,12 @@ DIGITS = 2
 
 def best_classical(results: Results, test: str) -> tuple[str, float]:
     """Name and error (mm) of the best classical estimator on a test set; it knows no training set."""
-    cell = f"{test} on {test}"
+    task = f"{test} on {test}"
     learned = (*AGGREGATIONS, "view_weights")
     names = [
-        name for name in results.read(cell, "metrics.json")[0]["selections"] if name not in learned
+        name for name in results.read(task, "metrics.json")[0]["selections"] if name not in learned
     ]
-    means = {name: results.relative(cell, name).mean for name in names}
+    means = {name: results.relative(task, name).mean for name in names}
     best = min(means, key=means.__getitem__)
     return best, means[best]
 
@@ -85,8 +85,8 @@ def _beats_classical(
     return Claim(statement, "not in the paper", min(leads.values()) > 0, by)
 
 
-ITEMS = (
-    Item(
+ARTEFACTS = (
+    Artefact(
         "view-weights",
         "table",
         "Learned view weights, which the paper lacks",

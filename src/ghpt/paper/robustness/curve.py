@@ -1,4 +1,4 @@
-"""A robustness curve: what is varied, the cells that measure it, and their results."""
+"""A robustness curve: what is varied, the tasks that measure it, and their results."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from ghpt.paper.engine.cells import Cell
+from ghpt.paper.engine.artefact import Results, Spread
 from ghpt.paper.engine.code import code_digest
-from ghpt.paper.engine.item import Results, Spread
 from ghpt.paper.engine.setup import Setup
-from ghpt.paper.robustness.work import LEARNED
+from ghpt.paper.engine.tasks import Task
+from ghpt.paper.robustness.actions import LEARNED
 
 PERTURBATIONS = "ghpt.paper.robustness.perturbation"
 CLEAN = "clean"
-"""The cell of a data set as it is, shared by the curves."""
+"""The task of a data set as it is, shared by the curves."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Curve:
     """One quantity that gets worse."""
 
     name: str
-    """Of its cell, and of its levels in ``sizes.robustness``; 0 means the data as they are."""
+    """Of its task, and of its levels in ``sizes.robustness``; 0 means the data as they are."""
     perturbation: str
     setting: str
     """The perturbation's argument that the levels are of."""
@@ -41,7 +41,7 @@ class Curve:
     def levels(self, setup: Setup) -> list[float | int]:
         return setup.sizes["robustness"][self.name]
 
-    def cell(self, setup: Setup) -> Cell:
+    def task(self, setup: Setup) -> Task:
         sizes = setup.sizes["robustness"]
         more = {name: sizes[f"{self.name}_{name}"] for name in self.more}
         target = f"{PERTURBATIONS}.{self.perturbation}"
@@ -55,7 +55,7 @@ class Curve:
 
 def measured(
     setup: Setup, name: str, data: str, perturbations: Sequence[dict[str, Any] | None]
-) -> Cell:
+) -> Task:
     """Everybody under each of the perturbations."""
     sizes = setup.sizes["robustness"]
     whole = setup.composed(
@@ -70,17 +70,20 @@ def measured(
         "perturbations": list(perturbations),
         "code of perturbations": code_digest(PERTURBATIONS),
     }
-    needs = {"model": setup.trained(sizes["trained_on"]), "data": setup.prepared(data, "test")}
+    dependencies = {
+        "model": setup.trained(sizes["trained_on"]),
+        "data": setup.prepared(data, "test"),
+    }
     seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
     name = f"robustness-{name}-seed{setup.seed}"
-    return Cell(name, "ghpt.paper.robustness.work.curve", config, needs, seconds=seconds)
+    return Task(name, "ghpt.paper.robustness.actions.curve", config, dependencies, seconds=seconds)
 
 
-def cells_of(setup: Setup, of: Sequence[Curve]) -> dict[str, Cell]:
-    cells = {curve.name: curve.cell(setup) for curve in of}
+def tasks_of(setup: Setup, of: Sequence[Curve]) -> dict[str, Task]:
+    tasks = {curve.name: curve.task(setup) for curve in of}
     if any(0 in curve.levels(setup) for curve in of):
-        cells[CLEAN] = measured(setup, CLEAN, "h36m", [None])
-    return cells
+        tasks[CLEAN] = measured(setup, CLEAN, "h36m", [None])
+    return tasks
 
 
 @dataclass(frozen=True)

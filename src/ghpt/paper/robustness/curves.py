@@ -7,8 +7,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-from ghpt.paper.engine.item import Claim, Item, Results, Section
-from ghpt.paper.robustness.curve import Curve, Found, cells_of, found
+from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section
+from ghpt.paper.robustness.curve import Curve, Found, found, tasks_of
 from ghpt.paper.robustness.figure import LABELS, Panel, curves
 from ghpt.paper.robustness.text import TIE, standing, table, verdict
 
@@ -86,9 +86,9 @@ def _item(
     *of: Curve,
     absolute: bool = False,
     claims: Claims = _no_claims,
-) -> Item:
+) -> Artefact:
     section = partial(_section, of=of, about=about, absolute=absolute, claims=claims)
-    return Item(label, "robustness", title, partial(cells_of, of=of), section)
+    return Artefact(label, "robustness", title, partial(tasks_of, of=of), section)
 
 
 _SAME = "All estimators get the same key points; none is trained or tuned again, and confidences stay as they were. "
@@ -117,7 +117,7 @@ MISSING_VIEWS = Curve(
 ROTATION = Curve("rotation", "RotatedCameras", "degrees", "rotation of each camera, degrees", "°")
 SHIFT = Curve("shift", "ShiftedCameras", "millimetres", "shift of each camera, mm", " mm")
 
-ITEMS = (
+ARTEFACTS = (
     _item(
         "robustness-outliers",
         "More outliers",

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
-from ghpt.paper.engine.item import Spread
+from ghpt.paper.engine.artefact import Spread
 from ghpt.report.figures import wrapped
 from ghpt.report.tables import NAMES
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ghpt.paper.engine.item import signed
+from ghpt.paper.engine.artefact import signed
 from ghpt.paper.robustness.curve import Curve, Found, nan_to_last
 from ghpt.paper.robustness.figure import LABELS
 from ghpt.report.escape import Markdown

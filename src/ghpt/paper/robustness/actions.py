@@ -15,7 +15,7 @@ from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.aggregation import aggregation_weights
 from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
-from ghpt.paper.engine.work import CHECKPOINT
+from ghpt.paper.engine.actions import CHECKPOINT
 from ghpt.recording import Observations, PoseEstimate
 from ghpt.report.poses import estimators
 from ghpt.skeleton import JOINTS
@@ -30,9 +30,9 @@ Estimator = Callable[[Observations], PoseEstimate]
 
 
 @torch.no_grad()
-def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+def curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
     """Estimate ``config["data"]`` under each of ``config["perturbations"]`` (None: as it is) with
-    the model of ``needs["model"]``, ``config["view_weights"]`` and ``config["baselines"]``.
+    the model of ``dependencies["model"]``, ``config["view_weights"]`` and ``config["baselines"]``.
 
     result.json: for each perturbation, estimator -> MPJPE (mm) ``relative`` and ``absolute``, and
     the ``coverage`` of each: the share of the joints with a truth that were counted.
@@ -40,7 +40,7 @@ def curve(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
     data = build(config["data"], "data")
     data.setup("test")
     frames = data.frames["test"]
-    model, _ = load_model(needs["model"] / CHECKPOINT, seed=config["seed"])
+    model, _ = load_model(dependencies["model"] / CHECKPOINT, seed=config["seed"])
     everybody = together(model.eval(), estimators(config, model))
     perturbations = build(config["perturbations"], "perturbations")
     levels: list[dict[str, dict[str, MPJPE]]] = [{} for _ in perturbations]

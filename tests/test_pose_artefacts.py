@@ -9,7 +9,7 @@ import pytest
 
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.paper.engine.item import Compared, Results, Spread
+from ghpt.paper.engine.artefact import Comparison, Results, Spread
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
 from ghpt.paper.pose import figures as pose_figures
@@ -26,17 +26,17 @@ SETUP = Setup(CONF, {"human36m": None, "panoptic": None}, {"train": (), "test": 
 REAL = Setup(
     CONF, {"human36m": "/data/human36m", "panoptic": "/data/panoptic"}, SETUP.overrides, {}, 0
 )
-ITEMS = {
+ARTEFACTS = {
     i.label: i
     for part in (generalization, other_systems, base_dataset, pose_figures, view_weights)
-    for i in part.ITEMS
+    for i in part.ARTEFACTS
 }
 ESTIMATORS = (*AGGREGATIONS, "view_weights", *base_dataset.BASELINES)
 PRIOR = {"weight": 1e-3, "best": 1.1e-3, "average": 2e-3}
 
 
 def papers(name):
-    """metrics.json of the test cell ``"cmu1 on h36m"`` as the paper has it."""
+    """metrics.json of the test task ``"cmu1 on h36m"`` as the paper has it."""
     if name in LIMITATION:
         errors = dict.fromkeys(ESTIMATORS, LIMITATION[name])
     else:
@@ -102,7 +102,7 @@ TABLES = (
 
 @pytest.mark.parametrize("label", TABLES)
 def test_the_papers_own_numbers_have_no_miss_and_all_of_its_claims(label):
-    section = ITEMS[label].section(Fake(same, setup=REAL))
+    section = ARTEFACTS[label].section(Fake(same, setup=REAL))
     assert all(claim.holds for claim in section.claims), [c for c in section.claims if not c.holds]
     assert section.claims
     rounding = {
@@ -110,11 +110,11 @@ def test_the_papers_own_numbers_have_no_miss_and_all_of_its_claims(label):
         "remelli-comparison": 0.005,
         "sota-comparison": 0.005,
     }
-    for number in section.compared:
+    for number in section.comparisons:
         assert abs(number.difference) <= rounding.get(label, 1e-9), number
     assert "miss" not in section.body
     assert "synthetic" not in section.data
-    synthetic = ITEMS[label].section(Fake(same))
+    synthetic = ARTEFACTS[label].section(Fake(same))
     assert "synthetic" in synthetic.data
     published = label in ("iskakov-comparison", "sota-comparison", "quantitative")
     assert (None in [claim.holds for claim in synthetic.claims]) == published
@@ -129,8 +129,8 @@ def worse(name, metrics):
     "label", [label for label in TABLES if label not in ("quantitative", "limitation-table")]
 )
 def test_a_worse_model_misses_and_its_claims_fall(label):
-    section = ITEMS[label].section(Fake(worse, setup=REAL))
-    assert any(number.miss for number in section.compared)
+    section = ARTEFACTS[label].section(Fake(worse, setup=REAL))
+    assert any(number.miss for number in section.comparisons)
     assert not all(claim.holds for claim in section.claims)
     assert "(miss)" in section.body or label == "remelli-comparison"
 
@@ -139,7 +139,7 @@ def test_numbers_over_seeds_have_their_deviation():
     def shifted(name, metrics):
         metrics["selections"]["weight"]["mpjpe_relative"] += 1
 
-    section = ITEMS["iskakov-comparison"].section(Fake(same, shifted))
+    section = ARTEFACTS["iskakov-comparison"].section(Fake(same, shifted))
     assert "31.5 ± 0.7" in section.body
     assert Spread((31.0, 32.0)).deviation == pytest.approx(0.5**0.5)
     assert Spread((31.0,)).text() == "31.0"
@@ -157,7 +157,7 @@ def test_numbers_over_seeds_have_their_deviation():
     ],
 )
 def test_what_is_a_miss(paper, ours, better, miss):
-    number = Compared("x", paper, Spread((ours,)), better)
+    number = Comparison("x", paper, Spread((ours,)), better)
     assert number.miss == miss
     assert ("(miss)" in number.cells()[2]) == miss
 
@@ -169,7 +169,7 @@ def test_a_drop_to_novel_arrangements_is_of_the_trained_one():
 
     rows = [
         row
-        for row in ITEMS["remelli-comparison"].section(Fake(drop)).body.splitlines()
+        for row in ARTEFACTS["remelli-comparison"].section(Fake(drop)).body.splitlines()
         if "ours (CMU" in row
     ]
     assert len(rows) == 4
@@ -180,7 +180,7 @@ def test_baselines_on_panoptic_are_the_mean_of_the_four_arrangements():
     def ransac(name, metrics):
         metrics["selections"]["ransac"]["mpjpe_relative"] = 10.0 * int(name[3])
 
-    body = ITEMS["sota-comparison"].section(Fake(ransac)).body
+    body = ARTEFACTS["sota-comparison"].section(Fake(ransac)).body
     row = next(line for line in body.splitlines() if line.startswith("| RANSAC on our"))
     assert row.split("|")[3].strip() == "25.0"
     assert f"{SOTA['RANSAC']}" in body
@@ -191,7 +191,7 @@ def test_the_pose_prior_claims_follow_the_numbers():
         for part in PARTS:
             metrics["selections"]["least"]["pose_prior"]["S9"][part] = 1e-5
 
-    good, bad = (ITEMS["pose-prior"].section(Fake(change)) for change in (same, flipped))
+    good, bad = (ARTEFACTS["pose-prior"].section(Fake(change)) for change in (same, flipped))
     assert [claim.holds for claim in good.claims] == [True, True, True, True]
     assert [claim.holds for claim in bad.claims] == [False, False, False, True]
     assert list(good.figures) == ["pose-prior"]
@@ -202,14 +202,14 @@ def test_other_systems_have_view_weights_of_the_novel_arrangements_beside_them()
         train, test = name.split(" on ")
         metrics["selections"]["view_weights"]["mpjpe_relative"] = 99.0 if train == test else 20.0
 
-    body = ITEMS["sota-comparison"].section(Fake(view_weights)).body
+    body = ARTEFACTS["sota-comparison"].section(Fake(view_weights)).body
     (row,) = (line for line in body.splitlines() if line.startswith("| view weights"))
     assert row.split("|")[3].strip() == "20.0"
     assert any(line.startswith("| adaptive RANSAC on our detections") for line in body.splitlines())
 
 
 @pytest.mark.parametrize(
-    ("cell", "error", "holds"),
+    ("task", "error", "holds"),
     [
         ("", 0.0, [True, True, True]),
         (
@@ -222,12 +222,12 @@ def test_other_systems_have_view_weights_of_the_novel_arrangements_beside_them()
     ],
 )
 def test_view_weights_are_set_beside_the_papers_selection_and_the_best_classical_estimator(
-    cell, error, holds
+    task, error, holds
 ):
     def change(name, metrics):
-        metrics["selections"]["view_weights"]["mpjpe_relative"] = error if name == cell else 20.0
+        metrics["selections"]["view_weights"]["mpjpe_relative"] = error if name == task else 20.0
 
-    section = ITEMS["view-weights"].section(Fake(change))
+    section = ARTEFACTS["view-weights"].section(Fake(change))
     assert [claim.holds for claim in section.claims] == holds
     assert {claim.where for claim in section.claims} == {"not in the paper"}
     rows = [
@@ -244,42 +244,42 @@ def test_view_weights_are_set_beside_the_papers_selection_and_the_best_classical
         "RANSAC 27.40",
     ]
     assert rows[-2][:2] == ["H36M, view weights", "20.00"]
-    assert not section.compared
+    assert not section.comparisons
 
 
 def test_every_test_has_view_weights_but_those_of_other_splits():
     grid = generalization.grid(SETUP)
-    assert all(cell.config["view_weights"] for cell in grid.values())
-    assert {name for name, cell in grid.items() if cell.config["baselines"]} == {
+    assert all(task.config["view_weights"] for task in grid.values())
+    assert {name for name, task in grid.items() if task.config["baselines"]} == {
         f"{data} on {data}" for data in generalization.ARRANGEMENTS
     }
-    limitation = ITEMS["limitation-table"].cells(SETUP)
+    limitation = ARTEFACTS["limitation-table"].tasks(SETUP)
     assert not limitation["train"].config["view_weights"]
     assert limitation["test"].config["view_weights"]
 
 
 def test_hyperparameters_are_those_of_the_configuration():
-    body = ITEMS["hyperparameters"].section(Results([SETUP], [{}], Path())).body
+    body = ARTEFACTS["hyperparameters"].section(Results([SETUP], [{}], Path())).body
     row = next(line for line in body.splitlines() if "alpha" in line)
-    assert [cell.strip() for cell in row.split("|")[2:6]] == [
+    assert [task.strip() for task in row.split("|")[2:6]] == [
         "1.0, 0.01, 0.02",
         "1.0, 0.01, 0.02",
         "1.0, 0.01, 0.0",
         "1.0, 0.01, 0.0",
     ]
     changed = Setup(CONF, SETUP.roots, {"train": ("model.hypotheses=77",), "test": ()}, {}, 0)
-    assert "77" in ITEMS["hyperparameters"].section(Results([changed], [{}], Path())).body
+    assert "77" in ARTEFACTS["hyperparameters"].section(Results([changed], [{}], Path())).body
 
 
-def test_cells_are_shared_between_items():
+def test_tasks_are_shared_between_items():
     grid = generalization.grid(SETUP)
     assert len(grid) == 25
     itself = base_dataset.on_itself(SETUP, "h36m", "cmu3")
-    for name, cell in itself.items():
-        assert grid[name].key == cell.key
-    limitation = ITEMS["limitation-table"].cells(SETUP)
+    for name, task in itself.items():
+        assert grid[name].key == task.key
+    limitation = ARTEFACTS["limitation-table"].tasks(SETUP)
     assert limitation["test"].key == grid["h36m on h36m"].key
-    assert len({cell.needs["model"].key for cell in grid.values()}) == 5
+    assert len({task.dependencies["model"].key for task in grid.values()}) == 5
     other = Setup(CONF, SETUP.roots, SETUP.overrides, {}, 1)
     assert generalization.grid(other)["cmu1 on h36m"].key != grid["cmu1 on h36m"].key
     data = [s.prepared("h36m", "test").key for s in (SETUP, other)]

@@ -1,4 +1,4 @@
-"""The cells and numbers that the camera problem's tables and figure share."""
+"""The tasks and numbers that the camera problem's tables and figure share."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ghpt.paper.engine.cells import Cell
-from ghpt.paper.engine.item import Compared, Results, Spread
+from ghpt.paper.engine.artefact import Comparison, Results, Spread
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task
 from ghpt.paper.published import FUNDAMENTAL_FRAMES
 
 
-def camera_model(setup: Setup) -> Cell:
+def camera_model(setup: Setup) -> Task:
     """The paper's: trained on Human3.6M."""
     return setup.trained("h36m", model="camera", seconds=100.0)
 
@@ -24,7 +24,7 @@ def of_test(composed: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def tested_pairs(setup: Setup) -> dict[str, Cell]:
+def tested_pairs(setup: Setup) -> dict[str, Task]:
     """The camera model on Human3.6M with all classical estimators."""
     return {
         "test": setup.tested(
@@ -52,7 +52,7 @@ def measured(spread: Spread, times: float = 1.0) -> Spread | None:
     )
 
 
-def three_rows(pair: str, numbers: Sequence[Compared], more: Sequence[str]) -> list[list[str]]:
+def three_rows(pair: str, numbers: Sequence[Comparison], more: Sequence[str]) -> list[list[str]]:
     """Rows *paper*, *ours* and *difference* of a pair; ``more`` is what else there is of ours."""
     kinds = zip(
         ("paper", "ours", "difference"),

@@ -1,4 +1,4 @@
-"""Cells are computed once, in the order of their needs, on several processes, and kept whatever
+"""Tasks are computed once, in the order of their dependencies, on several processes, and kept whatever
 happens.
 """
 
@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from ghpt.errors import GhptDataError
-from ghpt.paper.engine.cells import read_json, with_needs
 from ghpt.paper.engine.code import code_digest, meaning
 from ghpt.paper.engine.pool import perform_all
-from toy_cells import cell
+from ghpt.paper.engine.tasks import read_json, with_dependencies
+from toy_tasks import task
 
 
 @pytest.fixture
@@ -29,53 +29,55 @@ def numbers(diary):
 
 
 def diamond(diary, first=1, last=4):
-    """Two cells that need the same one, and a last that needs both."""
-    a = cell(diary, first)
-    b, c = cell(diary, 2, a), cell(diary, 3, a)
-    return cell(diary, last, b, c)
+    """Two tasks that need the same one, and a last that needs both."""
+    a = task(diary, first)
+    b, c = task(diary, 2, a), task(diary, 3, a)
+    return task(diary, last, b, c)
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_each_cell_is_done_once_after_what_it_needs(diary, tmp_path, jobs):
+def test_each_task_is_done_once_after_what_it_needs(diary, tmp_path, jobs):
     last = diamond(diary)
-    assert perform_all([last, *last.needs.values()], tmp_path / "cells", jobs, show=False) == 4
+    assert (
+        perform_all([last, *last.dependencies.values()], tmp_path / "tasks", jobs, show=False) == 4
+    )
     assert sorted(numbers(diary)) == [1, 2, 3, 4]
     assert numbers(diary)[0] == 1
     assert numbers(diary)[-1] == 4
-    assert read_json(last.folder(tmp_path / "cells") / "result.json") == 4 + (2 + 1) + (3 + 1)
+    assert read_json(last.folder(tmp_path / "tasks") / "result.json") == 4 + (2 + 1) + (3 + 1)
     here = {int(line.split()[1]) for line in diary.read_text().splitlines()} == {os.getpid()}
     assert here == (jobs == 1)
 
 
 def test_only_what_changed_is_done_again(diary, tmp_path):
-    cells = tmp_path / "cells"
-    perform_all([diamond(diary)], cells, 1, show=False)
-    assert perform_all([diamond(diary)], cells, 1, show=False) == 0
-    assert perform_all([diamond(diary, last=5)], cells, 1, show=False) == 1
-    assert perform_all([diamond(diary, first=7)], cells, 1, show=False) == 4
+    tasks = tmp_path / "tasks"
+    perform_all([diamond(diary)], tasks, 1, show=False)
+    assert perform_all([diamond(diary)], tasks, 1, show=False) == 0
+    assert perform_all([diamond(diary, last=5)], tasks, 1, show=False) == 1
+    assert perform_all([diamond(diary, first=7)], tasks, 1, show=False) == 4
     assert numbers(diary) == [1, 2, 3, 4, 5, 7, 2, 3, 4]
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_names_the_cell_and_keeps_what_is_finished(diary, tmp_path, jobs):
-    good = cell(diary, 1)
-    bad = cell(diary, -1, good)  # after it: an error ends at once what is made beside it
+def test_an_error_names_the_task_and_keeps_what_is_finished(diary, tmp_path, jobs):
+    good = task(diary, 1)
+    bad = task(diary, -1, good)  # after it: an error ends at once what is made beside it
     with pytest.raises(
         GhptDataError, match=r"^add--1: .*is negative. Give a positive one"
     ) as caught:
-        perform_all([cell(diary, 2, bad)], tmp_path / "cells", jobs, show=False)
+        perform_all([task(diary, 2, bad)], tmp_path / "tasks", jobs, show=False)
     assert caught.value.field == "number"
-    assert good.done(tmp_path / "cells")
-    assert not bad.done(tmp_path / "cells")
+    assert good.done(tmp_path / "tasks")
+    assert not bad.done(tmp_path / "tasks")
 
 
 def test_the_key_knows_config_needs_and_code(diary, monkeypatch):
     assert diamond(diary).key == diamond(diary).key
     assert len({diamond(diary).key, diamond(diary, first=9).key, diamond(diary, last=9).key}) == 3
     before = diamond(diary).key
-    monkeypatch.setattr("ghpt.paper.engine.cells.code_digest", lambda module: "changed")
+    monkeypatch.setattr("ghpt.paper.engine.tasks.code_digest", lambda module: "changed")
     assert diamond(diary).key != before
-    assert len(with_needs([diamond(diary), diamond(diary)])) == 4
+    assert len(with_dependencies([diamond(diary), diamond(diary)])) == 4
 
 
 def test_comments_docstrings_and_layout_are_no_code(tmp_path):
@@ -92,13 +94,13 @@ def test_comments_docstrings_and_layout_are_no_code(tmp_path):
         == plain
     )
     assert digest("c.py", "def f(x):\n    return x + 2\n") != plain
-    assert code_digest("toy_cells") != code_digest("ghpt.paper.engine.work")
+    assert code_digest("toy_tasks") != code_digest("ghpt.paper.engine.actions")
 
 
 PROGRAM = """
 import sys
 from pathlib import Path
-from test_cells import slow
+from test_tasks import slow
 from ghpt.paper.engine.pool import perform_all
 if __name__ == "__main__":
     perform_all(slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
@@ -106,7 +108,7 @@ if __name__ == "__main__":
 
 
 def slow(diary):
-    return [cell(diary, 1), *(cell(diary, n, sleep=600) for n in (2, 3))]
+    return [task(diary, 1), *(task(diary, n, sleep=600) for n in (2, 3))]
 
 
 @pytest.mark.posix
@@ -116,7 +118,7 @@ def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_pat
     program.write_text(PROGRAM)
     path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(program), str(diary), str(tmp_path / "cells")]
+    command = [sys.executable, str(program), str(diary), str(tmp_path / "tasks")]
     with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as run:
         until(lambda: {2, 3} <= set(numbers(diary)), 300)
         run.send_signal(getattr(signal, stop))
@@ -124,11 +126,11 @@ def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_pat
     workers = {int(line.split()[1]) for line in diary.read_text().splitlines()}
     until(lambda: not any(alive(worker) for worker in workers), 60)
     first, *others = slow(diary)
-    assert first.done(tmp_path / "cells")
-    assert not any(other.done(tmp_path / "cells") for other in others)
-    assert perform_all([first, cell(diary, 4, first)], tmp_path / "cells", 1, show=False) == 1
+    assert first.done(tmp_path / "tasks")
+    assert not any(other.done(tmp_path / "tasks") for other in others)
+    assert perform_all([first, task(diary, 4, first)], tmp_path / "tasks", 1, show=False) == 1
     if stop != "SIGKILL":  # orphans may stay in the table of processes for a while, and look alive
-        assert [path.name for path in (tmp_path / "cells").glob(".*.tmp")] == []
+        assert [path.name for path in (tmp_path / "tasks").glob(".*.tmp")] == []
 
 
 def alive(process):

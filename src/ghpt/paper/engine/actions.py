@@ -1,4 +1,4 @@
-"""The work of the commonest cells: prepare a split, train, test."""
+"""The work of the commonest tasks: prepare a split, train, test."""
 
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ QUIET = {"progress_bar": False}
 CHECKPOINT = LAST
 
 
-def prepare_split(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+def prepare_split(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
     """Have the recordings of ``config["data"]``, split ``config["split"]``, in the cache of
     prepared recordings.
     """
@@ -21,7 +21,7 @@ def prepare_split(config: dict[str, Any], needs: dict[str, Path], folder: Path) 
     write_json(folder / "result.json", {"frames": sum(map(len, recordings))})
 
 
-def train_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
+def train_model(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
     """What train.py does; the checkpoint is kept without the optimiser, two thirds of it, for
     nobody goes on from here.
 
@@ -35,9 +35,9 @@ def train_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) ->
     write_json(folder / "result.json", errors)
 
 
-def test_model(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """What test.py computes with the model of ``needs["model"]``: metrics.json, predictions.npz."""
-    measure(config | QUIET | {"ckpt": str(needs["model"] / CHECKPOINT)}, folder)
+def test_model(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
+    """What test.py computes with the model of ``dependencies["model"]``: metrics.json, predictions.npz."""
+    measure(config | QUIET | {"ckpt": str(dependencies["model"] / CHECKPOINT)}, folder)
 
 
 test_model.__test__ = False  # not one for pytest

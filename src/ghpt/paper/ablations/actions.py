@@ -17,7 +17,7 @@ from ghpt.models.aggregation import aggregation_weights, cap_logit_std
 from ghpt.models.checkpoint import load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.problem import PoseHypotheses
-from ghpt.paper.engine.work import CHECKPOINT
+from ghpt.paper.engine.actions import CHECKPOINT
 from ghpt.recording import Observations
 from ghpt.skeleton import JOINTS
 
@@ -25,15 +25,15 @@ AGGREGATIONS = ("weight", "average", "best")
 
 
 @torch.no_grad()
-def evaluate(config: dict[str, Any], needs: dict[str, Path], folder: Path) -> None:
-    """Test the model of ``needs["model"]`` on each data module of ``config["sets"]`` under each of
+def evaluate(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
+    """Test the model of ``dependencies["model"]`` on each data module of ``config["sets"]`` under each of
     ``config["settings"]``, pairs of a number of hypotheses and a temperature (None: the model's
     own).
 
     result.json: set -> for each setting selection -> pelvis-relative MPJPE (mm). A smaller pool is
     the beginning of a larger one, the same that test.py draws with so many hypotheses.
     """
-    model, _ = load_model(needs["model"] / CHECKPOINT, seed=config["seed"])
+    model, _ = load_model(dependencies["model"] / CHECKPOINT, seed=config["seed"])
     model.eval()
     settings = [(h or model.hypotheses, t or model.temperature) for h, t in config["settings"]]
     result = {}

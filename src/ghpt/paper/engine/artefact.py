@@ -1,4 +1,4 @@
-"""An item of the report, a table or a figure: the cells it is made of, and what it makes of their
+"""An artefact of the report, a table or a figure: the tasks it is made of, and what it makes of their
 results.
 """
 
@@ -13,8 +13,8 @@ from typing import Any, Literal
 
 from matplotlib.figure import Figure
 
-from ghpt.paper.engine.cells import Cell, read_json
 from ghpt.paper.engine.setup import Setup
+from ghpt.paper.engine.tasks import Task, read_json
 from ghpt.report.tables import NONE, display_name, markdown
 
 TOLERANCE = 0.05
@@ -57,7 +57,7 @@ def over_seeds(function: Callable[..., float], *spreads: Spread) -> Spread:
 
 
 @dataclass(frozen=True)
-class Compared:
+class Comparison:
     """One number of the paper beside ours."""
 
     what: str
@@ -91,7 +91,7 @@ class Compared:
         return [paper, NONE if self.ours is None else self.ours.text(self.digits), difference]
 
 
-def comparison(rows: Sequence[Compared], head: str, unit: str = "mm") -> str:
+def comparison_table(rows: Sequence[Comparison], head: str, unit: str = "mm") -> str:
     """A Markdown table of *paper | ours | difference*."""
     return markdown(
         [head, f"paper, {unit}", f"ours, {unit}", "difference"],
@@ -120,14 +120,14 @@ class Claim:
 
 @dataclass(frozen=True)
 class Section:
-    """What an item shows."""
+    """What an artefact shows."""
 
     data: str
     """The data used, in words that tell synthetic from real: goes into the heading."""
     body: str
     """Markdown. ``![caption](name.svg)`` shows ``figures["name"]``."""
     figures: Mapping[str, Figure] = field(default_factory=dict)
-    compared: Sequence[Compared] = ()
+    comparisons: Sequence[Comparison] = ()
     """Every number that the paper prints, for the summary and the list of misses."""
     claims: Sequence[Claim] = ()
     explained: str = ""
@@ -137,13 +137,13 @@ class Section:
 
 
 class Results:
-    """The results of an item's cells, for each seed."""
+    """The results of an artefact's tasks, for each seed."""
 
     def __init__(
-        self, setups: Sequence[Setup], cells: Sequence[Mapping[str, Cell]], folder: Path
+        self, setups: Sequence[Setup], tasks: Sequence[Mapping[str, Task]], folder: Path
     ) -> None:
         self.setups = setups
-        self._cells = cells
+        self._tasks = tasks
         self._folder = folder
 
     @property
@@ -152,11 +152,11 @@ class Results:
         return self.setups[0]
 
     def paths(self, name: str) -> list[Path]:
-        """The folder of a cell for each seed."""
-        return [cells[name].folder(self._folder) for cells in self._cells]
+        """The folder of a task for each seed."""
+        return [tasks[name].folder(self._folder) for tasks in self._tasks]
 
     def read(self, name: str, file: str = "result.json") -> list[Any]:
-        """A cell's file for each seed."""
+        """A task's file for each seed."""
         key = (name, file)
         if key not in self._read:
             self._read[key] = [read_json(path / file) for path in self.paths(name)]
@@ -167,7 +167,7 @@ class Results:
         return {}
 
     def spread(self, name: str, *keys: str, file: str = "metrics.json") -> Spread:
-        """A number of a cell's file, found by its keys, over the seeds."""
+        """A number of a task's file, found by its keys, over the seeds."""
         values = []
         for content in self.read(name, file):
             for key in keys:
@@ -176,7 +176,7 @@ class Results:
         return Spread(tuple(values))
 
     def relative(self, name: str, selection: str = "weight") -> Spread:
-        """Pelvis-relative MPJPE (mm) of a selection or baseline in a test cell."""
+        """Pelvis-relative MPJPE (mm) of a selection or baseline in a test task."""
         return self.spread(name, "selections", selection, "mpjpe_relative")
 
     def display_name(self, data: str) -> str:
@@ -188,14 +188,14 @@ class Results:
 
 
 @dataclass(frozen=True)
-class Item:
+class Artefact:
     """A table or figure of the paper, an ablation, or a robustness curve."""
 
     label: str
     """In paper.tex without ``tab:`` and ``fig:``, or our own."""
     kind: Literal["table", "figure", "ablation", "robustness"]
     title: str
-    cells: Callable[[Setup], dict[str, Cell]]
+    tasks: Callable[[Setup], dict[str, Task]]
     """By a name that ``section`` knows."""
     section: Callable[[Results], Section]
     of_paper: bool = True
