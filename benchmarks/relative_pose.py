@@ -24,7 +24,7 @@ from ghpt import randomness
 from ghpt.config import build
 from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.models.relative_pose.baselines import Robust, size_in_image
-from ghpt.recording import PairBatch
+from ghpt.observations import PairObservations
 
 THEIRS = ("usac_accurate", "poselib")
 
@@ -36,14 +36,14 @@ def draws(data: str, frames: int, count: int) -> Pairs:
     return Pairs(module.frames["test"].recordings, PairSettings(frames, count, points=1), seed=0)
 
 
-def solve(baseline: Robust, batch: PairBatch) -> list[float]:
+def solve(baseline: Robust, batch: PairObservations) -> list[float]:
     """Seconds that the solver itself takes for each pair."""
     a, b, used = batch.correspondences()
     size, taken = size_in_image(batch).tolist(), []
     for i in range(len(batch)):
         x, y = a[i, used[i]], b[i, used[i]]
         start = time.perf_counter()
-        baseline.pose(x, y, size[i], batch.sample[i])
+        baseline.pose(x, y, size[i], batch.index[i])
         taken.append(time.perf_counter() - start)
     return taken
 
@@ -56,8 +56,8 @@ def race(frames: int, size: int, rounds: int) -> list[list[str]]:
     ours, theirs = [], {name: [] for name in THEIRS}
     for number in range(-1, rounds):
         first = max(number, 0) * size % (len(pairs) - size + 1)
-        batch = pairs[range(first, first + size)]
-        keys = randomness.key(0, "benchmark", batch.sample)
+        batch = pairs[range(first, first + size)].observations
+        keys = randomness.key(0, "benchmark", batch.index)
         start = time.perf_counter()
         model.problem.featurize(model.problem.generate(batch, model.hypotheses, keys))
         taken = time.perf_counter() - start
@@ -90,11 +90,11 @@ def rigs(data: str, frames: int, count: int) -> list[str]:
     )
     taken, succeeded = [], 0
     for draw in range(count):
-        batch = pairs[[draw * len(pairs.pairs)]]
+        batch = pairs[[draw * len(pairs.pairs)]].observations
         names = list(pairs.rigs[0].names)
         arrays = (x[0].transpose(0, 1) for x in (batch.key_points, batch.confidence, batch.valid))
         start = time.perf_counter()
-        estimate = calibration(names, batch.cameras.K[0], *arrays, None, 0)
+        estimate = calibration(names, batch.K[0], *arrays, None, 0)
         taken.append(time.perf_counter() - start)
         succeeded += estimate.succeeded
     times = f"{statistics.median(taken):.1f}", f"{max(taken):.1f}"

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 
 DATA = {
     "_target_": "scene.SceneData",
@@ -48,12 +48,12 @@ def ring(views: int) -> Cameras:
     )
 
 
-def take(name: str, frames: int, cameras: Cameras, rng: np.random.Generator) -> Recording:
+def take(name: str, frames: int, cameras: Cameras, rng: np.random.Generator) -> LabelledRecording:
     """One random body that shakes; ``NOISE`` on every key point and one in fifty unseen."""
     truth = rng.normal(0, 400, (17, 3)) + rng.normal(0, 60, (frames, 17, 3))
     pixels, _ = project(cameras, torch.from_numpy(truth))
     views = pixels.shape[1]
-    return Recording(
+    return LabelledRecording(
         name=name,
         subject="S1",
         action="Walking",
@@ -79,7 +79,7 @@ class SceneData(KeyPointDataModule):
     def cache_key(self, split: str) -> dict[str, Any]:
         return {"name": f"scene-{split}", "views": self.views, "frames": self.lengths[split]}
 
-    def generate(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[LabelledRecording]:
         rng, cameras = np.random.default_rng(len(split)), ring(self.views)
         for first in range(0, self.lengths[split], _TAKE):
             yield take(f"{split}-{first}", min(_TAKE, self.lengths[split] - first), cameras, rng)

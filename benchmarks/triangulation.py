@@ -30,14 +30,14 @@ from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
 from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.lo_ransac import pycolmap_cameras
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 HYPOTHESES = 200
 
 
 def batch(views: int, frames: int) -> Observations:
     recording = scene.take("bench", frames, scene.ring(views), np.random.default_rng(views))
-    return Frames([recording], np.arange(frames))[range(frames)]
+    return Frames([recording], np.arange(frames))[range(frames)].observations
 
 
 def with_outliers(data: Observations) -> Observations:
@@ -122,7 +122,7 @@ def main() -> None:
     for views in map(int, wanted["views"].split(",")):
         many, few = batch(views, wanted["frames"]), batch(views, wanted["loop_frames"])
         one = batch(views, 16)
-        subsets = random_subsets(one.valid, HYPOTHESES, randomness.key(0, "benchmark", one.sample))
+        subsets = random_subsets(one.valid, HYPOTHESES, randomness.key(0, "benchmark", one.index))
         taken = seconds(
             lambda one=one, s=subsets: triangulate_subsets(
                 one.cameras, one.key_points, one.valid, s

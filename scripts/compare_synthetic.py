@@ -28,7 +28,7 @@ from ghpt.data.synthetic.recordings import synthetic_recordings, takes
 from ghpt.geometry import lens
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.models.estimators.classical import MEstimator
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -302,16 +302,14 @@ def _residual(
     cameras: Cameras, key_points: np.ndarray, confidence: np.ndarray, valid: np.ndarray
 ) -> np.ndarray:
     """T V J 2 in statures; NaN where not seen or seen in fewer than 3 views."""
-    frames, joints = len(key_points), key_points.shape[2]
+    frames = len(key_points)
     batch = Observations(
-        sample=torch.arange(frames),
+        index=torch.arange(frames),
         recording=torch.zeros(frames, dtype=torch.int64),
         cameras=Cameras(*(x.expand(frames, *x.shape) for x in (cameras.K, cameras.R, cameras.t))),
         key_points=torch.from_numpy(key_points),
         confidence=torch.from_numpy(confidence),
         valid=torch.from_numpy(valid),
-        truth=torch.zeros(frames, joints, 3),
-        truth_valid=torch.zeros(frames, joints, dtype=torch.bool),
     )
     points = MEstimator(loss="geman_mcclure", scale=0.01, iterations=50, tolerance=0.1)(
         batch

@@ -35,8 +35,8 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
 from ghpt.models.estimators.ransac import Ransac
+from ghpt.observations import Labelled, Observations, Truth
 from ghpt.randomness import key
-from ghpt.recording import Observations
 from ghpt.skeleton import PELVIS
 
 CONF = Path(__file__).resolve().parents[1] / "conf" / "detector"
@@ -67,7 +67,7 @@ class Draw:
     body_error: tuple[np.ndarray, np.ndarray]
     processes: list[Processes]
 
-    def batch(self, detector: Detector) -> Observations:
+    def batch(self, detector: Detector) -> Labelled[Observations, Truth]:
         """The detections in all views by these numbers."""
         take, count, views = self.take, len(self.points), range(len(self.processes))
         shown = detector.shown(self.points, self.body_error, take.familiar)
@@ -79,16 +79,16 @@ class Draw:
             torch.from_numpy(np.stack(x, axis=1)) for x in zip(*found, strict=True)
         )
         rig = take.rig.cameras
-        return Observations(
-            sample=torch.arange(count),
+        observations = Observations(
+            index=torch.arange(count),
             recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
             key_points=key_points,
             confidence=confidence,
             valid=valid,
-            truth=torch.from_numpy(self.points).float(),
-            truth_valid=torch.ones(self.points.shape[:2], dtype=torch.bool),
         )
+        truth_valid = torch.ones(self.points.shape[:2], dtype=torch.bool)
+        return Labelled(observations, Truth(torch.from_numpy(self.points).float(), truth_valid))
 
 
 def draws(detector: Detector, data: str, split: str, seed: int) -> list[Draw]:
@@ -138,9 +138,13 @@ def views_of(data: str, rig_names: tuple[str, ...]) -> dict[str, list[int]]:
     }
 
 
-def some_views(batch: Observations, views: list[int]) -> Observations:
-    parts = {name: getattr(batch, name)[:, views] for name in ("key_points", "confidence", "valid")}
-    return replace(batch, cameras=batch.cameras.index((slice(None), views)), **parts)
+def some_views(
+    batch: Labelled[Observations, Truth], views: list[int]
+) -> Labelled[Observations, Truth]:
+    whole = batch.observations
+    parts = {name: getattr(whole, name)[:, views] for name in ("key_points", "confidence", "valid")}
+    cameras = whole.cameras.index((slice(None), views))
+    return replace(batch, observations=replace(whole, cameras=cameras, **parts))
 
 
 def relative_error(points: torch.Tensor, ok: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
@@ -150,11 +154,14 @@ def relative_error(points: torch.Tensor, ok: torch.Tensor, truth: torch.Tensor) 
     return (error * ok).sum(dim=-1) / ok.sum(dim=-1).clamp(min=1)
 
 
-def rows(batch: Observations, threshold: float, seed: int) -> dict[str, torch.Tensor]:
+def rows(
+    labelled: Labelled[Observations, Truth], threshold: float, seed: int
+) -> dict[str, torch.Tensor]:
     """The learning-free rows for each frame of a batch, mm."""
-    subsets = random_subsets(batch.valid, HYPOTHESES, key(seed, "fit", batch.sample))
+    batch = labelled.observations
+    subsets = random_subsets(batch.valid, HYPOTHESES, key(seed, "fit", batch.index))
     points, ok = triangulate_subsets(batch.cameras, batch.key_points, batch.valid, subsets)
-    truth = batch.truth.double()
+    truth = labelled.truth.points.double()
     errors = relative_error(points, ok, truth[:, None])
     counted = ok[..., None].sum(dim=1).clamp(min=1)
     average = (points * ok[..., None]).sum(dim=1) / counted
@@ -222,10 +229,11 @@ def best_threshold(detector: Detector, data: str, seed: int) -> float:
 
     def error(threshold: float) -> float:
         estimates = [
-            (Ransac(threshold=threshold, pairs=64, seed=seed)(batch), batch) for batch in batches
+            (Ransac(threshold=threshold, pairs=64, seed=seed)(batch.observations), batch)
+            for batch in batches
         ]
         parts = [
-            relative_error(e.points.double(), e.estimated, batch.truth.double())
+            relative_error(e.points.double(), e.estimated, batch.truth.points.double())
             for e, batch in estimates
         ]
         return float(torch.cat(parts).mean())

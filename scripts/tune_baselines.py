@@ -49,7 +49,7 @@ def validation_batches(name: str) -> list:
 def error(estimator, batches: list) -> float:
     total = count = 0.0
     for batch in batches:
-        errors, counted = joint_errors(estimator(batch), batch.truth, batch.truth_valid, "relative")
+        errors, counted = joint_errors(estimator(batch.observations), batch.truth, "relative")
         total, count = total + errors.sum().item(), count + counted.sum().item()
     return total / count
 

@@ -23,7 +23,7 @@ from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.relative_pose import error_3d
 from ghpt.models.relative_pose.baselines import EightPoint, PairBaseline, PoseLib, Ransac, Usac
-from ghpt.recording import PairBatch, RelativePoseEstimate
+from ghpt.observations import Labelled, PairObservations, PairTruth, RelativePoseEstimate
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 DRAWS = 20
@@ -55,7 +55,7 @@ CANDIDATES: dict[str, dict[str, PairBaseline]] = {
 }
 
 
-def validation_pairs() -> PairBatch:
+def validation_pairs() -> Labelled[PairObservations, PairTruth]:
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
         config = plain(
             hydra.compose("train", ["data=h36m", "data.evaluate=validation", "output=none"])
@@ -68,21 +68,22 @@ def validation_pairs() -> PairBatch:
     return pairs[range(len(pairs))]
 
 
-def errors(estimate: RelativePoseEstimate, batch: PairBatch) -> Tensor:
+def errors(estimate: RelativePoseEstimate, pairs: PairTruth) -> Tensor:
     """E_3D of each pair, mean over the points; inf where there is no pose."""
-    truth = batch.pair_cameras()
+    truth = pairs.cameras
     (Ra, Rb), (ta, tb) = truth.R.unbind(1), truth.t.unbind(1)
     length = (tb - (Rb @ Ra.mT @ ta[..., None])[..., 0]).norm(dim=-1, keepdim=True)
     R = torch.stack((Ra, estimate.R @ Ra), dim=1)
     t = torch.stack((ta, (estimate.R @ ta[..., None])[..., 0] + length * estimate.t), dim=1)
-    error, counted = error_3d(Cameras(truth.K, R, t), truth, batch.points)
+    error, counted = error_3d(Cameras(truth.K, R, t), truth, pairs.points)
     mean = torch.where(counted, error, 0.0).sum(-1) / counted.sum(-1)
     return torch.where(estimate.estimated & (counted.sum(-1) > 0), mean, torch.inf)
 
 
 def main() -> None:
     torch.set_num_threads(1)
-    batch = validation_pairs()
+    labelled = validation_pairs()
+    batch = labelled.observations
     names = ["-".join(str(v + 1) for v in pair) for pair in batch.pair.tolist()]
     pairs = list(dict.fromkeys(names))
     for name in sys.argv[1:] or CANDIDATES:
@@ -99,7 +100,7 @@ def main() -> None:
             start = time.perf_counter()
             estimate = baseline(batch)
             duration = 1e3 * (time.perf_counter() - start) / len(batch)
-            error = errors(estimate, batch)
+            error = errors(estimate, labelled.truth)
             of_pair = torch.stack([error[[n == pair for n in names]].median() for pair in pairs])
             rows[setting] = (
                 *of_pair.tolist(),

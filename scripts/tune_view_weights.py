@@ -70,9 +70,8 @@ def validation_batches(name: str) -> list:
 def error(estimator, batches: list, condition) -> float:
     total = count = 0.0
     for batch in batches:
-        errors, counted = joint_errors(
-            estimator(condition(batch, 0)), batch.truth, batch.truth_valid, "relative"
-        )
+        estimate = estimator(condition(batch.observations, 0))
+        errors, counted = joint_errors(estimate, batch.truth, "relative")
         total, count = total + errors.sum().item(), count + counted.sum().item()
     return total / count
 

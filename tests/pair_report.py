@@ -12,7 +12,7 @@ from ghpt.data.datasets.pairs import RigOfSplit
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.predictions import PairPredictions, PairWriter, open_pairs
 from ghpt.models.rows import WEIGHTS
-from ghpt.recording import RelativePoseEstimate
+from ghpt.observations import RelativePoseEstimate
 from scenes import look_at
 
 META = {

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.recording import Observations
+from ghpt.observations import Labelled, Observations, PairObservations, PairTruth, select_views
 
 _STANDING = {
     "right_ankle": (-120, 0, 80),
@@ -49,7 +49,7 @@ class Scene:
         shape = self.key_points.shape[:-1]
         valid = torch.ones(shape, dtype=torch.bool) if valid is None else valid
         return Observations(
-            sample=torch.arange(shape[0]),
+            index=torch.arange(shape[0]),
             recording=torch.zeros(shape[0], dtype=torch.int64),
             cameras=self.cameras,
             key_points=self.key_points,
@@ -57,14 +57,40 @@ class Scene:
             confidence=torch.ones(shape, dtype=self.points.dtype)
             if confidence is None
             else confidence,
-            truth=self.points,
-            truth_valid=torch.ones(self.points.shape[:-1], dtype=torch.bool),
         )
 
     def noisy(self, sigma: float, seed: int) -> Scene:
         """The same with Gaussian noise of ``sigma`` pixels on the key points."""
         noise = np.random.default_rng(seed).normal(0, sigma, tuple(self.key_points.shape))
         return replace(self, key_points=self.key_points + torch.from_numpy(noise))
+
+
+def labelled_pairs(
+    rigs: Cameras,
+    pair: Tensor,
+    key_points: Tensor,
+    valid: Tensor | None = None,
+    points: Tensor | None = None,
+    draw: Tensor | None = None,
+) -> Labelled[PairObservations, PairTruth]:
+    """Pairs of views of B rigs [B, V] with their key points [B, V, M, J, 2]; each its own draw."""
+    count = torch.arange(len(pair))
+    shape = key_points.shape[:-1]
+    cameras = Cameras(*(select_views(values, pair) for values in (rigs.K, rigs.R, rigs.t)))
+    observations = PairObservations(
+        index=count,
+        rig=count,
+        draw=count if draw is None else draw,
+        pair=pair,
+        K=rigs.K,
+        baseline=(cameras.centre[:, 1] - cameras.centre[:, 0]).norm(dim=-1),
+        key_points=key_points,
+        confidence=torch.ones(shape, dtype=key_points.dtype),
+        valid=torch.ones(shape, dtype=torch.bool) if valid is None else valid,
+    )
+    if points is None:
+        points = torch.zeros(len(pair), 1, 3, dtype=torch.float64)
+    return Labelled(observations, PairTruth(cameras, points))
 
 
 def random_scene(

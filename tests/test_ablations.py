@@ -60,14 +60,12 @@ def test_the_beginning_of_a_pool_is_the_pool_of_so_many_hypotheses(toy, tmp_path
     frames = module.frames["test"]
     batch = frames[range(len(frames))]
     for count, errors in zip(counts, ours, strict=True):
-        estimates, _ = (
-            load_model(folder / "last.ckpt", hypotheses=count, seed=0)[0].eval().test_step(batch, 0)
-        )
+        model = load_model(folder / "last.ckpt", hypotheses=count, seed=0)[0].eval()
+        pool = model.sample(batch.observations, "test", batch.truth)
         for name, error in errors.items():
             metric = MPJPE("relative", 1, 17)
-            metric.update(
-                estimates[name], batch.truth, batch.truth_valid, torch.zeros_like(batch.sample)
-            )
+            group = torch.zeros_like(batch.observations.index)
+            metric.update(pool.estimate(name), batch.truth, group)
             assert error == pytest.approx(metric.compute().mean.item(), rel=1e-5)
     assert ours[0]["best"] > ours[1]["best"] > ours[2]["best"]
 

@@ -16,8 +16,8 @@ from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import matrix_to_vector, nearest_rotation, vector_to_matrix
 from ghpt.metrics.relative_pose import rotation_deg, translation_deg
-from ghpt.recording import PairBatch
 from rigs_with_people import calibration, people, relative
+from scenes import labelled_pairs
 
 CALIBRATE = calibration()
 PAIRS = [(a, b) for b in range(4) for a in range(b)]
@@ -223,23 +223,22 @@ def batch_of_pairs():
     pairs = [(0, (0, 1)), (0, (2, 0)), (1, (1, 3))]
     stack = lambda f: torch.stack([f(scenes[d]) for d, _ in pairs])  # noqa: E731
     cameras = Cameras(*(stack(lambda s, n=n: getattr(s.cameras, n)) for n in ("K", "R", "t")))
-    count = torch.arange(3)
     valid = stack(lambda s: s.valid.transpose(0, 1))
-    return PairBatch(
-        sample=count,
-        rig=torch.zeros(3, dtype=torch.int64),
-        draw=torch.tensor([d for d, _ in pairs]),
-        pair=torch.tensor([p for _, p in pairs]),
-        cameras=cameras,
-        key_points=stack(lambda s: s.key_points.transpose(0, 1)),
-        confidence=torch.ones(valid.shape),
-        valid=valid,
-        points=torch.zeros(3, 1, 3, dtype=torch.float64),
+    draw = torch.tensor([d for d, _ in pairs])
+    labelled = labelled_pairs(
+        cameras,
+        torch.tensor([p for _, p in pairs]),
+        stack(lambda s: s.key_points.transpose(0, 1)),
+        valid,
+        draw=draw,
     )
+    one_rig = torch.zeros_like(draw)
+    return replace(labelled, observations=replace(labelled.observations, rig=one_rig))
 
 
 def test_baseline_calibrates_a_draw_once_and_gives_its_pairs():
-    batch, calls = batch_of_pairs(), []
+    labelled, calls = batch_of_pairs(), []
+    batch = labelled.observations
 
     class Counted:
         def __call__(self, *arguments):
@@ -253,9 +252,7 @@ def test_baseline_calibrates_a_draw_once_and_gives_its_pairs():
     assert len(calls) == 2
     assert torch.equal(baseline(batch).R, found.R)
     assert len(calls) == 2
-    true = batch.pair_cameras()
-    R = true.R[:, 1] @ true.R[:, 0].mT
-    t = true.t[:, 1] - (R @ true.t[:, 0, :, None])[..., 0]
+    R, t = labelled.truth.relative_pose()
     assert found.estimated.all()
     assert rotation_deg(found.R, R).max() < 1
     assert translation_deg(found.t, t).max() < 1
@@ -263,7 +260,7 @@ def test_baseline_calibrates_a_draw_once_and_gives_its_pairs():
 
 
 def test_baseline_masks_a_camera_that_sees_nobody():
-    batch = batch_of_pairs()
+    batch = batch_of_pairs().observations
     valid = batch.valid.clone()
     valid[:2, 1] = False  # of the first draw
     found = RigBaseline(CALIBRATE, remembered=4, seed=0)(replace(batch, valid=valid))

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ import torch
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.pose.evaluation import NAMES, evaluate, write_metrics
 from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
-from ghpt.recording import PoseEstimate, Recording
+from ghpt.observations import PoseEstimate, Recording, Truth
 from ghpt.skeleton import JOINTS, PELVIS, SIX_JOINTS
 
 TAKES = ("S9/Greeting-2", "S9/Greeting-1", "S11/Walking-1", "S11/Eating-1")
@@ -27,18 +28,16 @@ def recording(name: str) -> Recording:
     views, mask = np.zeros((0, 2, 17, 2), np.float32), np.zeros((0, 2, 17), bool)
     subject, action = name.split("/")
     return Recording(
-        name,
-        subject,
-        action.split("-")[0],
-        50.0,
-        ("a", "b"),
-        cameras,
-        views,
-        views[..., 0],
-        mask,
-        np.zeros((0, 17, 3), np.float32),
-        mask[:, 0],
-        np.zeros(0, np.int64),
+        name=name,
+        subject=subject,
+        action=action.split("-")[0],
+        rate_hz=50.0,
+        camera_names=("a", "b"),
+        cameras=cameras,
+        key_points=views,
+        confidence=views[..., 0],
+        valid=mask,
+        frame=np.zeros(0, np.int64),
     )
 
 
@@ -56,8 +55,7 @@ def content(count: int = 60, takes: int = len(TAKES)) -> dict:
     }
     return {
         "estimates": estimates,
-        "truth": truth,
-        "truth_seen": torch.rand(count, 17, generator=g) > 0.1,
+        "truth": Truth(truth, torch.rand(count, 17, generator=g) > 0.1),
         "recording": recording,
         "frame": torch.arange(count),
         "weights": {w: torch.zeros(count) for w in WEIGHTS},
@@ -75,8 +73,8 @@ def predictions(tmp_path, values: dict, takes=TAKES):
 def relative(values: dict, name: str) -> np.ndarray:
     """Errors relative to the pelvis, NaN where they do not count: [N, 17]."""
     estimate = values["estimates"][name]
-    counts = (estimate.estimated & values["truth_seen"]).numpy()
-    points, truth = estimate.points.double().numpy(), values["truth"].double().numpy()
+    counts = (estimate.estimated & values["truth"].valid).numpy()
+    points, truth = estimate.points.double().numpy(), values["truth"].points.double().numpy()
     errors = np.linalg.norm(points - points[:, [PELVIS]] - truth + truth[:, [PELVIS]], axis=-1)
     return np.where(counts & counts[:, [PELVIS]], errors, np.nan)
 
@@ -101,7 +99,7 @@ def test_numbers_equal_numpy_on_the_same_arrays(tmp_path):
         assert numbers["without_damaged"]["mpjpe_relative"] == pytest.approx(
             np.nanmean(sound), rel=1e-6
         )
-        estimated, valid = values["estimates"][name].estimated, values["truth_seen"]
+        estimated, valid = values["estimates"][name].estimated, values["truth"].valid
         assert numbers["coverage"] == (estimated & valid).sum().item() / valid.sum().item()
         assert numbers["mpjpe_aligned"] < numbers["mpjpe_relative"]
 
@@ -159,7 +157,7 @@ def test_chunks_do_not_matter(tmp_path, monkeypatch):
 
 def test_nothing_to_measure_is_null_and_never_nan(tmp_path):
     values = content()
-    values["truth_seen"] = torch.zeros_like(values["truth_seen"])
+    values["truth"] = replace(values["truth"], valid=torch.zeros(60, 17, dtype=torch.bool))
     metrics = evaluate(predictions(tmp_path, values))
     write_metrics(tmp_path / "metrics.json", metrics)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
@@ -171,7 +169,7 @@ def test_nothing_to_measure_is_null_and_never_nan(tmp_path):
 def test_leaving_hard_joints_out_shows_in_the_coverage(tmp_path):
     values = content()
     full = values["estimates"]["worst"]
-    hard = torch.linalg.vector_norm(full.points - values["truth"], dim=-1) > 60
+    hard = torch.linalg.vector_norm(full.points - values["truth"].points, dim=-1) > 60
     values["estimates"]["weight"] = PoseEstimate(full.points, full.estimated & ~hard)
     selections = evaluate(predictions(tmp_path, values))["selections"]
     assert selections["weight"]["mpjpe_absolute"] < selections["worst"]["mpjpe_absolute"]

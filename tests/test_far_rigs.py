@@ -22,7 +22,7 @@ from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.export import WRITERS, Evidence, Scene, read_reconstruction
 from ghpt.geometry.cameras import CameraSet
-from ghpt.recording import Recording
+from ghpt.observations import Recording
 from ghpt.report.rig_files import write_poses
 from ghpt.skeleton import MIRROR
 from predicting import config, walk

@@ -11,7 +11,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.pose.evaluation import evaluate
 from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
-from ghpt.recording import PoseEstimate, Recording
+from ghpt.observations import PoseEstimate, Recording, Truth
 from ghpt.report import figures
 from ghpt.report.tensorboard import SHOWN, write_events
 from ghpt.skeleton import JOINT, JOINTS, PELVIS
@@ -45,18 +45,16 @@ def run(tmp_path, with_truth: bool = True):
     cameras = Cameras(torch.zeros(2, 3, 3), torch.zeros(2, 3, 3), torch.zeros(2, 3))
     views, mask = np.zeros((0, 2, 17, 2), np.float32), np.zeros((0, 2, 17), bool)
     take = Recording(
-        "S9/Eating",
-        "S9",
-        "Eating",
-        50.0,
-        ("a", "b"),
-        cameras,
-        views,
-        views[..., 0],
-        mask,
-        np.zeros((0, 17, 3), np.float32),
-        mask[:, 0],
-        np.zeros(0, np.int64),
+        name="S9/Eating",
+        subject="S9",
+        action="Eating",
+        rate_hz=50.0,
+        camera_names=("a", "b"),
+        cameras=cameras,
+        key_points=views,
+        confidence=views[..., 0],
+        valid=mask,
+        frame=np.zeros(0, np.int64),
     )
     g = torch.Generator().manual_seed(0)
     truth = torch.from_numpy(PERSON).float().expand(40, 17, 3) + torch.arange(40)[:, None, None]
@@ -70,7 +68,7 @@ def run(tmp_path, with_truth: bool = True):
     valid = torch.full((40, 17), with_truth)
     weights = {summary: torch.rand(40, generator=g) for summary in WEIGHTS}
     rows = torch.arange(40)
-    writer.write(rows, estimates, truth, valid, 0 * rows, rows, weights)
+    writer.write(rows, estimates, Truth(truth, valid), 0 * rows, rows, weights)
     writer.finish(tmp_path / "predictions.npz", [take], META)
     predictions = open_predictions(tmp_path / "predictions.npz")
     return predictions, evaluate(predictions)

@@ -4,13 +4,13 @@ import torch
 
 from ghpt.data.datasets.frames import BatchOrder, Frames, trainable
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 from ghpt.skeleton import PELVIS
 
 
 def recording(name, frames, offset, views=3):
     rng = np.random.default_rng(len(name))
-    return Recording(
+    return LabelledRecording(
         name=name,
         subject="S1",
         action="Walking",
@@ -40,17 +40,19 @@ def test_a_batch_is_its_frames(recordings):
     batch = frames[range(5)]
     places = [(2, 6), (0, 0), (1, 0), (2, 0), (0, 4)]
     for row, (r, t) in enumerate(places):
-        assert batch.recording[row] == r
-        for field in ("key_points", "confidence", "valid", "truth", "truth_valid"):
+        assert batch.observations.recording[row] == r
+        for field in ("key_points", "confidence", "valid"):
             np.testing.assert_array_equal(
-                getattr(batch, field)[row], getattr(recordings[r], field)[t]
+                getattr(batch.observations, field)[row], getattr(recordings[r], field)[t]
             )
-        assert torch.equal(batch.cameras.K[row], recordings[r].cameras.K)
+        np.testing.assert_array_equal(batch.truth.points[row], recordings[r].truth[t])
+        np.testing.assert_array_equal(batch.truth.valid[row], recordings[r].truth_valid[t])
+        assert torch.equal(batch.observations.cameras.K[row], recordings[r].cameras.K)
     np.testing.assert_array_equal(
         frames.frame_numbers(range(5)), [recordings[r].frame[t] for r, t in places]
     )
     assert len(frames[[]]) == 0
-    assert frames[[]].key_points.shape == (0, 3, 17, 2)
+    assert frames[[]].observations.key_points.shape == (0, 3, 17, 2)
 
 
 def test_trainable_needs_the_pelvis_and_enough_joints(recordings):

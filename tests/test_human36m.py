@@ -13,7 +13,7 @@ from ghpt.data.datasets.human36m import DAMAGED, human36m_files, human36m_record
 from ghpt.data.datasets.labels import LABELS_FILE
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 from ghpt.skeleton import JOINTS
 
 LENGTHS = {
@@ -45,7 +45,7 @@ def root(tmp_path: Path, takes: list) -> Path:
 
 def read(
     root: Path, split: str, numbers: tuple[int, ...] = (0, 1, 2, 3), damaged: bool = True
-) -> list[Recording]:
+) -> list[LabelledRecording]:
     return list(human36m_recordings(root, split, numbers, damaged))
 
 

@@ -8,8 +8,8 @@ from ghpt.geometry.normal_equations import (
     local_cameras,
     minors,
     solve_symmetric,
-    usable_views,
     valid_cameras,
+    valid_key_points,
     view_equations,
     weighted_sum,
 )
@@ -72,7 +72,7 @@ def test_key_points_are_usable_up_to_the_limit_in_valid_cameras():
     key_points[0, 1, 0], key_points[0, 2, 1] = LARGEST, -1.1 * LARGEST
     key_points[2, 3, 1], key_points[2, 4, 0] = torch.nan, -torch.inf
     expected = [[True, True, False, True, True], [False] * 5, [True, True, True, False, False]]
-    assert usable_views(cameras, key_points).tolist() == expected
+    assert valid_key_points(cameras, key_points).tolist() == expected
 
 
 def test_local_cameras_see_the_same_from_their_median_centre():

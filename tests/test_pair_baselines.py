@@ -16,9 +16,9 @@ from ghpt.models.relative_pose.baselines import (
     _distinct,
     size_in_image,
 )
+from ghpt.observations import Labelled, PairObservations, RelativePoseEstimate
 from ghpt.randomness import key, uniform
-from ghpt.recording import PairBatch, RelativePoseEstimate
-from scenes import random_scene
+from scenes import labelled_pairs, random_scene
 
 ROBUST = {
     "ransac": Ransac(samples=200, threshold=0.02, seed=0),
@@ -36,9 +36,9 @@ each_robust = pytest.mark.parametrize("baseline", ROBUST.values(), ids=ROBUST.ke
 EYE = torch.eye(3, dtype=torch.float64)
 
 
-def pairs(
+def labelled(
     seeds=range(3), frames=20, sigma=0.0, views=3, change=lambda rig, points: (rig, points)
-) -> PairBatch:
+) -> Labelled:
     """One pair of views (2, 0) of one rig for each seed, before it a person who walks about."""
     rigs, key_points = [], []
     for seed in seeds:
@@ -53,29 +53,17 @@ def pairs(
         as_people = Cameras(*(x.expand(frames, *x.shape) for x in (rig.K, rig.R, rig.t)))
         rigs.append(rig)
         key_points.append((project(as_people, points)[0] + sigma * noise).transpose(0, 1))
-    count = len(rigs)
-    shape = (count, views, frames, 17)
-    return PairBatch(
-        sample=torch.arange(count),
-        rig=torch.arange(count),
-        draw=torch.arange(count),
-        pair=torch.tensor([[2, 0]]).expand(count, 2),
-        cameras=Cameras(*(torch.stack([getattr(r, n) for r in rigs]) for n in ("K", "R", "t"))),
-        key_points=torch.stack(key_points),
-        confidence=torch.ones(shape, dtype=torch.float64),
-        valid=torch.ones(shape, dtype=torch.bool),
-        points=torch.zeros(count, 1, 3, dtype=torch.float64),
-    )
+    cameras = Cameras(*(torch.stack([getattr(r, n) for r in rigs]) for n in ("K", "R", "t")))
+    pair = torch.tensor([[2, 0]]).expand(len(rigs), 2)
+    return labelled_pairs(cameras, pair, torch.stack(key_points))
 
 
-def part(batch: PairBatch, index) -> PairBatch:
-    values = {f.name: getattr(batch, f.name) for f in fields(PairBatch)}
-    return PairBatch(
-        **{n: v.index(index) if isinstance(v, Cameras) else v[index] for n, v in values.items()}
-    )
+def pairs(*args, **kwargs) -> PairObservations:
+    """What is seen of ``labelled``'s pairs."""
+    return labelled(*args, **kwargs).observations
 
 
-def with_outliers(batch: PairBatch, share=0.2) -> PairBatch:
+def with_outliers(batch: PairObservations, share=0.2) -> PairObservations:
     """That share of the joints of the reference view is far off."""
     generator = torch.Generator().manual_seed(1)
     wrong = torch.rand(batch.valid.shape, generator=generator) < share
@@ -84,11 +72,9 @@ def with_outliers(batch: PairBatch, share=0.2) -> PairBatch:
     return replace(batch, key_points=batch.key_points + wrong[..., None] * shift)
 
 
-def degrees(estimate: RelativePoseEstimate, batch: PairBatch):
-    """The errors of R and of the direction of t."""
-    cameras = batch.pair_cameras()
-    R = cameras.R[:, 1] @ cameras.R[:, 0].mT
-    t = cameras.t[:, 1] - (R @ cameras.t[:, 0, :, None])[..., 0]
+def degrees(estimate: RelativePoseEstimate):
+    """The errors of R and of the direction of t of the poses of ``pairs()``, whatever the noise."""
+    R, t = labelled().truth.relative_pose()
     return rotation_deg(estimate.R, R), translation_deg(estimate.t, t)
 
 
@@ -106,7 +92,7 @@ def test_exact_key_points_give_the_true_pose_with_t_of_length_1(baseline):
     assert estimate.estimated.all()
     # OpenCV reads its points in float32
     limit = 0.02 if isinstance(baseline, Usac) else 1e-5
-    assert all((error < limit).all() for error in degrees(estimate, batch))
+    assert all((error < limit).all() for error in degrees(estimate))
     torch.testing.assert_close(estimate.t.norm(dim=-1), torch.ones(3, dtype=torch.float64))
     torch.testing.assert_close(estimate.R @ estimate.R.mT, EYE.expand(3, 3, 3), rtol=0, atol=1e-9)
     assert estimate.R.dtype == torch.float64
@@ -116,10 +102,10 @@ def test_exact_key_points_give_the_true_pose_with_t_of_length_1(baseline):
 def test_outliers_move_a_robust_estimate_little(baseline):
     batch = with_outliers(pairs(sigma=1))
     linear = EightPoint()(batch)
-    assert not linear.estimated.all() or degrees(linear, batch)[0].min() > 3
+    assert not linear.estimated.all() or degrees(linear)[0].min() > 3
     estimate = baseline(batch)
     assert estimate.estimated.all()
-    rotation, translation = degrees(estimate, batch)
+    rotation, translation = degrees(estimate)
     assert rotation.max() < 1
     assert translation.max() < 1
 
@@ -132,7 +118,7 @@ def test_a_pair_s_estimate_depends_on_no_other_pair_and_is_the_same_again(baseli
     cv2.setRNGSeed(5)
     torch.manual_seed(5)
     for index in (torch.tensor([2]), torch.tensor([3, 2, 0])):
-        some = baseline(part(batch, index))
+        some = baseline(batch.rows(index))
         for name in ("R", "t"):
             torch.testing.assert_close(
                 getattr(some, name), getattr(together, name)[index], rtol=0, atol=1e-12
@@ -148,7 +134,7 @@ def test_joints_that_a_view_does_not_see_are_not_used(baseline):
         valid[..., None], batch.key_points, torch.tensor([torch.nan, 1e6], dtype=torch.float64)
     )
     assert equal(baseline(replace(batch, key_points=moved, valid=valid)), expected)
-    assert all((error < 3).all() for error in degrees(expected, batch))
+    assert all((error < 3).all() for error in degrees(expected))
 
 
 @each
@@ -163,8 +149,7 @@ def test_other_views_are_nothing(baseline):
 def test_the_resolution_is_nothing(baseline):
     batch = with_outliers(pairs(sigma=1), share=0.05)
     zoom = torch.tensor([4.0, 4.0, 1.0], dtype=torch.float64).diag()
-    cameras = Cameras(zoom @ batch.cameras.K, batch.cameras.R, batch.cameras.t)
-    large = baseline(replace(batch, cameras=cameras, key_points=batch.key_points * 4))
+    large = baseline(replace(batch, K=zoom @ batch.K, key_points=batch.key_points * 4))
     estimate = baseline(batch)
     torch.testing.assert_close(large.R, estimate.R, rtol=0, atol=1e-6)
     torch.testing.assert_close(large.t, estimate.t, rtol=0, atol=1e-6)
@@ -246,12 +231,12 @@ def test_few_correspondences_are_enough(baseline):
     batch = replace(batch, valid=(torch.arange(340) % 20 == 0).reshape(20, 17).expand(3, 3, 20, 17))
     estimate = baseline(batch)
     assert estimate.estimated.all()
-    assert degrees(estimate, batch)[0].max() < 0.5
+    assert degrees(estimate)[0].max() < 0.5
 
 
 @each
 def test_a_batch_of_no_pairs_gives_no_poses(baseline):
-    estimate = baseline(part(pairs([0]), slice(0, 0)))
+    estimate = baseline(pairs([0]).rows(slice(0, 0)))
     assert estimate.R.shape == (0, 3, 3)
     assert estimate.t.shape == (0, 3)
 
@@ -262,7 +247,7 @@ def test_key_points_in_float32_are_enough(baseline):
     single = replace(
         batch, key_points=batch.key_points.float(), confidence=batch.confidence.float()
     )
-    assert all((error < 3).all() for error in degrees(baseline(single), batch))
+    assert all((error < 3).all() for error in degrees(baseline(single)))
 
 
 def test_the_size_in_the_image_is_the_median_over_frames_and_views():
@@ -272,8 +257,7 @@ def test_the_size_in_the_image_is_the_median_over_frames_and_views():
     box[1] = torch.tensor([3.0, 4.0])
     key_points = (scale[:, None, None] * box).expand(3, 3, 3, 17, 2)
     K = torch.tensor([200.0, 200.0, 1.0], dtype=torch.float64).diag().expand(3, 3, 3, 3)
-    cameras = Cameras(K, batch.cameras.R, batch.cameras.t)
-    same = replace(batch, key_points=key_points, cameras=cameras)
+    same = replace(batch, key_points=key_points, K=K)
     torch.testing.assert_close(size_in_image(same), torch.full((3,), 10 / 200, dtype=torch.float64))
     unseen = same.valid.clone()
     unseen[1] = False

@@ -13,7 +13,7 @@ from ghpt.models.relative_pose.evaluation import (
     errors_of_pair,
     evaluate_pairs,
 )
-from ghpt.recording import RelativePoseEstimate
+from ghpt.observations import RelativePoseEstimate
 from pair_report import content, moved, rig, written
 
 RIGS = [rig(9), rig(11)]

@@ -8,7 +8,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ghpt.models.relative_pose.evaluation import ERRORS, evaluate_pairs
 from ghpt.models.rows import WEIGHTS
-from ghpt.recording import RelativePoseEstimate
+from ghpt.observations import RelativePoseEstimate
 from ghpt.report import pair_figures
 from ghpt.report.figures import image
 from ghpt.report.pair_figures import rig_figure

@@ -8,7 +8,7 @@ import torch
 from ghpt.errors import GhptDataError, GhptError
 from ghpt.models.pose.predictions import open_predictions
 from ghpt.models.relative_pose.predictions import PairWriter, open_pairs
-from ghpt.recording import RelativePoseEstimate
+from ghpt.observations import RelativePoseEstimate
 from pair_report import META, NAMES, content, rig, written
 from test_predictions import array, changed, write_all
 

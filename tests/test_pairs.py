@@ -35,7 +35,7 @@ def test_every_pair_of_every_draw_of_every_rig_and_those_of_a_draw_together():
     assert places == [
         (draw // 3, draw, pair) for draw in range(6) for pair in combinations(range(3), 2)
     ]
-    batch = pairs[range(len(pairs))]
+    batch = pairs[range(len(pairs))].observations
     assert torch.equal(batch.draw, torch.arange(6).repeat_interleave(3))
     assert torch.equal(batch.key_points[0], batch.key_points[2])
     assert not torch.equal(batch.key_points[0], batch.key_points[3])
@@ -47,7 +47,8 @@ def test_a_batch_holds_the_recordings_values_of_its_frames(samples):
     pairs = Pairs(data, SETTINGS, seed=5, samples=samples)
     for sample in (0, 7, len(pairs) - 1):
         rig, draw, pair = pairs.locate(sample)
-        batch = pairs[[sample]]
+        labelled = pairs[[sample]]
+        batch = labelled.observations
         frames = pairs.frames_of(rig, draw)
         assert sum(len(positions) for _, positions in frames) == 12
         assert all(len(set(positions)) == len(positions) for _, positions in frames)
@@ -57,12 +58,15 @@ def test_a_batch_holds_the_recordings_values_of_its_frames(samples):
         np.testing.assert_array_equal(
             batch.of_pair(batch.valid)[0].numpy(), valid[:, list(pair)].swapaxes(0, 1)
         )
-        assert torch.equal(batch.pair_cameras().t[0], data[frames[0][0]].cameras.t[list(pair)])
+        cameras = data[frames[0][0]].cameras.index(list(pair))
+        assert torch.equal(labelled.truth.cameras.t[0], cameras.t)
+        distance = torch.pdist(cameras.centre.double())
+        torch.testing.assert_close(batch.baseline, distance)
 
 
 def test_a_sample_does_not_depend_on_its_batch():
     pairs = Pairs(recordings(), SETTINGS, seed=0, samples=40)
-    together, alone = pairs[[3, 17, 9]], pairs[[17]]
+    together, alone = pairs[[3, 17, 9]].observations, pairs[[17]].observations
     assert torch.equal(together.key_points[1], alone.key_points[0])
     assert torch.equal(together.pair[1], alone.pair[0])
 
@@ -87,7 +91,7 @@ def test_frames_are_drawn_evenly():
 
 
 def test_a_rig_with_few_frames_fills_up_with_unseen_ones():
-    batch = Pairs(recordings()[2:], PairSettings(40, 1, 5), seed=0)[[0]]
+    batch = Pairs(recordings()[2:], PairSettings(40, 1, 5), seed=0)[[0]].observations
     assert batch.valid[0, :, :30].any(-1).all()
     assert not batch.valid[0, :, 30:].any()
 
@@ -109,7 +113,7 @@ def test_without_any_true_pose_there_is_a_named_error():
 
 
 def test_an_empty_share_of_a_batch_has_the_right_shapes():
-    batch = Pairs(recordings(), SETTINGS, seed=0)[[]]
+    batch = Pairs(recordings(), SETTINGS, seed=0)[[]].observations
     assert len(batch) == 0
     assert batch.key_points.shape == (0, 3, 12, 17, 2)
     assert batch.pair.shape == (0, 2)

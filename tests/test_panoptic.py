@@ -14,7 +14,7 @@ from ghpt.data.datasets.panoptic import COCO19, joints17, panoptic_files, panopt
 from ghpt.data.datasets.store import write_store
 from ghpt.data.synthetic.rigs import panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 from ghpt.skeleton import JOINT, JOINTS
 
 ALL = tuple(range(31))
@@ -40,7 +40,7 @@ def root(tmp_path: Path, poses: np.ndarray) -> Path:
     return tmp_path
 
 
-def read(root: Path, split: str, numbers: tuple[int, ...] = (10, 3)) -> Recording:
+def read(root: Path, split: str, numbers: tuple[int, ...] = (10, 3)) -> LabelledRecording:
     (recording,) = panoptic_recordings(root, numbers, split)
     return recording
 

@@ -4,7 +4,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ghpt.metrics.pose_error import MPJPE, joint_errors
-from ghpt.recording import PoseEstimate
+from ghpt.observations import PoseEstimate, Truth
 from ghpt.skeleton import PELVIS, SIX_JOINTS
 
 KINDS = ("absolute", "relative", "aligned")
@@ -20,7 +20,7 @@ def frames(count: int, seed: int = 0, missing: float = 0.2):
     estimated = torch.rand(count, 17, generator=g) > missing
     truth_valid = torch.rand(count, 17, generator=g) > missing
     group = 2 * torch.randint(0, 2, (count,), generator=g)
-    return PoseEstimate(points, estimated), truth, truth_valid, group
+    return PoseEstimate(points, estimated), Truth(truth, truth_valid), group
 
 
 def similarity_residual(points: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -32,10 +32,10 @@ def similarity_residual(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     return np.linalg.norm(scale * turned - b, axis=1)
 
 
-def slow_errors(estimate: PoseEstimate, truth, truth_valid, kind: str) -> list[dict[int, float]]:
+def slow_errors(estimate: PoseEstimate, truth: Truth, kind: str) -> list[dict[int, float]]:
     """For each frame, joint -> error, one joint at a time in numpy."""
     result = []
-    arrays = (estimate.points.double(), estimate.estimated, truth.double(), truth_valid)
+    arrays = (estimate.points.double(), estimate.estimated, truth.points.double(), truth.valid)
     for p, e, t, s in zip(*(array.numpy() for array in arrays), strict=True):
         joints = [j for j in range(17) if e[j] and s[j]]
         if kind == "relative":
@@ -54,15 +54,15 @@ def slow_errors(estimate: PoseEstimate, truth, truth_valid, kind: str) -> list[d
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_equals_a_slow_reference(kind):
-    estimate, truth, truth_valid, group = frames(40)
+    estimate, truth, group = frames(40)
     metric = MPJPE(kind, groups=3, joints=17)
-    metric.update(estimate, truth, truth_valid, group)
-    result, slow = metric.compute(), slow_errors(estimate, truth, truth_valid, kind)
+    metric.update(estimate, truth, group)
+    result, slow = metric.compute(), slow_errors(estimate, truth, kind)
     everything = [error for frame in slow for error in frame.values()]
     six = [error for frame in slow for joint, error in frame.items() if joint in SIX_JOINTS]
     assert result.mean.item() == pytest.approx(np.mean(everything), rel=1e-9)
     assert result.six_joints.item() == pytest.approx(np.mean(six), rel=1e-9)
-    assert result.coverage.item() == len(everything) / truth_valid.sum().item()
+    assert result.coverage.item() == len(everything) / truth.valid.sum().item()
     for joint in range(17):
         expected = np.mean([frame[joint] for frame in slow if joint in frame])
         assert result.per_joint[joint].item() == pytest.approx(expected, rel=1e-9)
@@ -75,67 +75,60 @@ def test_equals_a_slow_reference(kind):
 
 
 def test_zero_where_it_should_be():
-    _, truth, truth_valid, _ = frames(8)
-    everywhere = torch.ones_like(truth_valid)
+    _, truth, _ = frames(8)
+    everywhere = torch.ones_like(truth.valid)
+    truth = Truth(truth.points, everywhere)
     turn = torch.from_numpy(Rotation.from_euler("xyz", [0.3, 2.0, -1.0]).as_matrix())
-    moved = PoseEstimate(truth + torch.tensor([5.0, 7.0, -9.0]), everywhere)
-    similar = PoseEstimate(0.5 * truth.double() @ turn.mT + 77, everywhere)
-    assert joint_errors(moved, truth, everywhere, "absolute")[0].min() > 12
-    assert (
-        joint_errors(moved, truth, everywhere, "relative")[0].max() < 1e-3
-    )  # the float32 of the input
-    assert joint_errors(similar, truth, everywhere, "relative")[0][:, SIX_JOINTS].mean() > 100
-    assert joint_errors(similar, truth, everywhere, "aligned")[0].max() < 1e-6
+    moved = PoseEstimate(truth.points + torch.tensor([5.0, 7.0, -9.0]), everywhere)
+    similar = PoseEstimate(0.5 * truth.points.double() @ turn.mT + 77, everywhere)
+    assert joint_errors(moved, truth, "absolute")[0].min() > 12
+    assert joint_errors(moved, truth, "relative")[0].max() < 1e-3  # the float32 of the input
+    assert joint_errors(similar, truth, "relative")[0][:, SIX_JOINTS].mean() > 100
+    assert joint_errors(similar, truth, "aligned")[0].max() < 1e-6
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_what_does_not_count_changes_nothing(kind):
-    estimate, truth, truth_valid, _ = frames(20)
-    counts = (estimate.estimated & truth_valid)[..., None]
+    estimate, truth, _ = frames(20)
+    counts = (estimate.estimated & truth.valid)[..., None]
     spoilt = PoseEstimate(torch.where(counts, estimate.points, 1e6), estimate.estimated)
-    errors, counted = joint_errors(estimate, truth, truth_valid, kind)
+    errors, counted = joint_errors(estimate, truth, kind)
     spoilt_errors, spoilt_counted = joint_errors(
-        spoilt, torch.where(counts, truth, -1e6), truth_valid, kind
+        spoilt, Truth(torch.where(counts, truth.points, -1e6), truth.valid), kind
     )
     assert torch.equal(counted, spoilt_counted)
     torch.testing.assert_close(spoilt_errors, errors, rtol=1e-12, atol=1e-9)
 
 
 def test_frames_that_fix_no_frame_do_not_count():
-    estimate, truth, truth_valid, _ = frames(4, missing=0.0)
+    estimate, truth, _ = frames(4, missing=0.0)
     no_pelvis = estimate.estimated.clone()
     no_pelvis[:, PELVIS] = False
-    assert not joint_errors(
-        PoseEstimate(estimate.points, no_pelvis), truth, truth_valid, "relative"
-    )[1].any()
-    two = torch.zeros_like(truth_valid)
+    assert not joint_errors(PoseEstimate(estimate.points, no_pelvis), truth, "relative")[1].any()
+    two = torch.zeros_like(truth.valid)
     two[:, :2] = True
-    errors, counted = joint_errors(
-        PoseEstimate(estimate.points, two), truth, truth_valid, "aligned"
-    )
+    errors, counted = joint_errors(PoseEstimate(estimate.points, two), truth, "aligned")
     assert not counted.any()
     assert (errors == 0).all()
 
 
 def test_three_joints_are_enough_to_align():
-    estimate, truth, truth_valid, _ = frames(1, missing=0.0)
-    three = torch.zeros_like(truth_valid)
+    estimate, truth, _ = frames(1, missing=0.0)
+    three = torch.zeros_like(truth.valid)
     three[:, [2, 9, 16]] = True
-    errors, counted = joint_errors(
-        PoseEstimate(estimate.points, three), truth, truth_valid, "aligned"
-    )
+    errors, counted = joint_errors(PoseEstimate(estimate.points, three), truth, "aligned")
     assert torch.equal(counted, three)
     assert errors[three].max() > 1  # the noise has changed the triangle's shape
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_uneven_processes_give_the_number_of_one(kind):
-    estimate, truth, truth_valid, group = frames(97)
+    estimate, truth, group = frames(97)
     whole, shares = MPJPE(kind, 3, 17), [MPJPE(kind, 3, 17) for _ in range(3)]
-    whole.update(estimate, truth, truth_valid, group)
+    whole.update(estimate, truth, group)
     for share, rows in zip(shares, (slice(0, 90), slice(90, 90), slice(90, 97)), strict=True):
         part = PoseEstimate(estimate.points[rows], estimate.estimated[rows])
-        share.update(part, truth[rows], truth_valid[rows], group[rows])
+        share.update(part, truth.rows(rows), group[rows])
     shares[0].merge_state(shares[1])
     shares[0].merge_state(shares[2])
     assert torch.equal(shares[0].counted, whole.counted)
@@ -152,7 +145,6 @@ def test_uneven_processes_give_the_number_of_one(kind):
 def test_nothing_to_average_is_nan():
     metric = MPJPE("absolute", 1, 17)
     nowhere, no_points = torch.zeros(0, 17, dtype=torch.bool), torch.zeros(0, 17, 3)
-    metric.update(
-        PoseEstimate(no_points, nowhere), no_points, nowhere, torch.zeros(0, dtype=torch.int64)
-    )
+    estimate = PoseEstimate(no_points, nowhere)
+    metric.update(estimate, Truth(no_points, nowhere), torch.zeros(0, dtype=torch.int64))
     assert metric.compute().mean.isnan()

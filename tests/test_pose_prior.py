@@ -2,7 +2,7 @@ import numpy as np
 import torch
 
 from ghpt.metrics.pose_prior import PARTS, PosePrior, length_ratios
-from ghpt.recording import PoseEstimate
+from ghpt.observations import PoseEstimate
 from ghpt.skeleton import JOINT, MIRROR, SYMMETRIC_PARTS
 
 

@@ -10,7 +10,7 @@ import torch
 from ghpt.errors import GhptDataError, GhptError
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
-from ghpt.recording import PoseEstimate, Recording
+from ghpt.observations import PoseEstimate, Recording, Truth
 
 NAMES = ("weight", "average", "linear")
 META = {
@@ -27,18 +27,16 @@ def recording(subject: str, action: str) -> Recording:
     cameras = Cameras(torch.zeros(2, 3, 3), torch.zeros(2, 3, 3), torch.zeros(2, 3))
     views, mask = np.zeros((0, 2, 17, 2), np.float32), np.zeros((0, 2, 17), bool)
     return Recording(
-        f"{subject}/{action}",
-        subject,
-        action,
-        50.0,
-        ("a", "b"),
-        cameras,
-        views,
-        views[..., 0],
-        mask,
-        np.zeros((0, 17, 3), np.float32),
-        mask[:, 0],
-        np.zeros(0, np.int64),
+        name=f"{subject}/{action}",
+        subject=subject,
+        action=action,
+        rate_hz=50.0,
+        camera_names=("a", "b"),
+        cameras=cameras,
+        key_points=views,
+        confidence=views[..., 0],
+        valid=mask,
+        frame=np.zeros(0, np.int64),
     )
 
 
@@ -54,8 +52,7 @@ def rows(index: torch.Tensor) -> dict:
     here = (index[:, None] + torch.arange(17)) % 5 > 0
     return {
         "estimates": {name: PoseEstimate(points + 10 * i, here) for i, name in enumerate(NAMES)},
-        "truth": points - 1,
-        "truth_seen": (index[:, None] + torch.arange(17)) % 7 > 0,
+        "truth": Truth(points - 1, (index[:, None] + torch.arange(17)) % 7 > 0),
         "recording": index % 3,
         "frame": 64 * index,
         "weights": {name: index.float() + i for i, name in enumerate(WEIGHTS)},
@@ -80,9 +77,10 @@ def test_round_trip(tmp_path):
     assert {**META, "unit": "mm"}.items() <= predictions.meta.items()
     chunks, expected = list(predictions.chunks(6)), rows(torch.arange(20))
     assert [len(chunk.frame) for chunk in chunks] == [6, 6, 6, 2]
-    valid = expected["truth_seen"]
-    assert torch.equal(torch.cat([c.truth_valid for c in chunks]), valid)
-    assert torch.equal(torch.cat([c.truth for c in chunks]), expected["truth"] * valid[..., None])
+    truth = expected["truth"]
+    assert torch.equal(torch.cat([c.truth.valid for c in chunks]), truth.valid)
+    points = torch.cat([c.truth.points for c in chunks])
+    assert torch.equal(points, truth.points * truth.valid[..., None])
     assert torch.equal(torch.cat([c.frame for c in chunks]), expected["frame"])
     assert torch.equal(torch.cat([c.recording for c in chunks]), expected["recording"])
     for name, estimate in expected["estimates"].items():

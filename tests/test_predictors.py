@@ -71,7 +71,7 @@ def sound(result, batch):
         assert torch.isfinite(getattr(result, field)).all(), field
         expected = torch.float64 if field == "points" else torch.float32
         assert getattr(result, field).dtype == expected
-    assert torch.equal(result.frame, batch.sample)
+    assert torch.equal(result.frame, batch.index)
     missing = ~result.has_position
     for field in ("points", "error", "covariance"):
         assert (getattr(result, field)[missing] == 0).all()
@@ -106,7 +106,7 @@ def test_the_learned_prediction_is_that_of_the_view_weights():
     assert torch.equal(result.points, weighed.triangulation.points)
     assert torch.equal(result.views, weighed.views)
     torch.testing.assert_close(
-        result.score, (weighed.weights * weighed.logits).sum(-1), rtol=0, atol=1e-6
+        result.score, (weighed.pool.weights() * weighed.pool.logits).sum(-1), rtol=0, atol=1e-6
     )
     found = QUALITY(batch, weighed.triangulation.points, weighed.views)
     torch.testing.assert_close(result.covariance, found.covariance.float())
@@ -117,11 +117,11 @@ def test_displaced_key_points_spoil_the_average_of_the_hypotheses_and_not_the_le
     batch = Outliers(0.05, 0.1, 0.5)(scene.batch(), 0)
     predictor = learned()
     model = predictor.view_weights.model
-    pool = model.problem.generate(batch, model.hypotheses, model.keys("average", batch))
+    pool = model.sample(batch, "average")
     result = sound(predictor(batch), batch)
     ours, average = (
         (points - scene.points).norm(dim=-1).mean()
-        for points in (result.points, pool.points.mean(1))
+        for points in (result.points, pool.hypotheses.points.mean(1))
     )
     assert result.has_position.all()
     assert ours < 0.3 * average

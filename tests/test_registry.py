@@ -129,7 +129,7 @@ def of_the_ablations() -> dict[str, dict[str, Any]]:
     return {
         task.name: task.config["model"]
         for task in tasks.values()
-        if task.work.endswith(".train_model")
+        if task.action.endswith(".train_model")
     }
 
 

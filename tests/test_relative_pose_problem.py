@@ -17,13 +17,13 @@ from ghpt.models.relative_pose.problem import (
     random_subsets,
 )
 from ghpt.models.relative_pose.scale import KnownScale
-from ghpt.recording import PairBatch, RelativePoseEstimate
-from scenes import random_scene
+from ghpt.observations import Labelled, RelativePoseEstimate
+from scenes import labelled_pairs, random_scene
 
 FRAMES = 20
 
 
-def batch_of(seeds: list[int], noise: float = 0.0, views: int = 3) -> PairBatch:
+def batch_of(seeds: list[int], noise: float = 0.0, views: int = 3) -> Labelled:
     """For each seed a rig before which 20 people stand; pairs (0, 1), (0, 2), (1, 2), ... in turn."""
     rng = np.random.default_rng(seeds)
     K, R, t, key_points, points = [], [], [], [], []
@@ -41,19 +41,9 @@ def batch_of(seeds: list[int], noise: float = 0.0, views: int = 3) -> PairBatch:
             else pixels.transpose(0, 1)
         )
         points.append(scene.points.reshape(-1, 3)[:100])
-    shape = (len(seeds), views, FRAMES, 17)
     pair = torch.tensor([[0, 1], [0, 2], [1, 2]])[torch.arange(len(seeds)) % 3]
-    return PairBatch(
-        sample=torch.arange(len(seeds)),
-        rig=torch.arange(len(seeds)),
-        draw=torch.arange(len(seeds)),
-        pair=pair,
-        cameras=Cameras(torch.stack(K), torch.stack(R), torch.stack(t)),
-        key_points=torch.stack(key_points).float(),
-        confidence=torch.ones(shape),
-        valid=torch.ones(shape, dtype=torch.bool),
-        points=torch.stack(points),
-    )
+    rigs = Cameras(torch.stack(K), torch.stack(R), torch.stack(t))
+    return labelled_pairs(rigs, pair, torch.stack(key_points).float(), points=torch.stack(points))
 
 
 def problem(**changes) -> RelativePose:
@@ -70,31 +60,25 @@ def problem(**changes) -> RelativePose:
     return RelativePose(**(settings | changes))
 
 
-def truth_of(batch: PairBatch) -> tuple[torch.Tensor, torch.Tensor]:
-    cameras = batch.pair_cameras()
-    R = cameras.R[:, 1] @ cameras.R[:, 0].mT
-    return R, cameras.t[:, 1] - (R @ cameras.t[:, 0, :, None])[..., 0]
-
-
-def keys(batch: PairBatch) -> torch.Tensor:
-    return batch.sample + 1000
+def keys(batch: Labelled) -> torch.Tensor:
+    return batch.observations.index + 1000
 
 
 @pytest.mark.parametrize("refine", [0, 1, 2])
 def test_exact_key_points_give_the_true_pose_in_every_hypothesis(refine):
     batch, cameras = batch_of([0, 1, 2]), problem(refine=refine)
-    h = cameras.generate(batch, 30, keys(batch))
-    R, t = truth_of(batch)
+    h = cameras.generate(batch.observations, 30, keys(batch))
+    R, t = batch.truth.relative_pose()
     assert h.estimated.all()
     assert rotation_deg(h.R, R[:, None].expand_as(h.R)).max() < 0.02  # the key points are float32
     assert ((h.t - t[:, None]).norm(dim=-1) / t.norm(dim=-1)[:, None]).max() < 1e-3
     assert cameras.featurize(h).abs().max() < 1
-    assert cameras.error(cameras.expand(h), batch)[0].max() < 2
+    assert cameras.error(cameras.as_estimates(h), batch.truth)[0].max() < 2
 
 
 def test_features_are_sorted_and_say_nothing_of_the_order_of_frames_and_joints():
     batch, cameras = batch_of([3, 4], noise=5.0), problem()
-    h = cameras.generate(batch, 10, keys(batch))
+    h = cameras.generate(batch.observations, 10, keys(batch))
     features = cameras.featurize(h)
     assert (features.diff(dim=-1) >= 0).all()
     order = torch.randperm(h.a.shape[1], generator=torch.Generator().manual_seed(0))
@@ -106,11 +90,13 @@ def test_features_are_sorted_and_say_nothing_of_the_order_of_frames_and_joints()
 
 def test_features_have_one_length_for_any_number_of_frames_and_ignore_what_is_not_seen():
     batch, cameras = batch_of([3], noise=5.0), problem()
-    h = cameras.generate(batch, 10, keys(batch))
-    valid = batch.valid.clone()
+    h = cameras.generate(batch.observations, 10, keys(batch))
+    valid = batch.observations.valid.clone()
     valid[:, 1, ::3, 4:9] = False
     partly = replace(
-        batch, valid=valid, key_points=torch.where(valid[..., None], batch.key_points, 1e6)
+        batch.observations,
+        valid=valid,
+        key_points=torch.where(valid[..., None], batch.observations.key_points, 1e6),
     )
     a, b, both = partly.correspondences()
     hidden = cameras.featurize(RelativePoseHypotheses(h.R, h.t, h.estimated, a, b, both))
@@ -160,14 +146,8 @@ def test_at_most_half_of_the_correspondences_make_a_hypothesis_or_all_would_be_a
 
 def test_a_pair_s_hypotheses_do_not_depend_on_its_batch():
     batch, cameras = batch_of([5, 6, 7], noise=5.0), problem()
-    together = cameras.generate(batch, 20, keys(batch))
-    alone = batch_of([5, 6, 7], noise=5.0)
-    alone = PairBatch(
-        **{
-            f: (getattr(alone, f).index(slice(1, 2)) if f == "cameras" else getattr(alone, f)[1:2])
-            for f in PairBatch.__dataclass_fields__
-        }
-    )
+    together = cameras.generate(batch.observations, 20, keys(batch))
+    alone = batch.observations.rows(slice(1, 2))
     single = cameras.generate(alone, 20, keys(batch)[1:2])
     torch.testing.assert_close(together.R[1], single.R[0], rtol=0, atol=1e-9)
     torch.testing.assert_close(together.t[1], single.t[0], rtol=0, atol=1e-6)
@@ -175,40 +155,39 @@ def test_a_pair_s_hypotheses_do_not_depend_on_its_batch():
 
 def test_what_determines_no_pose_is_said_and_does_not_spoil_its_neighbours():
     batch, cameras = batch_of([0, 1, 2], noise=3.0), problem()
-    valid = batch.valid.clone()
+    valid = batch.observations.valid.clone()
     valid[0, 1] = False  # all joints missing in a view
     valid[1, 0, :, 1:] = False
     valid[1, 0, 7:] = False  # 7 correspondences
-    spoilt = replace(batch, valid=valid)
-    h, whole = cameras.generate(spoilt, 20, keys(batch)), cameras.generate(batch, 20, keys(batch))
+    spoilt = replace(batch.observations, valid=valid)
+    h, whole = (
+        cameras.generate(spoilt, 20, keys(batch)),
+        cameras.generate(batch.observations, 20, keys(batch)),
+    )
     assert h.estimated.tolist() == [False, False, True]
     assert torch.equal(h.R[2], whole.R[2])
-    error, counted = cameras.error(cameras.expand(h), spoilt)
+    error, counted = cameras.error(cameras.as_estimates(h), batch.truth)
     assert counted.tolist() == [False, False, True]
     assert torch.isfinite(error).all()
     assert torch.isfinite(cameras.featurize(h)).all()
-    same = replace(batch, pair=torch.tensor([[1, 1], [0, 2], [1, 2]]))  # identical cameras
+    same = replace(
+        batch.observations, pair=torch.tensor([[1, 1], [0, 2], [1, 2]])
+    )  # identical cameras
     assert cameras.generate(same, 20, keys(batch)).estimated.tolist() == [False, True, True]
 
 
 def test_an_empty_share_of_a_batch_goes_through():
-    full = batch_of([0, 1, 2])
-    empty = PairBatch(
-        **{
-            f: (full.cameras.index(slice(0)) if f == "cameras" else getattr(full, f)[:0])
-            for f in PairBatch.__dataclass_fields__
-        }
-    )
+    empty = batch_of([0, 1, 2]).rows(slice(0))
     cameras = problem()
-    h = cameras.generate(empty, 10, keys(empty))
+    h = cameras.generate(empty.observations, 10, keys(empty))
     assert cameras.featurize(h).shape == (0, 10, 16)
-    assert cameras.error(cameras.expand(h), empty)[0].shape == (0, 10)
+    assert cameras.error(cameras.as_estimates(h), empty.truth)[0].shape == (0, 10)
     assert cameras.aggregate(h, torch.zeros(0, 10)).R.shape == (0, 3, 3)
 
 
 def test_one_weight_selects_and_equal_weights_average_whatever_the_quaternions_signs():
     batch, cameras = batch_of([8], noise=5.0), problem()
-    h = cameras.generate(batch, 3, keys(batch))
+    h = cameras.generate(batch.observations, 3, keys(batch))
     chosen = cameras.aggregate(h, torch.tensor([[0.0, 1.0, 0.0]]))
     torch.testing.assert_close(chosen.R[0], h.R[0, 1])
     torch.testing.assert_close(chosen.t[0], h.t[0, 1])
@@ -225,16 +204,16 @@ def test_one_weight_selects_and_equal_weights_average_whatever_the_quaternions_s
 
 def test_the_average_translation_keeps_the_known_length():
     batch, cameras = batch_of([9, 10], noise=15.0), problem()
-    h = cameras.generate(batch, 50, keys(batch))
+    h = cameras.generate(batch.observations, 50, keys(batch))
     estimate = cameras.aggregate(h, torch.full((2, 50), 1 / 50))
-    torch.testing.assert_close(estimate.t.norm(dim=-1), truth_of(batch)[1].norm(dim=-1))
+    torch.testing.assert_close(estimate.t.norm(dim=-1), batch.truth.relative_pose()[1].norm(dim=-1))
 
 
 def test_the_average_is_differentiable_in_the_weights():
     batch, cameras = batch_of([8], noise=5.0), problem()
-    h = cameras.generate(batch, 5, keys(batch))
+    h = cameras.generate(batch.observations, 5, keys(batch))
     weights = torch.full((1, 5), 0.2, requires_grad=True)
-    error, _ = cameras.error(cameras.aggregate(h, weights), batch)
+    error, _ = cameras.error(cameras.aggregate(h, weights), batch.truth)
     error.sum().backward()
     assert torch.isfinite(weights.grad).all()
     assert (weights.grad != 0).any()
@@ -242,34 +221,35 @@ def test_the_average_is_differentiable_in_the_weights():
 
 def test_the_error_is_nearly_that_of_linear_triangulation():
     batch, cameras = batch_of([11, 12, 13]), problem(largest_error=1e6)
-    R, t = truth_of(batch)
+    R, t = batch.truth.relative_pose()
     turn = torch.from_numpy(
         Rotation.from_rotvec(np.random.default_rng(0).normal(0, 0.004, (3, 3))).as_matrix()
     )
     estimate = RelativePoseEstimate(
         turn @ R, t + torch.tensor([10.0, -20.0, 15.0]), torch.ones(3, dtype=torch.bool)
     )
-    true = batch.pair_cameras()
+    true = batch.truth.cameras
     target_t = (estimate.R @ true.t[:, 0, :, None])[..., 0] + estimate.t
     guess = Cameras(
         true.K,
         torch.stack((true.R[:, 0], estimate.R @ true.R[:, 0]), 1),
         torch.stack((true.t[:, 0], target_t), 1),
     )
-    reference, counted = error_3d(guess, true, batch.points)
+    reference, counted = error_3d(guess, true, batch.truth.points)
     mean = (reference * counted).sum(-1) / counted.sum(-1)
-    error, _ = cameras.error(estimate, batch)
+    error, _ = cameras.error(estimate, batch.truth)
     torch.testing.assert_close(error, mean, rtol=0.05, atol=0.5)
 
 
 def test_best_is_below_every_selection_and_worst_above():
     batch, cameras = batch_of([14, 15, 16], noise=8.0), problem()
-    h = cameras.generate(batch, 40, keys(batch))
-    errors, _ = cameras.error(cameras.expand(h), batch)
+    h = cameras.generate(batch.observations, 40, keys(batch))
+    errors, _ = cameras.error(cameras.as_estimates(h), batch.truth)
     logits = -cameras.featurize(h)[..., 8]
     found = {
         name: cameras.error(
-            cameras.aggregate(h, aggregation_weights(name, logits, errors, 1.2, keys(batch))), batch
+            cameras.aggregate(h, aggregation_weights(name, logits, errors, 1.2, keys(batch))),
+            batch.truth,
         )[0]
         for name in AGGREGATIONS
     }

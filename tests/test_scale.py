@@ -19,9 +19,10 @@ from ghpt.models.relative_pose.scale import (
     body_scale,
     stature,
 )
-from ghpt.recording import PairBatch, RelativePoseEstimate
+from ghpt.observations import RelativePoseEstimate
 from ghpt.skeleton import BONES, JOINTS
 from rigs_with_people import people, relative
+from scenes import labelled_pairs
 
 
 def bones(points):
@@ -35,17 +36,8 @@ def batch(noise=0.0):
     two = lambda x: torch.stack((x, x))  # noqa: E731
     cameras = Cameras(two(scene.cameras.K), two(scene.cameras.R), two(scene.cameras.t))
     valid = two(scene.valid.transpose(0, 1))
-    problem = PairBatch(
-        sample=torch.arange(2),
-        rig=torch.zeros(2, dtype=torch.int64),
-        draw=torch.zeros(2, dtype=torch.int64),
-        pair=pairs,
-        cameras=cameras,
-        key_points=two(scene.key_points.transpose(0, 1)),
-        confidence=torch.ones(valid.shape),
-        valid=valid,
-        points=torch.zeros(2, 1, 3, dtype=torch.float64),
-    )
+    key_points = two(scene.key_points.transpose(0, 1))
+    problem = labelled_pairs(cameras, pairs, key_points, valid).observations
     R, t = (
         torch.stack(x)
         for x in zip(*(relative(scene.cameras, *p) for p in pairs.tolist()), strict=True)

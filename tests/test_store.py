@@ -15,12 +15,12 @@ import torch
 from ghpt.data.datasets import store
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 
 
-def recording(seed: int, frames: int = 7, views: int = 3) -> Recording:
+def recording(seed: int, frames: int = 7, views: int = 3) -> LabelledRecording:
     rng = np.random.default_rng(seed)
-    return Recording(
+    return LabelledRecording(
         name=f"S1/take-{seed}",
         subject="S1",
         action="Größe 走",
@@ -38,8 +38,8 @@ def recording(seed: int, frames: int = 7, views: int = 3) -> Recording:
     )
 
 
-def assert_same(a: Recording, b: Recording) -> None:
-    for field in fields(Recording):
+def assert_same(a: LabelledRecording, b: LabelledRecording) -> None:
+    for field in fields(LabelledRecording):
         x, y = getattr(a, field.name), getattr(b, field.name)
         if field.name == "cameras":
             assert all(
@@ -76,7 +76,7 @@ def test_arrays_are_read_only_maps_of_the_file(tmp_path: Path) -> None:
 def test_prepares_once_per_key(tmp_path: Path) -> None:
     made = []
 
-    def make(seed: int) -> list[Recording]:
+    def make(seed: int) -> list[LabelledRecording]:
         made.append(seed)
         return [recording(seed)]
 
@@ -157,12 +157,12 @@ def test_a_folder_that_another_process_made_meanwhile_stays(tmp_path: Path) -> N
     """Its readers have it mapped; ours goes away."""
     valid = []
 
-    def make() -> list[Recording]:
+    def make() -> list[LabelledRecording]:
         if not valid:
             valid.append(store.prepared(tmp_path, {"name": "x"}, make_other, {})[0])
         return [recording(1)]
 
-    def make_other() -> list[Recording]:
+    def make_other() -> list[LabelledRecording]:
         return [recording(0)]
 
     (take,) = store.prepared(tmp_path, {"name": "x"}, make, {})

@@ -3,7 +3,7 @@ from math import comb
 import pytest
 import torch
 
-from ghpt.geometry.subsets import _pairs_or_more, random_subsets
+from ghpt.geometry.subsets import _subset_of_two_or_more, random_subsets
 from ghpt.randomness import key
 
 
@@ -40,14 +40,14 @@ def test_the_sizes_of_many_views_subsets_are_binomial(views):
 @pytest.mark.parametrize("n", [2, 3, 10])
 def test_unranking_meets_every_subset_once(n):
     ranks = torch.arange(2**n - n - 1)[None, :, None, None]
-    numbers = _pairs_or_more(ranks, torch.full((1, 1, 1, 1), n)).flatten()
+    numbers = _subset_of_two_or_more(ranks, torch.full((1, 1, 1, 1), n)).flatten()
     assert numbers.tolist() == [x for x in range(2**n) if x.bit_count() >= 2]
 
 
 def test_unranking_does_not_overflow_at_the_word_s_end():
     last = 2**62 - 62 - 2
     ranks = torch.tensor([0, 1, last])[None, :, None, None]
-    numbers = _pairs_or_more(ranks, torch.full((1, 1, 1, 1), 62)).flatten()
+    numbers = _subset_of_two_or_more(ranks, torch.full((1, 1, 1, 1), 62)).flatten()
     assert numbers.tolist() == [3, 5, 2**62 - 1]
 
 

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from ghpt.errors import GhptDataError
-from ghpt.paper.engine.code import code_digest, meaning
 from ghpt.paper.engine.pool import perform_all
 from ghpt.paper.engine.tasks import read_json, with_dependencies
 from toy_tasks import task
@@ -75,26 +74,9 @@ def test_the_key_knows_config_needs_and_code(diary, monkeypatch):
     assert diamond(diary).key == diamond(diary).key
     assert len({diamond(diary).key, diamond(diary, first=9).key, diamond(diary, last=9).key}) == 3
     before = diamond(diary).key
-    monkeypatch.setattr("ghpt.paper.engine.tasks.code_digest", lambda module: "changed")
+    monkeypatch.setattr("ghpt.paper.engine.tasks.code_digest", lambda names: "changed")
     assert diamond(diary).key != before
     assert len(with_dependencies([diamond(diary), diamond(diary)])) == 4
-
-
-def test_comments_docstrings_and_layout_are_no_code(tmp_path):
-    def digest(name, text):
-        (tmp_path / name).write_text(text)
-        return meaning(tmp_path / name)
-
-    plain = digest("a.py", "def f(x):\n    return x + 1\n")
-    assert (
-        digest(
-            "b.py",
-            '"""About."""\n\n\ndef f(x):\n    """More."""\n    # why\n    return (x\n            + 1)\n',
-        )
-        == plain
-    )
-    assert digest("c.py", "def f(x):\n    return x + 2\n") != plain
-    assert code_digest("toy_tasks") != code_digest("ghpt.paper.engine.actions")
 
 
 PROGRAM = """

@@ -135,9 +135,10 @@ def test_calibration_on_embedded_people_known_to_the_detector_and_not(split, ban
     )
     takes = list(islice(synthetic_recordings("h36m", split, 0, detector), 4))
     frames = Frames(takes, np.arange(0, sum(map(len, takes)), 16))
-    batch = frames[range(len(frames))]
+    labelled = frames[range(len(frames))]
+    batch = labelled.observations
     result = predictor.fitted(batch)(batch)
-    offset = (result.points - batch.truth).double()[result.has_position][..., None]
+    offset = (result.points - labelled.truth.points).double()[result.has_position][..., None]
     distance = (
         offset.mT
         @ torch.linalg.solve(full(result.covariance)[result.has_position].double(), offset)

@@ -10,6 +10,7 @@ from ghpt.data.datasets.frames import Frames
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
+from ghpt.observations import RelativePoseEstimate
 from ghpt.paper.camera.extrinsics import (
     PARTS,
     from_pairs,
@@ -18,7 +19,7 @@ from ghpt.paper.camera.extrinsics import (
     seen_by,
     with_true_scale,
 )
-from ghpt.recording import PairBatch, RelativePoseEstimate
+from scenes import labelled_pairs
 
 TRUTH = human36m_rig("S9").cameras
 
@@ -74,22 +75,9 @@ def test_rig_in_any_frame_and_unit_gives_back_the_true_cameras():
 def test_pairs_with_the_first_camera_are_taken_in_its_order():
     pair = torch.tensor([[0, 1], [0, 2], [0, 3], [1, 2], [1, 3], [2, 3]])
     rig = Cameras(*(x.expand(len(pair), *x.shape) for x in (TRUTH.K, TRUTH.R, TRUTH.t)))
-    number, view = torch.arange(len(pair)), torch.zeros(len(pair), 4, 1, 17)
-    points = torch.zeros(len(pair), 1, 3, dtype=torch.float64)
-    batch = PairBatch(
-        number,
-        0 * number,
-        0 * number,
-        pair,
-        rig,
-        torch.zeros(*view.shape, 2),
-        view,
-        view > 0,
-        points,
-    )
-    a, b = (batch.pair_cameras().index((slice(None), i)) for i in (0, 1))
-    R = b.R @ a.R.mT
-    t = b.t - (R @ a.t[..., None])[..., 0]
+    labelled = labelled_pairs(rig, pair, torch.zeros(len(pair), 4, 1, 17, 2))
+    batch = labelled.observations
+    R, t = labelled.truth.relative_pose()
     estimate = RelativePoseEstimate(R, t, torch.ones(len(pair), dtype=torch.bool))
     found = replaced(TRUTH, from_pairs(estimate, batch, "truth"), True, True)
     torch.testing.assert_close(found.R, TRUTH.R, rtol=0, atol=1e-12)
@@ -109,7 +97,8 @@ def test_draws_take_turns_over_the_frames_of_their_rigs():
         {"recordings": [i], "draws": [(R.tolist(), (t + shift).tolist()) for shift in shifts[i]]}
         for i in range(2)
     ]
-    batch, true = seen_by(frames, rigs, False, True)[range(6)], frames[range(6)]
+    batch = seen_by(frames, rigs, False, True)[range(6)].observations
+    true = frames[range(6)].observations
     torch.testing.assert_close(batch.key_points, true.key_points, rtol=0, atol=0)
     moved = (batch.cameras.t - true.cameras.t)[:, 1:]
     expected = torch.tensor([0.0, 10, 20, 30, 40, 50])[:, None, None].expand(6, 3, 3).double()

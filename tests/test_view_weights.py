@@ -44,7 +44,7 @@ def view_weights(power=2.0, hypotheses=300, consensus=CONSENSUS):
         hypotheses,
         temperature=1.5,
         gumbel=True,
-        spread=None,
+        logit_std_cap=None,
         selection="weight",
         seed=0,
     )
@@ -104,11 +104,11 @@ def test_hypotheses_are_made_of_views_that_agree():
     far = replace(scene, key_points=scene.key_points + 150.0 * wrong[..., None])
     found = view_weights().weigh(far.batch())
     assert torch.equal(found.views, ~wrong)
-    assert not (found.hypotheses.views & ~found.views.mT[:, None]).any()
+    assert not (found.pool.hypotheses.views & ~found.views.mT[:, None]).any()
     assert error(found.triangulation.points, scene) < 0.2 * error(
         Linear()(far.batch()).points, scene
     )
-    torch.testing.assert_close(found.weights.sum(-1), torch.ones(3))
+    torch.testing.assert_close(found.pool.weights().sum(-1), torch.ones(3))
 
 
 def test_where_the_views_disagree_as_a_whole_a_scorer_that_is_wrong_harms_less():

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.geometry.cameras import Cameras, project
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 
 DATA = {
     "_target_": "toys.ToyData",
@@ -86,7 +86,7 @@ class ToyData(KeyPointDataModule):
     def cache_key(self, split: str) -> dict[str, Any]:
         return {"name": f"toy-{split}", "views": self.views, "missing": self.missing}
 
-    def generate(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[LabelledRecording]:
         rng = np.random.default_rng(["train", "validation", "test"].index(split))
         for take in range(2):
             yield recording(
@@ -101,7 +101,7 @@ class ToyData(KeyPointDataModule):
 
 def recording(
     name: str, subject: str, frames: int, views: int, missing: float, rng: np.random.Generator
-) -> Recording:
+) -> LabelledRecording:
     angles = np.linspace(0, 2 * np.pi, views, endpoint=False)
     R = torch.from_numpy(
         np.stack([Rotation.from_euler("yx", [a, 0.2]).as_matrix() for a in angles])
@@ -114,7 +114,7 @@ def recording(
     truth = body + rng.normal(0, 60, (frames, 17, 3))
     pixels, _ = project(cameras, torch.from_numpy(truth))
     valid = rng.random((frames, views, 17)) >= missing
-    return Recording(
+    return LabelledRecording(
         name=name,
         subject=subject,
         action="Walking",

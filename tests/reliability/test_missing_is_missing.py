@@ -14,8 +14,8 @@ from ghpt.geometry.cameras import Cameras, project
 from ghpt.models.estimators.classical import Linear
 from ghpt.models.estimators.predictors import Classical
 from ghpt.models.estimators.uncertainty import UncertaintyModel
+from ghpt.observations import Observations
 from ghpt.reconstruction import About, State
-from ghpt.recording import Observations
 from ghpt.skeleton import JOINTS
 from predicting import walk
 
@@ -48,14 +48,12 @@ def batch(valid: np.ndarray, rng: np.random.Generator) -> Observations:
         *(x.expand(T, *x.shape) for x in (RIG.cameras.K, RIG.cameras.R, RIG.cameras.t))
     )
     return Observations(
-        sample=torch.arange(T),
+        index=torch.arange(T),
         recording=torch.zeros(T, dtype=torch.int64),
         cameras=cameras,
         key_points=torch.where(there[..., None], pixels, spoilt),
         confidence=there.double(),
         valid=there,
-        truth=torch.zeros(T, J, 3),
-        truth_valid=torch.zeros(T, J, dtype=torch.bool),
     )
 
 

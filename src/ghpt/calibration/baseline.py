@@ -9,7 +9,7 @@ import torch
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.errors import check
 from ghpt.geometry.cameras import relative_pose
-from ghpt.recording import PairBatch, RelativePoseEstimate
+from ghpt.observations import PairObservations, RelativePoseEstimate
 
 
 class RigBaseline:
@@ -26,7 +26,7 @@ class RigBaseline:
         self._found: OrderedDict[tuple, RigEstimate] = OrderedDict()
 
     @torch.no_grad()
-    def __call__(self, batch: PairBatch) -> RelativePoseEstimate:
+    def __call__(self, batch: PairObservations) -> RelativePoseEstimate:
         device = batch.key_points.device
         rigs = [self._rig(batch, item) for item in range(len(batch))]
         a, b = batch.pair.cpu().T
@@ -49,7 +49,7 @@ class RigBaseline:
             turn.double().to(device), shift.double().to(device), ok.to(device)
         )
 
-    def _rig(self, batch: PairBatch, item: int) -> RigEstimate:
+    def _rig(self, batch: PairObservations, item: int) -> RigEstimate:
         key_points = batch.key_points[item].transpose(0, 1).cpu()
         # the sum tells draws of different data sets apart, whose numbers are the same
         known = int(batch.rig[item]), int(batch.draw[item]), float(key_points.double().sum())
@@ -57,7 +57,7 @@ class RigBaseline:
             confidence, valid = (
                 x[item].transpose(0, 1).cpu() for x in (batch.confidence, batch.valid)
             )
-            K = batch.cameras.K[item].double().cpu()
+            K = batch.K[item].double().cpu()
             names = [str(view) for view in range(len(K))]
             self._found[known] = self.calibration(
                 names, K, key_points, confidence, valid, None, self.seed

@@ -31,8 +31,8 @@ from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.models.estimators.classical import Baseline
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES
+from ghpt.observations import Recording
 from ghpt.provenance import provenance
-from ghpt.recording import Recording
 from ghpt.report.calibration import differences, explains, print_calibration, spread
 from ghpt.report.rig_comparison import Similarity, align, triangulate_recording, upright
 from ghpt.report.rig_files import (

@@ -34,8 +34,8 @@ from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.files import atomic_write, remove, sweep_temporaries, write_json
 from ghpt.geometry.cameras import CameraSet
 from ghpt.geometry.lens import distort
+from ghpt.observations import Recording
 from ghpt.provenance import provenance
-from ghpt.recording import Recording
 from ghpt.report.escape import escaped, plain
 from ghpt.report.tables import display_name, markdown
 

@@ -15,7 +15,7 @@ from ghpt.data.formats.key_points import KeyPoints, read_key_points
 from ghpt.data.formats.names import Name
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import CameraSet
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 
 
 class InputSettings(TypedDict):
@@ -48,7 +48,7 @@ def own_key_points(config: Mapping[str, Any]) -> KeyPoints:
     )
 
 
-def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, Recording]:
+def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, LabelledRecording]:
     """A recording of ``config["data"]`` by name; without a name S9/Walking-1 or the first."""
     data = build(config["data"], "data")
     made = {"source": data.source, "split": data.evaluate}

@@ -1,5 +1,4 @@
-"""Normal equations of linear triangulation: one 3x3 system for each view and joint, free of the
-unit of length.
+"""Normal equations of linear triangulation: a 3x3 system for each view and joint, without units.
 
 A view that sees the joint at pixel (u, v) gives two rows, ``a = (u - c_x) r_3 - f_x r_1 - s r_2``
 and ``b = (v - c_y) r_3 - f_y r_2`` (r_i the rows of R), whose residuals are depth x pixel error. So
@@ -10,13 +9,14 @@ conditioning is that of the rays alone.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.masking import apply, identity_like, where
 from ghpt.geometry.rotations import is_rotation
 
 LARGEST = 1e12
@@ -28,112 +28,146 @@ LARGEST_CONDITION = 1e13
 and more.
 """
 
+Vector = tuple[Tensor, Tensor, Tensor]
+"""The components of a 3-vector, each an array of its own."""
+Row = tuple[Tensor, Tensor, Tensor, Tensor]
+"""An equation of a point: its three coefficients and its right-hand side."""
+Symmetric = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+"""The elements xx xy xz yy yz zz of a symmetric 3x3 matrix."""
+
 
 def valid_cameras(cameras: Cameras) -> Bool[Tensor, "*B V"]:
-    """Which cameras are cameras: finite and not absurd, R a rotation within 1e-3, positive focal
-    lengths, last row of K (0, 0, 1).
+    """Return which cameras are cameras.
+
+    Their numbers are finite and not absurd, R is a rotation within 1e-3, focal lengths are
+    positive, and the last row of K is (0, 0, 1).
     """
     K = cameras.K
     R = cameras.R
-    t = cameras.t
-    values = torch.cat((K.flatten(-2), R.flatten(-2), t), dim=-1)
-    focal = torch.stack((K[..., 0, 0], K[..., 1, 1]), dim=-1)
+    numbers = (K.flatten(-2), R.flatten(-2), cameras.t)
+    largest = torch.cat(numbers, dim=-1).abs()
+    bounded = (largest <= LARGEST).all(-1)
+    focal = K.diagonal(dim1=-2, dim2=-1)[..., :2]
+    positive = (focal >= 1 / LARGEST).all(-1)
     last_row = K[..., 2, :] - K.new_tensor([0.0, 0.0, 1.0])
-    return (
-        (values.abs() <= LARGEST).all(-1)
-        & (focal >= 1 / LARGEST).all(-1)
-        & (last_row.abs() <= 1e-6).all(-1)
-        & is_rotation(R, 1e-3)
-    )
+    ideal = (last_row.abs() <= 1e-6).all(-1)
+    return bounded & positive & ideal & is_rotation(R, 1e-3)
 
 
-def usable_views(cameras: Cameras, key_points: Float[Tensor, "*B V J 2"]) -> Bool[Tensor, "*B V J"]:
-    """Which key points can be triangulated from: finite, not absurd, and of a valid camera."""
-    return (key_points.abs() <= LARGEST).all(-1) & valid_cameras(cameras)[..., None]
+def valid_key_points(
+    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"]
+) -> Bool[Tensor, "*B V J"]:
+    """Return which key points can be triangulated: finite, not absurd, and of a valid camera."""
+    bounded = (key_points.abs() <= LARGEST).all(-1)
+    return bounded & valid_cameras(cameras)[..., None]
 
 
 def local_cameras(
     cameras: Cameras, valid: Bool[Tensor, "*B V"] | None = None
 ) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
-    """Float64 cameras in a world whose origin is the rig's (component-wise median) centre, and that
-    origin.
+    """Return float64 cameras in a world whose origin is the rig's median centre, and that origin.
 
-    Far from the world's origin the squares of coordinates would cost digits, and a median is not
-    moved by one camera with absurd numbers. Invalid cameras are replaced by one at the origin.
-    ``valid``: ``valid_cameras``.
+    Far from the world's origin the squares of coordinates would cost digits, and a (component-wise)
+    median is not moved by one camera with absurd numbers. Invalid cameras are replaced by one at
+    the origin. ``valid``: ``valid_cameras``.
     """
-    valid = valid_cameras(cameras) if valid is None else valid
-    K, R, t = (x.to(torch.float64) for x in (cameras.K, cameras.R, cameras.t))
-    identity = torch.eye(3, dtype=torch.float64, device=K.device)
-    K = torch.where(valid[..., None, None], K, identity)
-    R = torch.where(valid[..., None, None], R, identity)
-    t = torch.where(valid[..., None], t, 0.0)
-    centre = torch.where(valid[..., None], Cameras(K, R, t).centre, torch.nan)
+    if valid is None:
+        valid = valid_cameras(cameras)
+    double = cameras.to(torch.float64)
+    identity = identity_like(double.K)
+    K = where(valid, double.K, identity)
+    R = where(valid, double.R, identity)
+    t = where(valid, double.t, 0.0)
+    centre = where(valid, Cameras(K, R, t).centre, torch.nan)
     origin = centre.nanmedian(dim=-2).values.nan_to_num(0.0)
-    return Cameras(K, R, t + (R @ origin[..., None, :, None])[..., 0]), origin
+    shift = apply(R, origin.unsqueeze(-2))
+    return Cameras(K, R, t + shift), origin
 
 
-class Views(NamedTuple):
-    """Cameras and key points with their components apart and the frames last, so that each
-    operation runs along memory: key points are [V, J, B], what is a camera's is [V, 1, B]; float64.
+@dataclass(frozen=True)
+class ViewComponents:
+    """Cameras and key points with their components in separate arrays and the frames last.
+
+    So each operation runs along memory: key points are [V, J, B], what is a camera's is [V, 1, B];
+    float64.
     """
 
-    first: tuple[Tensor, Tensor, Tensor]
+    first: Vector
     """The first row of ``K[:2, :2] R[:2]``."""
-    second: tuple[Tensor, Tensor, Tensor]
-    axis: tuple[Tensor, Tensor, Tensor]
+    second: Vector
+    axis: Vector
     """The optical axis, r_3."""
-    shift: tuple[Tensor, Tensor, Tensor]
+    shift: Vector
     """``K[:2, :2] t[:2]`` and t_3."""
     u: Tensor
-    """Horizontal pixels from the principal point; 0 where the view is not usable."""
+    """Horizontal pixels from the principal point; 0 where the key point is not valid."""
     v: Tensor
 
-    def rows(self) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-        """The rows a and b of each view and joint, their right-hand sides the last of four."""
-        (p, q, tz) = self.shift
-        a = [self.u * r - k for r, k in zip(self.axis, self.first, strict=True)]
-        b = [self.v * r - k for r, k in zip(self.axis, self.second, strict=True)]
-        return (*a, p - self.u * tz), (*b, q - self.v * tz)
+    def rows(self) -> tuple[Row, Row]:
+        """Return the rows a and b of each view and joint."""
+        shift_u, shift_v, shift_z = self.shift
+        ax, ay, az = (self.u * r - k for r, k in zip(self.axis, self.first, strict=True))
+        bx, by, bz = (self.v * r - k for r, k in zip(self.axis, self.second, strict=True))
+        right_a = shift_u - self.u * shift_z
+        right_b = shift_v - self.v * shift_z
+        return (ax, ay, az, right_a), (bx, by, bz, right_b)
 
-    def depth(self, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-        """Of points [J, B] in each view, mm."""
-        (rx, ry, rz) = self.axis
-        shift = self.shift[2]
-        return torch.addcmul(torch.addcmul(torch.addcmul(shift, rx, x), ry, y), rz, z)
+    def depth(self, x: Tensor, y: Tensor, z: Tensor) -> Float[Tensor, "V J B"]:
+        """Return the depth of points [J, B] in each view, mm."""
+        rx, ry, rz = self.axis
+        depth = torch.addcmul(self.shift[2], rx, x)
+        depth = torch.addcmul(depth, ry, y)
+        return torch.addcmul(depth, rz, z)
 
 
-def views_of(
-    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], usable: Bool[Tensor, "V J B"]
-) -> Views:
-    """``cameras`` are used as they are: pass valid ones near the origin, [B, V] or [1, V] for all
+def view_components(
+    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], valid: Bool[Tensor, "V J B"]
+) -> ViewComponents:
+    """Return the components of cameras and key points.
+
+    ``cameras`` are used as they are: pass valid ones near the origin, [B, V] or [1, V] for all
     frames.
     """
     R = cameras.R.permute(2, 3, 1, 0)[..., None, :].contiguous()
     t = cameras.t.permute(2, 1, 0)[..., None, :]
     K = cameras.K.permute(2, 3, 1, 0)[:2, :, :, None].contiguous()
-    pixels = torch.where(usable, key_points.permute(3, 1, 2, 0).to(torch.float64), 0.0)
-    u, v = (torch.where(usable, pixels[i] - K[i, 2], 0.0) for i in range(2))
-    first, second = (
-        tuple(K[i, 0] * R[0, j] + K[i, 1] * R[1, j] for j in range(3)) for i in range(2)
+    pixels = key_points.permute(3, 1, 2, 0).double()
+    pixels = torch.where(valid, pixels, 0.0)
+    return ViewComponents(
+        first=_combine(K[0], R),
+        second=_combine(K[1], R),
+        axis=(R[2, 0], R[2, 1], R[2, 2]),
+        shift=(_mix(K[0], t), _mix(K[1], t), t[2].contiguous()),
+        u=torch.where(valid, pixels[0] - K[0, 2], 0.0),
+        v=torch.where(valid, pixels[1] - K[1, 2], 0.0),
     )
-    shift = tuple(K[i, 0] * t[0] + K[i, 1] * t[1] for i in range(2))
-    return Views(first, second, tuple(R[2]), (*shift, t[2].contiguous()), u, v)
 
 
-def products(a: Sequence[Tensor], b: Sequence[Tensor]) -> Float[Tensor, "V 9 ..."]:
-    """Normal equations of each view alone from its two rows: the matrix (xx xy xz yy yz zz) and its
-    right-hand side (3).
+def _combine(k: Float[Tensor, "3 V 1 B"], R: Float[Tensor, "3 3 V 1 B"]) -> Vector:
+    return _mix(k, R[:, 0]), _mix(k, R[:, 1]), _mix(k, R[:, 2])
+
+
+def _mix(k: Float[Tensor, "3 V 1 B"], x: Float[Tensor, "3 V 1 B"]) -> Float[Tensor, "V 1 B"]:
+    return k[0] * x[0] + k[1] * x[1]
+
+
+def form_equations(a: Sequence[Tensor], b: Sequence[Tensor]) -> Float[Tensor, "V 9 ..."]:
+    """Return the normal equations of each view alone from its two rows.
+
+    They are the matrix (xx xy xz yy yz zz) and its right-hand side (3).
     """
-    pairs = [(i, j) for i in range(3) for j in range(i, 3)] + [(i, 3) for i in range(3)]
-    return torch.stack([torch.addcmul(a[i] * a[j], b[i], b[j]) for i, j in pairs], dim=1)
+    matrix = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    right = [(0, 3), (1, 3), (2, 3)]
+    products = [torch.addcmul(a[i] * a[j], b[i], b[j]) for i, j in matrix + right]
+    return torch.stack(products, dim=1)
 
 
 def weighted_sum(
     equations: Float[Tensor, "V E ..."], weights: Float[Tensor, "V ..."]
 ) -> Float[Tensor, "E ..."]:
-    """Over the views, in their order: each frame's sum is the same in any batch, as ``torch.sum``'s
-    is not.
+    """Return the sum over the views, in their order.
+
+    So each frame's sum is the same in any batch, as ``torch.sum``'s is not.
     """
     total = equations.new_zeros(equations.shape[1:])
     for equation, weight in zip(equations, weights, strict=True):
@@ -142,20 +176,24 @@ def weighted_sum(
 
 
 def view_equations(
-    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], usable: Bool[Tensor, "B V J"]
+    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], valid: Bool[Tensor, "B V J"]
 ) -> Float[Tensor, "B V J 9"]:
-    """Normal equations of each view alone, float64: the matrix (xx xy xz yy yz zz) and its
-    right-hand side (3); all 0 where the view is not usable. ``cameras`` are used as they are: pass
-    valid ones near the origin.
+    """Return the normal equations of each view alone, float64; all 0 where a key point is invalid.
+
+    They are the matrix (xx xy xz yy yz zz) and its right-hand side (3). ``cameras`` are used as
+    they are: pass valid ones near the origin.
     """
-    usable = usable.permute(1, 2, 0)
-    each = products(*views_of(cameras, key_points, usable).rows())
-    return torch.where(usable[:, None], each, 0.0).permute(3, 0, 2, 1).contiguous()
+    valid = valid.permute(1, 2, 0)
+    components = view_components(cameras, key_points, valid)
+    a, b = components.rows()
+    equations = form_equations(a, b)
+    equations = torch.where(valid[:, None], equations, 0.0)
+    return equations.permute(3, 0, 2, 1).contiguous()
 
 
-def minors(m: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-    """Cofactors (xx xy xz yy yz zz) of symmetric 3x3 matrices."""
-    xx, xy, xz, yy, yz, zz = m
+def minors(matrix: Sequence[Tensor]) -> Symmetric:
+    """Return the cofactors (xx xy xz yy yz zz) of symmetric 3x3 matrices."""
+    xx, xy, xz, yy, yz, zz = matrix
     return (
         yy * zz - yz * yz,
         xz * yz - xy * zz,
@@ -166,21 +204,24 @@ def minors(m: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
     )
 
 
-def solve_symmetric(equations: tuple[Tensor, ...]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def solve_symmetric(equations: Sequence[Tensor]) -> Row:
     """Solve batched symmetric 3x3 systems by cofactors.
 
     ``equations``: nine equal shapes, the matrix (xx xy xz yy yz zz) and the right-hand side (x y
     z). Returns x, y, z and tr(M) tr(M^-1); where that exceeds ``LARGEST_CONDITION`` it is inf and
     the solution 0.
     """
-    matrix = equations[:6]
-    (p, q, r) = equations[6:]
-    cxx, cxy, cxz, cyy, cyz, czz = minors(matrix)
-    determinant = matrix[0] * cxx + matrix[1] * cxy + matrix[2] * cxz
-    numerator = (matrix[0] + matrix[3] + matrix[5]) * (cxx + cyy + czz)
-    good = numerator < LARGEST_CONDITION * determinant
-    inverse = torch.where(good, 1 / torch.where(good, determinant, 1.0), 0.0)
+    xx, xy, xz, yy, _, zz, p, q, r = equations
+    cxx, cxy, cxz, cyy, cyz, czz = minors(equations[:6])
+    determinant = xx * cxx + xy * cxy + xz * cxz
+    trace = xx + yy + zz
+    cofactor_trace = cxx + cyy + czz
+    numerator = trace * cofactor_trace
+    regular = numerator < LARGEST_CONDITION * determinant
+    safe = torch.where(regular, determinant, 1.0)
+    inverse = torch.where(regular, 1 / safe, 0.0)
     x = (cxx * p + cxy * q + cxz * r) * inverse
     y = (cxy * p + cyy * q + cyz * r) * inverse
     z = (cxz * p + cyz * q + czz * r) * inverse
-    return x, y, z, torch.where(good, numerator * inverse, torch.inf)
+    condition = torch.where(regular, numerator * inverse, torch.inf)
+    return x, y, z, condition

@@ -11,40 +11,46 @@ _WORD = 62
 
 
 def random_subsets(
-    valid: Bool[Tensor, "B V J"], count: int, keys: Int[Tensor, " B"]
+    valid: Bool[Tensor, "B V J"],
+    count: int,
+    keys: Int[Tensor, " B"],
 ) -> Bool[Tensor, "B H J V"]:
-    """For each hypothesis and joint a subset of the seen views, uniform over all those of two views
-    or more.
+    """Return for each hypothesis and joint a subset of the valid views, of two or more.
 
-    ``count`` is H. A frame's subsets depend on its key and its own ``valid`` alone. A joint seen in
-    fewer than two views gets the empty subset.
+    It is uniform over all such subsets. ``count`` is H. A frame's subsets depend on its key and its
+    own ``valid`` alone. A joint with fewer than two valid views gets the empty subset.
     """
     valid = valid.transpose(1, 2)[:, None]
     views = valid.sum(-1, keepdim=True)
-    place = valid.cumsum(-1) - 1
-    words = -(-max(valid.shape[-1], 1) // _WORD)
-    word = bits(keys, (count, valid.shape[2], words)) & torch.iinfo(torch.int64).max
-    word[..., :1] = _pairs_or_more(word[..., :1], views)
+    position = (valid.cumsum(-1) - 1).clamp(min=0)
+    _, _, joints, all_views = valid.shape
+    words = -(-max(all_views, 1) // _WORD)
+    word = bits(keys, (count, joints, words)) & torch.iinfo(torch.int64).max
+    word[..., :1] = _subset_of_two_or_more(word[..., :1], views)
     if words == 1:
-        chosen = valid & (((word >> place.clamp(min=0)) & 1) != 0)
-    else:
-        place = place.clamp(min=0).expand(-1, count, -1, -1)
-        chosen = valid & (((word.gather(-1, place // _WORD) >> (place % _WORD)) & 1) != 0)
-        # for more views than a word holds the fair bits themselves are drawn: once in 1e17 draws
-        # fewer than two
-        chosen |= valid & (views > _WORD) & (chosen.sum(-1, keepdim=True) < 2)
-    return chosen
+        return valid & _bit(word, position)
+    position = position.expand(-1, count, -1, -1)
+    own_word = word.gather(-1, position // _WORD)
+    chosen = valid & _bit(own_word, position % _WORD)
+    # for more views than a word holds the fair bits themselves are drawn: once in 1e17 draws
+    # fewer than two
+    too_few = (views > _WORD) & (chosen.sum(-1, keepdim=True) < 2)
+    return chosen | (valid & too_few)
 
 
-def _pairs_or_more(
-    word: Int[Tensor, "B H J 1"], views: Int[Tensor, "B 1 J 1"]
+def _bit(word: Int[Tensor, "..."], position: Int[Tensor, "..."]) -> Bool[Tensor, "..."]:
+    return ((word >> position) & 1) != 0
+
+
+def _subset_of_two_or_more(
+    word: Int[Tensor, "B H J 1"],
+    views: Int[Tensor, "B 1 J 1"],
 ) -> Int[Tensor, "B H J 1"]:
-    """Turn 63 random bits into a number with two bits or more set out of ``views``, each equally
-    likely.
+    """Turn 63 random bits into a number with two bits or more set out of ``views``.
 
-    Such numbers below 2^n are counted by 2^n - n - 1, and the one of rank r whose highest bit is p
-    is r + p + 2. The remainder that gives r is uniform but for less than 2e-9 of the probability
-    (none to speak of below 30 views).
+    Each is equally likely. Such numbers below 2^n are counted by 2^n - n - 1, and the one of rank r
+    whose highest bit is p is r + p + 2. The remainder that gives r is uniform but for less than
+    2e-9 of the probability (none to speak of below 30 views).
     """
     n = torch.arange(_WORD + 1, device=word.device)
     below = (1 << n) - n - 1

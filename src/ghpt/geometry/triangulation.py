@@ -6,7 +6,7 @@ product, whatever the number of subsets; then each joint is a 3x3 solve.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, fields
 
 import torch
@@ -14,17 +14,19 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.masking import where
 from ghpt.geometry.normal_equations import (
     LARGEST,
-    Views,
+    Row,
+    ViewComponents,
+    form_equations,
     local_cameras,
     minors,
-    products,
     solve_symmetric,
-    usable_views,
     valid_cameras,
+    valid_key_points,
+    view_components,
     view_equations,
-    views_of,
     weighted_sum,
 )
 from ghpt.geometry.state import State
@@ -32,14 +34,18 @@ from ghpt.geometry.state import State
 NO_DEPTH = 1e-9
 """A depth below this fraction of |t| is rounding: the rays met in the camera's own centre."""
 
+_ONE_CENTRE = 1e-12
+"""Centres closer than this fraction of the largest |t| are one centre."""
+
 _AT_ONCE = 2**15
 """Key points that are worked on at once: few enough to stay in a processor's cache."""
 
 
 @dataclass(frozen=True)
 class Triangulation:
-    """Points and what is known of them; every field is finite but ``cond``, which is inf for no
-    unique point.
+    """Points and what is known of them.
+
+    Every field is finite but ``cond``, which is inf for no unique point.
     """
 
     points: Float[Tensor, "*B J 3"]
@@ -66,212 +72,275 @@ class Triangulation:
         return self.status <= State.FILLED
 
     def with_rows(self, rows: Int[Tensor, " b"], part: Triangulation) -> Triangulation:
-        """This, with ``part`` in these rows of the first dimension."""
-        return Triangulation(
-            *(
-                getattr(self, f.name).index_copy(0, rows, getattr(part, f.name))
-                for f in fields(self)
-            )
-        )
+        """Return a copy with ``part`` in these rows of the first dimension."""
+        return _map_fields(lambda x, y: x.index_copy(0, rows, y), self, part)
+
+    def with_fallback(self, mask: Bool[Tensor, "*B J"], fallback: Triangulation) -> Triangulation:
+        """Return a copy with ``fallback`` where ``mask`` is False."""
+        return _map_fields(lambda x, y: where(mask, x, y), self, fallback)
+
+    def unflatten(self, shape: torch.Size) -> Triangulation:
+        """Return a copy whose first dimension has this shape."""
+        return _map_fields(lambda x: x.reshape(*shape, *x.shape[1:]), self)
+
+
+def _map_fields(function: Callable[..., Tensor], *results: Triangulation) -> Triangulation:
+    """Return the results with ``function`` applied to each of their fields."""
+    changed = {}
+    for field in fields(Triangulation):
+        values = [getattr(result, field.name) for result in results]
+        changed[field.name] = function(*values)
+    return Triangulation(**changed)
 
 
 def triangulate(
-    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"], weights: Float[Tensor, "*B V J"]
+    cameras: Cameras,
+    key_points: Float[Tensor, "*B V J 2"],
+    weights: Float[Tensor, "*B V J"],
 ) -> Triangulation:
-    """The points that minimise the sum over views of weight x (depth x pixel error)^2.
+    """Return the points that minimise the sum over views of weight x (depth x pixel error)^2.
 
     A view with weight 0 (or less) is not used, and whatever its numbers are they change nothing.
     Never raises on values; a joint's result depends on its own inputs only.
     """
     lead = weights.shape[:-2]
-    (views, joints) = weights.shape[-2:]
-    rig = flat_cameras(cameras, lead)
+    views, joints = weights.shape[-2:]
     frames = lead.numel()
+    rig = flat_cameras(cameras, lead)
     key_points = key_points.reshape(frames, views, joints, 2)
     weights = weights.reshape(frames, views, joints)
 
-    def part(rows: slice) -> tuple[Tensor, ...]:
+    def solve(rows: slice) -> Triangulation:
         weight = weights[rows].permute(1, 2, 0)
-        chosen = ~(weight <= 0)
-        system = System(
-            rig if len(rig.t) == 1 else rig.index(rows),
-            key_points[rows],
-            chosen & (weight < torch.inf),
-        )
-        weight = torch.where(system.used, weight.to(torch.float64), 0.0)
-        largest = weight.amax(dim=0) if len(weight) else weight.sum(0)
-        solution = system.solve(weight / torch.where(largest > 0, largest, 1.0))
-        return system.fields(*solution, system.used, (chosen & ~system.used).any(0))
+        return _solve_weighted(select_frames(rig, rows), key_points[rows], weight)
 
-    fields = in_parts(part, weights.shape)
-    return Triangulation(*(x.reshape(*lead, *x.shape[1:]) for x in fields))
+    return solve_in_parts(solve, weights.shape).unflatten(lead)
 
 
-def in_parts(function: Callable[[slice], tuple[Tensor, ...]], shape: torch.Size) -> list[Tensor]:
-    """What ``function`` gives for all frames of [B, V, J], a few frames at a time."""
+def _solve_weighted(
+    cameras: Cameras,
+    key_points: Float[Tensor, "B V J 2"],
+    weight: Float[Tensor, "V J B"],
+) -> Triangulation:
+    chosen = ~(weight <= 0)
+    system = System(cameras, key_points, chosen & (weight < torch.inf))
+    weight = torch.where(system.used, weight.double(), 0.0)
+    largest = weight.amax(dim=0) if len(weight) else weight.sum(0)
+    safe_largest = torch.where(largest > 0, largest, 1.0)
+    solution, cond = system.solve(weight / safe_largest)
+    rejected = (chosen & ~system.used).any(0)
+    return system.assess(solution, cond, system.used, rejected)
+
+
+def solve_in_parts(function: Callable[[slice], Triangulation], shape: torch.Size) -> Triangulation:
+    """Return what ``function`` gives for all frames of [B, V, J], a few frames at a time."""
     frames, views, joints = shape
     size = max(1, _AT_ONCE // max(views * joints, 1))
-    parts = [function(slice(start, start + size)) for start in range(0, max(frames, 1), size)]
-    return [torch.cat(field) if len(parts) > 1 else field[0] for field in zip(*parts, strict=True)]
+    parts = []
+    for start in range(0, max(frames, 1), size):
+        rows = slice(start, start + size)
+        parts.append(function(rows))
+    if len(parts) == 1:
+        return parts[0]
+    return _map_fields(lambda *x: torch.cat(x), *parts)
 
 
 def flat_cameras(cameras: Cameras, lead: torch.Size) -> Cameras:
-    """Cameras with the leading dimensions as one; of length 1 where all frames share one rig in
-    memory.
+    """Return cameras with the leading dimensions as one.
+
+    It has length 1 where all frames share one rig in memory.
     """
-    views = cameras.t.shape[-2]
-    fields = []
-    for x, inner in ((cameras.K, 2), (cameras.R, 2), (cameras.t, 1)):
-        fields.append(x.expand(*lead, views, *x.shape[-inner:]))
+    K = _expand(cameras.K, lead, 3)
+    R = _expand(cameras.R, lead, 3)
+    t = _expand(cameras.t, lead, 2)
     frames = lead.numel()
-    if frames > 1 and not any(any(x.stride()[: len(lead)]) for x in fields):
-        return Cameras(*(x[(0,) * len(lead)][None] for x in fields))
-    return Cameras(*(x.reshape(frames, *x.shape[len(lead) :]) for x in fields))
+    shared = not any(any(x.stride()[: len(lead)]) for x in (K, R, t))
+    if frames > 1 and shared:
+        first = (0,) * len(lead)
+        return Cameras(K[first][None], R[first][None], t[first][None])
+    K = K.reshape(frames, *K.shape[-3:])
+    R = R.reshape(frames, *R.shape[-3:])
+    t = t.reshape(frames, *t.shape[-2:])
+    return Cameras(K, R, t)
+
+
+def _expand(x: Tensor, lead: torch.Size, inner: int) -> Tensor:
+    """Return ``x`` expanded to the leading dimensions before its ``inner`` last ones."""
+    return x.expand(*lead, *x.shape[-inner:])
+
+
+def select_frames(rig: Cameras, rows: slice) -> Cameras:
+    """Return the cameras of these frames; the rig itself where all frames share it."""
+    return rig if len(rig.t) == 1 else rig.index(rows)
 
 
 class System:
     """The equations of a few frames, made once for any weights; arrays are [V, J, B]."""
 
     def __init__(
-        self, cameras: Cameras, key_points: Float[Tensor, "B V J 2"], given: Bool[Tensor, "V J B"]
+        self,
+        cameras: Cameras,
+        key_points: Float[Tensor, "B V J 2"],
+        valid: Bool[Tensor, "V J B"],
     ) -> None:
-        valid = valid_cameras(cameras)
-        self.local, self.origin = local_cameras(cameras, valid)
-        finite = (key_points.abs() <= LARGEST).permute(3, 1, 2, 0)
-        self.used = given & finite[0] & finite[1] & valid.mT[:, None]
-        self.views = views_of(self.local, key_points, self.used)
+        camera_valid = valid_cameras(cameras)
+        self.local, self.origin = local_cameras(cameras, camera_valid)
+        u_bounded, v_bounded = (key_points.abs() <= LARGEST).permute(3, 1, 2, 0)
+        self.used = valid & u_bounded & v_bounded & camera_valid.mT[:, None]
+        self.views = view_components(self.local, key_points, self.used)
         self.a, self.b = self.views.rows()
-        self.equations = products(self.a, self.b)
-        self.length = torch.linalg.vector_norm(
-            torch.where(valid[..., None], cameras.t.to(torch.float64), 0.0), dim=-1
-        )
+        self.equations = form_equations(self.a, self.b)
+        t = where(camera_valid, cameras.t.double(), 0.0)
+        self.length = torch.linalg.vector_norm(t, dim=-1)
 
     def solve(
         self, weight: Float[Tensor, "V J B"]
-    ) -> tuple[Sequence[Tensor], Float[Tensor, "J B"]]:
-        """The solution in the local world and tr(M) tr(M^-1); ``weight`` is 0 where not ``used``."""
-        sums = weighted_sum(self.equations, weight)
-        *solution, cond = solve_symmetric(tuple(sums))
+    ) -> tuple[Float[Tensor, "3 J B"], Float[Tensor, "J B"]]:
+        """Return the solution in the local world and tr(M) tr(M^-1).
+
+        ``weight`` is 0 where not ``used``.
+        """
+        sums = weighted_sum(self.equations, weight).unbind(0)
+        x, y, z, cond = solve_symmetric(sums)
         # once more from the residuals of the rows: the digits that squaring has cost
-        toward = weighted_sum(_toward(self.a, self.b, solution), weight)
-        step = solve_symmetric((*sums[:6], *toward))[:3]
-        return [x + d for x, d in zip(solution, step, strict=True)], cond
+        gradient = weighted_sum(_gradient(self.a, self.b, x, y, z), weight)
+        dx, dy, dz, _ = solve_symmetric((*sums[:6], *gradient))
+        return torch.stack((x + dx, y + dy, z + dz)), cond
 
     def square_residuals(
-        self, points: Float[Tensor, "3 *P J B"], square: Float[Tensor, "V J B"], view: int
-    ) -> Float[Tensor, "*P J B"]:
-        """Squared pixel errors of points (local world) in one view over ``square``; inf where that
-        is 0 and behind the camera.
-        """
-        x, y, z = points
-        over, down = (
-            torch.addcmul(r[0][view] * x, r[1][view], y).addcmul_(r[2][view], z)
-            for r in (self.a, self.b)
-        )
-        over = over.sub_(self.a[3][view])
-        down = down.sub_(self.b[3][view])
-        (rx, ry, rz) = self.views.axis
-        shift = self.views.shift[2]
-        depth = (
-            torch.addcmul(shift[view], rx[view], x)
-            .addcmul_(ry[view], y)
-            .addcmul_(rz[view], z)
-            .clamp_(min=0)
-        )
-        scale = depth.mul_(depth).mul_(square[view])
-        return (
-            over.mul_(over)
-            .addcmul_(down, down)
-            .div_(scale)
-            .nan_to_num_(nan=torch.inf, posinf=torch.inf)
-        )
-
-    def fields(
         self,
-        solution: Sequence[Tensor],
-        cond: Tensor,
+        points: Float[Tensor, "3 *P J B"],
+        square: Float[Tensor, "V J B"],
+        view: int,
+    ) -> Float[Tensor, "*P J B"]:
+        """Return squared pixel errors of points (local world) in one view over ``square``.
+
+        They are inf where that is 0 and behind the camera.
+        """
+        over = _residual(self.a, points, view)
+        down = _residual(self.b, points, view)
+        x, y, z = points
+        rx, ry, rz = self.views.axis
+        depth = torch.addcmul(self.views.shift[2][view], rx[view], x)
+        depth.addcmul_(ry[view], y).addcmul_(rz[view], z).clamp_(min=0)
+        scale = depth.mul_(depth).mul_(square[view])
+        error = over.mul_(over).addcmul_(down, down).div_(scale)
+        return error.nan_to_num_(nan=torch.inf, posinf=torch.inf)
+
+    def assess(
+        self,
+        solution: Float[Tensor, "3 J B"],
+        cond: Float[Tensor, "J B"],
         used: Bool[Tensor, "V J B"],
-        spoilt: Bool[Tensor, "J B"],
-    ) -> tuple[Tensor, ...]:
-        """The fields of Triangulation of a solution that is made of the ``used`` views."""
+        rejected: Bool[Tensor, "J B"],
+    ) -> Triangulation:
+        """Return the Triangulation of a solution that is made of the ``used`` views.
+
+        ``rejected``: the joints one of whose inputs is no number to triangulate from.
+        """
         count = used.sum(0)
         depth = self.views.depth(*solution)
-        distance = torch.where(used.any(1), self.length.mT, 0.0)[:, None]
-        parallel = torch.isinf(cond) | _one_centre(self.local, distance, used)
+        in_view = used.any(1)
+        distance = torch.where(in_view, self.length.mT, 0.0)[:, None]
         behind = (used & ~(depth > NO_DEPTH * distance)).any(0)
-        status = torch.full_like(count, int(State.OBSERVED), dtype=torch.int8)
-        for mask, reason in (
-            (behind, State.BEHIND),
-            (parallel, State.PARALLEL),
-            (count < 2, State.FEW_VIEWS),
-            (spoilt, State.BAD_INPUT),
-        ):
-            status = status.masked_fill(mask, int(reason))
+        parallel = torch.isinf(cond) | _share_centre(self.local, distance, used)
+        # the last of these that applies
+        status = torch.zeros_like(count, dtype=torch.int8)
+        status = status.masked_fill(behind, int(State.BEHIND))
+        status = status.masked_fill(parallel, int(State.PARALLEL))
+        status = status.masked_fill(count < 2, int(State.FEW_VIEWS))
+        status = status.masked_fill(rejected, int(State.BAD_INPUT))
         ok = status == State.OBSERVED
-        nearest = (
-            torch.where(used, depth, torch.inf).amin(0) if len(depth) else torch.zeros_like(cond)
-        )
-        nearest = torch.where(ok | (status == State.BEHIND), nearest, 0.0)
-        world = [torch.where(ok, x + o, 0.0) for x, o in zip(solution, self.origin.mT, strict=True)]
+        position = solution + self.origin.mT[:, None]
+        world = torch.where(ok, position, 0.0)
+        has_depth = ok | (status == State.BEHIND)
+        nearest = torch.where(has_depth, _smallest(depth, used), 0.0)
         angle = _ray_angle(self.local, self.views, used, count)
-        return (
-            torch.stack(world, -1).transpose(0, 1),
-            *(x.mT for x in (status, angle, nearest, cond)),
-        )
+        # the components of a point are neighbours in memory
+        points = torch.stack(world.unbind(0), dim=-1).transpose(0, 1)
+        return Triangulation(points, status.mT, angle.mT, nearest.mT, cond.mT)
 
 
-def _toward(
-    a: Sequence[Tensor], b: Sequence[Tensor], solution: Sequence[Tensor]
-) -> Float[Tensor, "V 3 J B"]:
-    """The right-hand sides of the views' equations for a step from ``solution``."""
-    over, down = (
-        r[3] - (r[0] * solution[0] + r[1] * solution[1] + r[2] * solution[2]) for r in (a, b)
-    )
-    return torch.stack([torch.addcmul(a[i] * over, b[i], down) for i in range(3)], dim=1)
+def _smallest(depth: Float[Tensor, "V J B"], used: Bool[Tensor, "V J B"]) -> Float[Tensor, "J B"]:
+    """Return the smallest depth over the used views; 0 where there are no views at all."""
+    if not len(depth):
+        return depth.sum(0)
+    return torch.where(used, depth, torch.inf).amin(0)
+
+
+def _residual(row: Row, points: Float[Tensor, "3 *P J B"], view: int) -> Float[Tensor, "*P J B"]:
+    """Return the residual of one view's row at points."""
+    x, y, z = points
+    kx, ky, kz, right = row
+    left = torch.addcmul(kx[view] * x, ky[view], y).addcmul_(kz[view], z)
+    return left.sub_(right[view])
+
+
+def _gradient(a: Row, b: Row, x: Tensor, y: Tensor, z: Tensor) -> Float[Tensor, "V 3 J B"]:
+    """Return the right-hand sides of the views' equations for a step from the point (x, y, z)."""
+    over = a[3] - (a[0] * x + a[1] * y + a[2] * z)
+    down = b[3] - (b[0] * x + b[1] * y + b[2] * z)
+    components = [torch.addcmul(a[i] * over, b[i], down) for i in range(3)]
+    return torch.stack(components, dim=1)
 
 
 def _ray_angle(
-    cameras: Cameras, views: Views, used: Bool[Tensor, "V J B"], count: Int[Tensor, "J B"]
+    cameras: Cameras,
+    views: ViewComponents,
+    used: Bool[Tensor, "V J B"],
+    count: Int[Tensor, "J B"],
 ) -> Float[Tensor, "J B"]:
-    """``Triangulation.angle``: the sum of |d_i x d_j|^2 over pairs is the sum of the principal
-    minors of the sum of d d^T (Cauchy-Binet).
+    """Return ``Triangulation.angle``.
+
+    The sum of |d_i x d_j|^2 over pairs is the sum of the principal minors of the sum of d d^T
+    (Cauchy-Binet).
     """
+    ray = _rays(cameras, views)
+    upper = [(0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)]
+    outer = torch.stack([ray[i] * ray[j] for i, j in upper], dim=1)
+    square_length = outer[:, 0] + outer[:, 3] + outer[:, 5]
+    summed = weighted_sum(outer, used / square_length)
+    areas = minors(summed.unbind(0))
+    total = areas[0] + areas[3] + areas[5]
+    pairs = (count * (count - 1) / 2).clamp(min=1)
+    return (total / pairs).clamp(0, 1).sqrt().asin()
+
+
+def _rays(cameras: Cameras, views: ViewComponents) -> list[Float[Tensor, "V J B"]]:
+    """Return the components of the key points' rays in the world, of no particular length."""
     (k, s), (n, m) = cameras.K.permute(2, 3, 1, 0)[:2, :2, :, None].contiguous()
     determinant = k * m - s * n
     determinant = torch.where(determinant == 0, 1.0, determinant)
     x = (m * views.u - s * views.v) / determinant
     y = (k * views.v - n * views.u) / determinant
     first, second, third = cameras.R.permute(2, 3, 1, 0)[..., None, :].contiguous()
-    ray = [
-        torch.addcmul(torch.addcmul(r, q, y), p, x)
-        for p, q, r in zip(first, second, third, strict=True)
-    ]
-    outer = torch.stack([ray[i] * ray[j] for i in range(3) for j in range(i, 3)], dim=1)
-    share = used / (outer[:, 0] + outer[:, 3] + outer[:, 5])
-    areas = minors(tuple(weighted_sum(outer, share)))
-    pairs = (count * (count - 1) / 2).clamp(min=1)
-    return ((areas[0] + areas[3] + areas[5]) / pairs).clamp(0, 1).sqrt().asin()
+    rays = []
+    for p, q, r in zip(first, second, third, strict=True):
+        component = torch.addcmul(r, q, y)
+        rays.append(torch.addcmul(component, p, x))
+    return rays
 
 
-def _one_centre(
+def _share_centre(
     cameras: Cameras, distance: Float[Tensor, "V 1 B"], used: Bool[Tensor, "V J B"]
 ) -> Bool[Tensor, "J B"]:
-    """Whether the used cameras have one and the same centre, within the rounding of their world's
-    distances.
+    """Return whether the used cameras have one and the same centre.
+
+    It is the same within the rounding of their world's distances.
     """
-    centre = cameras.centre.permute(2, 1, 0)
+    shared = torch.ones(used.shape[1:], dtype=torch.bool, device=used.device)
     if not len(used):
-        return torch.ones(used.shape[1:], dtype=torch.bool, device=used.device)
-    limit = 1e-12 * distance.amax(0)
-    if not (
-        centre[0].sort(0).values.diff(dim=0) <= limit
-    ).any():  # no two cameras can have: nothing to do
-        return torch.zeros(used.shape[1:], dtype=torch.bool, device=used.device)
-    one = torch.ones(used.shape[1:], dtype=torch.bool, device=used.device)
+        return shared
+    centre = cameras.centre.permute(2, 1, 0)
+    limit = _ONE_CENTRE * distance.amax(0)
+    gaps = centre[0].sort(0).values.diff(dim=0)
+    if not (gaps <= limit).any():  # no two cameras can have one: nothing to do
+        return torch.zeros_like(shared)
     for x in centre[..., None, :]:
-        spread = torch.where(used, x, -torch.inf).amax(0) - torch.where(used, x, torch.inf).amin(0)
-        one &= spread <= limit
-    return one
+        largest = torch.where(used, x, -torch.inf).amax(0)
+        smallest = torch.where(used, x, torch.inf).amin(0)
+        shared &= largest - smallest <= limit
+    return shared
 
 
 @torch.no_grad()
@@ -284,45 +353,62 @@ def triangulate_subsets(
     """Triangulate each joint of each hypothesis from its own subset of views (paper, section 3.1).
 
     Returns points (world, mm, float64; 0 where not ok) and whether they are ok: two views or more,
-    all of them seen and finite, rays that fix a point, in front of every camera of the subset. Few
+    all of them valid and finite, rays that fix a point, in front of every camera of the subset. Few
     views: each of the 2^V subsets is triangulated once and looked up; many views: the cost grows
     with V and never with 2^V.
     """
-    views = subsets.shape[-1]
-    hypotheses = subsets.shape[1]
-    usable = valid & usable_views(cameras, key_points)
+    _, hypotheses, _, views = subsets.shape
+    valid = valid & valid_key_points(cameras, key_points)
     local, origin = local_cameras(cameras)
-    equations = view_equations(local, key_points, usable).transpose(1, 2)
-    floor = NO_DEPTH * torch.linalg.vector_norm(cameras.t.to(torch.float64), dim=-1).nan_to_num(0.0)
-    depth_rows = torch.cat((local.R[..., 2, :], (local.t[..., 2] - floor)[..., None]), dim=-1)
-    usable = usable.transpose(1, 2)
+    equations = view_equations(local, key_points, valid).transpose(1, 2)
+    length = torch.linalg.vector_norm(cameras.t.double(), dim=-1)
+    floor = NO_DEPTH * length.nan_to_num(0.0)
+    shift = local.t[..., 2] - floor
+    depth_rows = torch.cat((local.R[..., 2, :], shift[..., None]), dim=-1)
+    solver = _SubsetSolver(equations, depth_rows, valid.transpose(1, 2))
     if 2**views > hypotheses:
-        points, ok = _solve_subsets(equations, depth_rows, usable, subsets.permute(0, 2, 1, 3))
-        points = points.permute(0, 3, 1, 2)
-        ok = ok.transpose(1, 2)
+        points, ok = solver.solve(subsets)
     else:
-        bit = 1 << torch.arange(views, device=subsets.device)
-        every = (torch.arange(2**views, device=subsets.device)[:, None] & bit) != 0
-        points, ok = _solve_subsets(
-            equations, depth_rows, usable, every.expand(*usable.shape[:2], -1, -1)
-        )
-        code = (subsets * bit).sum(-1)
-        ok = ok.transpose(1, 2).gather(1, code)
-        points = points.permute(0, 3, 1, 2).gather(1, code[..., None].expand(-1, -1, -1, 3))
-    return torch.where(ok[..., None], points + origin[:, None, None], 0.0), ok
+        points, ok = _look_up(solver, subsets)
+    world = points + origin[:, None, None]
+    return where(ok, world, 0.0), ok
 
 
-def _solve_subsets(
-    equations: Float[Tensor, "B J V 9"],
-    depth_rows: Float[Tensor, "B V 4"],
-    usable: Bool[Tensor, "B J V"],
-    subsets: Bool[Tensor, "B J H V"],
-) -> tuple[Float[Tensor, "B J 3 H"], Bool[Tensor, "B J H"]]:
-    chosen = subsets.mT.contiguous()
-    summed = equations.mT @ chosen.to(torch.float64)
-    *solution, cond = solve_symmetric(summed.unbind(-2))
-    points = torch.stack(solution, dim=-2)
-    depth = depth_rows[:, None, :, :3] @ points + depth_rows[:, None, :, 3:]
-    good = (depth > 0) & usable[..., None]
-    enough = chosen.sum(-2) >= 2
-    return points, enough & torch.isfinite(cond) & (good | ~chosen).all(-2)
+def _look_up(
+    solver: _SubsetSolver, subsets: Bool[Tensor, "B H J V"]
+) -> tuple[Float[Tensor, "B H J 3"], Bool[Tensor, "B H J"]]:
+    """Solve each of the 2^V subsets once and return the solutions of these."""
+    views = subsets.shape[-1]
+    bit = 1 << torch.arange(views, device=subsets.device)
+    codes = torch.arange(2**views, device=subsets.device)
+    all_subsets = (codes[:, None] & bit) != 0
+    frames, joints, _ = solver.valid.shape
+    points, ok = solver.solve(all_subsets[:, None].expand(frames, -1, joints, -1))
+    code = (subsets * bit).sum(-1)
+    point_index = code[..., None].expand(-1, -1, -1, 3)
+    return points.gather(1, point_index), ok.gather(1, code)
+
+
+@dataclass(frozen=True)
+class _SubsetSolver:
+    """The equations of all joints, to be summed over subsets of the views."""
+
+    equations: Float[Tensor, "B J V 9"]
+    depth_rows: Float[Tensor, "B V 4"]
+    """Depth in each view, less what is rounding, as a linear function of a point."""
+    valid: Bool[Tensor, "B J V"]
+
+    def solve(
+        self, subsets: Bool[Tensor, "B H J V"]
+    ) -> tuple[Float[Tensor, "B H J 3"], Bool[Tensor, "B H J"]]:
+        chosen = subsets.permute(0, 2, 3, 1).contiguous()
+        summed = self.equations.mT @ chosen.double()
+        x, y, z, cond = solve_symmetric(summed.unbind(-2))
+        points = torch.stack((x, y, z), dim=-2)
+        rows = self.depth_rows[:, None]
+        depth = rows[..., :3] @ points + rows[..., 3:]
+        in_front = (depth > 0) & self.valid[..., None]
+        all_in_front = (in_front | ~chosen).all(-2)
+        enough = chosen.sum(-2) >= 2
+        ok = enough & torch.isfinite(cond) & all_in_front
+        return points.permute(0, 3, 1, 2), ok.transpose(1, 2)

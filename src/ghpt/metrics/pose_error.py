@@ -8,7 +8,7 @@ from torch import Tensor
 from torchmetrics import Metric
 
 from ghpt.geometry.rotations import procrustes
-from ghpt.recording import PoseEstimate
+from ghpt.observations import PoseEstimate, Truth
 from ghpt.skeleton import PELVIS, SIX_JOINTS
 
 Kind = Literal["absolute", "relative", "aligned"]
@@ -16,10 +16,7 @@ Kind = Literal["absolute", "relative", "aligned"]
 
 
 def joint_errors(
-    estimate: PoseEstimate,
-    truth: Float[Tensor, "*B J 3"],
-    truth_valid: Bool[Tensor, "*B J"],
-    kind: Kind,
+    estimate: PoseEstimate, truth: Truth, kind: Kind
 ) -> tuple[Float[Tensor, "*B J"], Bool[Tensor, "*B J"]]:
     """Distance of each estimated joint to its true place, mm, float64, and which of them count.
 
@@ -29,16 +26,17 @@ def joint_errors(
     count is 0.
     """
     points = estimate.points.double()
-    truth = truth.double()
-    counted = estimate.estimated & truth_valid
+    true_points = truth.points.double()
+    counted = estimate.estimated & truth.valid
     if kind == "relative":
         points = points - points[..., PELVIS, None, :]
-        truth = truth - truth[..., PELVIS, None, :]
+        true_points = true_points - true_points[..., PELVIS, None, :]
         counted = counted & counted[..., PELVIS, None]
     elif kind == "aligned":
         counted = counted & (counted.sum(-1, keepdim=True) >= 3)
-        points = procrustes(points, truth, counted)
-    return torch.where(counted, torch.linalg.vector_norm(points - truth, dim=-1), 0.0), counted
+        points = procrustes(points, true_points, counted)
+    errors = torch.linalg.vector_norm(points - true_points, dim=-1)
+    return torch.where(counted, errors, 0.0), counted
 
 
 class PoseErrors(NamedTuple):
@@ -86,17 +84,16 @@ class MPJPE(Metric):
     def update(
         self,
         estimate: PoseEstimate,
-        truth: Float[Tensor, "B J 3"],
-        truth_valid: Bool[Tensor, "B J"],
+        truth: Truth,
         group: Int[Tensor, " B"],
     ) -> None:
         """Add B frames; ``group`` is each frame's group (its action, say), 0 ... groups-1."""
-        errors, counted = joint_errors(estimate, truth, truth_valid, self.kind)
+        errors, counted = joint_errors(estimate, truth, self.kind)
         # A product, not index_add_, whose order of summation varies on a GPU.
         member = torch.nn.functional.one_hot(group.long(), self.groups).double().mT
         self.error_sum += member @ errors
         self.counted += member @ counted.double()
-        self.with_truth += member @ truth_valid.double()
+        self.with_truth += member @ truth.valid.double()
 
     def compute(self) -> PoseErrors:
         six = list(SIX_JOINTS)

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torchmetrics import Metric
 
-from ghpt.recording import PoseEstimate
+from ghpt.observations import PoseEstimate
 from ghpt.skeleton import SYMMETRIC_PARTS
 
 PARTS = tuple(SYMMETRIC_PARTS)

@@ -45,14 +45,14 @@ def softmax_weights(
 def aggregation_weights(
     name: str,
     logits: Float[Tensor, "B H"],
-    errors: Float[Tensor, "B H"],
+    errors: Float[Tensor, "B H"] | None,
     temperature: float,
     keys: Int[Tensor, " B"],
 ) -> Float[Tensor, "B H"]:
-    """Weights that sum to 1 over the pool and, given to ``Problem.aggregate``, make the named
-    selection.
+    """Return weights that sum to 1 over the pool: the named aggregation is the estimate under them.
 
-    ``errors`` is used by best and worst alone, ``keys`` by stochastic and random.
+    ``errors`` are needed by best and worst alone, ``keys`` by stochastic and random. Raises
+    GhptConfigError for a name that does not exist.
     """
     count = logits.shape[-1]
     if name == "weight":
@@ -64,9 +64,14 @@ def aggregation_weights(
         index = (logits / temperature + noise).argmax(dim=-1)
     elif name == "random":
         index = (randomness.uniform(randomness.key(0, "random", keys), (1,)) * count).long()[:, 0]
-    elif name in ("most", "least", "best", "worst"):
-        scores = logits if name in ("most", "least") else -errors
-        index = scores.argmax(dim=-1) if name in ("most", "best") else scores.argmin(dim=-1)
+    elif name == "most":
+        index = logits.argmax(dim=-1)
+    elif name == "least":
+        index = logits.argmin(dim=-1)
+    elif name in ("best", "worst"):
+        if errors is None:
+            raise ValueError(f"{name} needs the errors")
+        index = (-errors).argmax(dim=-1) if name == "best" else (-errors).argmin(dim=-1)
     else:
         raise GhptConfigError(
             "selection", f"{name!r} is unknown", f"Existing: {', '.join(AGGREGATIONS)}."

@@ -13,11 +13,17 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from ghpt.geometry.cameras import relative_pose
 from ghpt.models.aggregation import AGGREGATIONS
+from ghpt.models.pool import Pool
 from ghpt.models.pose.predictions import PredictionWriter
 from ghpt.models.relative_pose.predictions import PairWriter
-from ghpt.recording import Observations, PairBatch, PoseEstimate, RelativePoseEstimate
+from ghpt.observations import (
+    Labelled,
+    Observations,
+    PairObservations,
+    PairTruth,
+    Truth,
+)
 
 
 class Collect(Callback):
@@ -40,10 +46,8 @@ class Collect(Callback):
         """Make the writer, of ``self.data``."""
 
     @abstractmethod
-    def write(
-        self, module: Any, batch: Any, estimates: dict[str, Any], weights: dict[str, torch.Tensor]
-    ) -> None:
-        """Write a batch with the selections' estimates."""
+    def write(self, module: Any, batch: Any, pool: Pool) -> None:
+        """Write a batch with the aggregations' estimates."""
 
     @abstractmethod
     def finish(self) -> None:
@@ -57,7 +61,7 @@ class Collect(Callback):
     def on_test_batch_end(
         self, trainer: L.Trainer, module: L.LightningModule, outputs: Any, batch: Any, *_: Any
     ) -> None:
-        self.write(module, batch, *outputs)
+        self.write(module, batch, outputs)
 
     def on_exception(
         self, trainer: L.Trainer, module: L.LightningModule, exception: BaseException
@@ -81,16 +85,16 @@ class CollectPoses(Collect):
     def write(
         self,
         module: Any,
-        batch: Observations,
-        estimates: dict[str, PoseEstimate],
-        weights: dict[str, torch.Tensor],
+        batch: Labelled[Observations, Truth],
+        pool: Pool,
     ) -> None:
-        estimates = estimates | {
-            name: estimator(batch) for name, estimator in self.estimators.items()
-        }
-        frame = torch.from_numpy(self.data.frame_numbers(batch.sample.tolist()))
+        observations = batch.observations
+        estimates = {name: pool.estimate(name) for name in AGGREGATIONS}
+        estimates |= {name: estimator(observations) for name, estimator in self.estimators.items()}
+        index = observations.index
+        frame = torch.from_numpy(self.data.frame_numbers(index.tolist()))
         self.writer.write(
-            batch.sample, estimates, batch.truth, batch.truth_valid, batch.recording, frame, weights
+            index, estimates, batch.truth, observations.recording, frame, pool.weight_summary()
         )
 
     def finish(self) -> None:
@@ -108,18 +112,18 @@ class CollectPairs(Collect):
     def write(
         self,
         module: Any,
-        batch: PairBatch,
-        estimates: dict[str, RelativePoseEstimate],
-        weights: dict[str, torch.Tensor],
+        batch: Labelled[PairObservations, PairTruth],
+        pool: Pool,
     ) -> None:
+        estimates = {name: pool.estimate(name) for name in AGGREGATIONS}
         for name, estimator in self.estimators.items():
-            estimate = estimator(batch)
-            length = module.problem.scale(estimate, batch)
+            estimate = estimator(batch.observations)
+            length = module.problem.scale(estimate, batch.observations)
             estimates[name] = replace(estimate, t=estimate.t * length[..., None])
-        a, b = (batch.pair_cameras().index((slice(None), view)) for view in (0, 1))
-        truth = relative_pose(a.R, a.t, b.R, b.t)
+        of = batch.observations
+        truth = batch.truth.relative_pose()
         self.writer.write(
-            batch.sample, estimates, truth, batch.rig, batch.draw, batch.pair, weights
+            of.index, estimates, truth, of.rig, of.draw, of.pair, pool.weight_summary()
         )
 
     def finish(self) -> None:

@@ -1,28 +1,22 @@
-"""The loop of the framework as a LightningModule: generate, describe, score, weigh, combine,
-compare.
-"""
+"""The loop of the framework as a LightningModule: generate, featurize, score, aggregate, compare."""
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import lightning as L
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Int
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
 from ghpt import randomness
 from ghpt.errors import GhptError, check
-from ghpt.models.aggregation import (
-    AGGREGATIONS,
-    aggregation_weights,
-    cap_logit_std,
-    softmax_weights,
-)
+from ghpt.models.aggregation import aggregation_weights, softmax_weights
 from ghpt.models.loss import LossTerms, mean_over_all
+from ghpt.models.pool import Pool
 from ghpt.models.problem import Problem
 from ghpt.models.scorer import Scorer
+from ghpt.observations import Batch, Labelled, Samples
 
 STATISTICS_HYPOTHESES = 16
 """Hypotheses of each training sample that the feature statistics are taken from: enough for a mean
@@ -31,17 +25,6 @@ and deviation.
 
 MOST_HYPOTHESES = 100_000
 """In a pool: of more, the poses of one batch alone are gigabytes."""
-
-
-@dataclass(frozen=True)
-class Pool:
-    """A batch's hypotheses with their logits and errors."""
-
-    hypotheses: Any
-    logits: Float[Tensor, "B H"]
-    errors: Float[Tensor, "B H"]
-    counted: Tensor
-    """Which items have a truth to compare with, Bool [B]."""
 
 
 class StochasticEstimator(L.LightningModule):
@@ -110,80 +93,89 @@ class StochasticEstimator(L.LightningModule):
             {name: _mean() for name in ("weight", "average", "random")}
         )
 
-    def pool(self, batch: Any, keys: Int[Tensor, " B"]) -> Pool:
-        """Draw, score and measure the hypotheses of a batch."""
-        hypotheses = self.problem.generate(batch, self.hypotheses, keys)
-        logits = cap_logit_std(self.scorer(self.problem.featurize(hypotheses)), self.logit_std_cap)
-        with torch.no_grad():
-            errors, counted = self.problem.error(self.problem.as_estimates(hypotheses), batch)
-        return Pool(hypotheses, logits, errors.to(logits.dtype), counted)
+    def sample(
+        self,
+        observations: Samples,
+        purpose: str,
+        truth: Batch | None = None,
+        step: int | None = None,
+    ) -> Pool:
+        """Draw and score the hypotheses of a batch.
 
-    def keys(self, purpose: str, batch: Any, *indices: int) -> Int[Tensor, " B"]:
-        return randomness.key(
-            self.seed, purpose, *indices, batch.sample, device=batch.sample.device
+        ``purpose`` (and ``step``, in training) name the random draws: the same names give the same
+        hypotheses of a sample in any batch. ``truth`` is needed for the pool's errors alone.
+        """
+        keys = self.keys(purpose, observations, step)
+        hypotheses = self.problem.generate(observations, self.hypotheses, keys)
+        logits = self.scorer(self.problem.featurize(hypotheses))
+        return Pool(
+            self.problem, hypotheses, logits, self.temperature, self.logit_std_cap, keys, truth
         )
 
+    def keys(
+        self, purpose: str, observations: Samples, step: int | None = None
+    ) -> Int[Tensor, " B"]:
+        """Return the key of each sample's random draws."""
+        index = observations.index
+        steps = () if step is None else (step,)
+        return randomness.key(self.seed, purpose, *steps, index, device=index.device)
+
     @torch.no_grad()
-    def fit_statistics(self, batches: Iterator[Any]) -> None:
+    def fit_statistics(self, batches: Iterable[Samples]) -> None:
         """Take the scorer's feature statistics from hypotheses of the training samples."""
-        features = [
-            self.problem.featurize(
-                self.problem.generate(batch, STATISTICS_HYPOTHESES, self.keys("statistics", batch))
-            ).flatten(0, 1)
-            for batch in batches
-        ]
+        features = []
+        for observations in batches:
+            keys = self.keys("statistics", observations)
+            hypotheses = self.problem.generate(observations, STATISTICS_HYPOTHESES, keys)
+            features.append(self.problem.featurize(hypotheses).flatten(0, 1))
         self.scorer.standardise.fit(torch.cat(features))
 
     def on_fit_start(self) -> None:
         if not self.scorer.standardise.fitted:
-            self.fit_statistics(
-                batch.to(self.device) for batch in self.trainer.datamodule.all_training_batches()
-            )
+            batches = self.trainer.datamodule.all_training_batches()
+            self.fit_statistics(batch.observations.to(self.device) for batch in batches)
 
-    def terms(self, pool: Pool, batch: Any, keys: Int[Tensor, " B"]) -> LossTerms:
-        """The loss of each item."""
-        noise = (
-            randomness.gumbel(keys, (pool.logits.shape[-1],)).to(pool.logits.dtype)
-            if self.gumbel
-            else None
-        )
-        weights = softmax_weights(pool.logits, self.temperature, noise)
+    def terms(self, pool: Pool, keys: Int[Tensor, " B"]) -> LossTerms:
+        """Return the loss of each item; ``keys`` are those of the Gumbel noise."""
+        logits = pool.capped_logits
+        noise = None
+        if self.gumbel:
+            noise = randomness.gumbel(keys, (logits.shape[-1],)).to(logits.dtype)
+        weights = softmax_weights(logits, self.temperature, noise)
         chosen = weights
         if self.selection == "stochastic":
             drawn = aggregation_weights(
-                "stochastic", pool.logits.detach(), pool.errors, self.temperature, keys
+                "stochastic", logits.detach(), pool.errors, self.temperature, keys
             )
             chosen = drawn + weights - weights.detach()
-        estimate_error, _ = self.problem.error(
-            self.problem.aggregate(pool.hypotheses, chosen), batch
-        )
+        estimate = self.problem.aggregate(pool.hypotheses, chosen)
+        estimate_error, _ = self.problem.error(estimate, pool.known_truth)
         return self.loss(weights, pool.errors, estimate_error.to(weights.dtype))
 
-    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
+    def training_step(self, batch: Labelled[Any, Any], batch_idx: int) -> Tensor:
         step = self.global_step
-        pool = self.pool(batch, self.keys("hypotheses", batch, step))
-        terms = self.terms(pool, batch, self.keys("gumbel", batch, step))
-        total = pool.counted.sum()
-        if self.trainer.world_size > 1:
-            total = self.all_gather(total).sum()
+        observations = batch.observations
+        pool = self.sample(observations, "hypotheses", batch.truth, step)
+        terms = self.terms(pool, self.keys("gumbel", observations, step))
+        total = pool.has_truth.sum()
         world = self.trainer.world_size
-        means = LossTerms(*(mean_over_all(term, pool.counted, total, world) for term in terms))
+        if world > 1:
+            total = self.all_gather(total).sum()
+        means = LossTerms(*(mean_over_all(term, pool.has_truth, total, world) for term in terms))
         if not torch.isfinite(means.total):
             raise GhptError(
-                f"training step {step}: the loss is {means.total.item()}. The samples of the batch are"
-                f" {batch.sample.tolist()}. Lower optimizer.lr, or look at these frames."
+                f"training step {step}: the loss is {means.total.item()}. The samples of the batch "
+                f"are {observations.index.tolist()}. Lower optimizer.lr, or look at these frames."
             )
         for name, value in means._asdict().items():
             self.log(f"train/{name}", value.detach(), batch_size=len(batch), sync_dist=world > 1)
         return means.total
 
-    def validation_step(self, batch: Any, batch_idx: int) -> None:
-        keys = self.keys("validation", batch)
-        pool = self.pool(batch, keys)
+    def validation_step(self, batch: Labelled[Any, Any], batch_idx: int) -> None:
+        pool = self.sample(batch.observations, "validation", batch.truth)
         for name, metric in self.validation.items():
-            weights = aggregation_weights(name, pool.logits, pool.errors, self.temperature, keys)
-            error, _ = self.problem.error(self.problem.aggregate(pool.hypotheses, weights), batch)
-            metric.update(error.double(), pool.counted.double())
+            error, _ = self.problem.error(pool.estimate(name), batch.truth)
+            metric.update(error.double(), pool.has_truth.double())
 
     def on_validation_epoch_end(self) -> None:
         for name, metric in self.validation.items():
@@ -195,24 +187,8 @@ class StochasticEstimator(L.LightningModule):
             )
             metric.reset()
 
-    def test_step(self, batch: Any, batch_idx: int) -> tuple[dict[str, Any], dict[str, Tensor]]:
-        """Every selection's estimate, and a summary of the weights: what the report is made of."""
-        keys = self.keys("test", batch)
-        pool = self.pool(batch, keys)
-        weights = {
-            name: aggregation_weights(name, pool.logits, pool.errors, self.temperature, keys)
-            for name in AGGREGATIONS
-        }
-        estimates = {
-            name: self.problem.aggregate(pool.hypotheses, w) for name, w in weights.items()
-        }
-        w = weights["weight"]
-        summary = {
-            "entropy": torch.special.entr(w).sum(dim=-1),
-            "max": w.amax(dim=-1),
-            "effective": 1 / w.square().sum(dim=-1),
-        }
-        return estimates, summary
+    def test_step(self, batch: Labelled[Any, Any], batch_idx: int) -> Pool:
+        return self.sample(batch.observations, "test", batch.truth)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
         return self.optimizer(self.scorer.parameters())

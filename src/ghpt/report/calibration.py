@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,7 @@ from torch import Tensor
 
 from ghpt.models.estimators.classical import Baseline
 from ghpt.models.relative_pose.scale import SEGMENTS
-from ghpt.recording import Recording
+from ghpt.observations import Recording
 from ghpt.report.escape import escaped, plain
 from ghpt.report.rig_comparison import (
     held_out_errors,
@@ -189,8 +188,7 @@ def _segment_rows(explained: Numbers) -> list[list[str]]:
 def spread(recording: Recording, frames: int) -> Recording:
     """At most so many of its frames, evenly spread."""
     rows = np.unique(np.linspace(0, len(recording) - 1, min(frames, len(recording))).astype(int))
-    arrays = ("key_points", "confidence", "valid", "truth", "truth_valid", "frame")
-    return replace(recording, **{name: getattr(recording, name)[rows] for name in arrays})
+    return recording.frames(rows)
 
 
 def _caption(numbers: Numbers) -> str:

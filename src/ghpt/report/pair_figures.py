@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.evaluation import camera_after
-from ghpt.recording import RelativePoseEstimate
+from ghpt.observations import RelativePoseEstimate
 from ghpt.report.figures import TRUTH, wrapped
 from ghpt.report.pair_tables import NAMES
 

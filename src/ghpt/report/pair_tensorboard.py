@@ -11,7 +11,7 @@ from torch.utils.tensorboard import SummaryWriter
 from ghpt.models.relative_pose.evaluation import ERRORS, pair_errors
 from ghpt.models.relative_pose.predictions import PairPredictions
 from ghpt.models.rows import WEIGHTS
-from ghpt.recording import RelativePoseEstimate
+from ghpt.observations import RelativePoseEstimate
 from ghpt.report.figures import image
 from ghpt.report.pair_figures import rig_figure
 from ghpt.report.pair_tables import MANY

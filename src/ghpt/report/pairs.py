@@ -8,7 +8,7 @@ from ghpt.models.collect import CollectPairs
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.relative_pose.evaluation import evaluate_pairs
 from ghpt.models.relative_pose.predictions import open_pairs
-from ghpt.recording import PairBatch, RelativePoseEstimate
+from ghpt.observations import PairObservations, RelativePoseEstimate
 from ghpt.report.pair_tables import print_pair_tables, write_pair_report
 from ghpt.report.pair_tensorboard import write_pair_events
 from ghpt.report.report import Report
@@ -22,7 +22,7 @@ class Settings(TypedDict):
 
 def estimators(
     config: Mapping[str, Any], model: StochasticEstimator
-) -> dict[str, Callable[[PairBatch], RelativePoseEstimate]]:
+) -> dict[str, Callable[[PairObservations], RelativePoseEstimate]]:
     """The classical estimators."""
     return build(config["camera_baselines"], "camera_baselines")
 

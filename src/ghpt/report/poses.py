@@ -8,7 +8,7 @@ from ghpt.models.collect import CollectPoses
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.evaluation import evaluate
 from ghpt.models.pose.predictions import open_predictions
-from ghpt.recording import Observations, PoseEstimate
+from ghpt.observations import Observations, PoseEstimate
 from ghpt.report.report import Report
 from ghpt.report.tables import print_table, write_report
 from ghpt.report.tensorboard import write_events

@@ -12,7 +12,7 @@ from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.rotations import nearest_rotation
 from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.estimators.classical import Baseline
-from ghpt.recording import Observations, Recording
+from ghpt.observations import Observations, Recording
 from ghpt.skeleton import BONES, JOINT, PELVIS, THORAX
 
 _FRAMES = 256
@@ -94,14 +94,12 @@ def triangulate_recording(
         count = len(valid)
         rig = recording.cameras
         batch = Observations(
-            sample=torch.arange(first, first + count),
+            index=torch.arange(first, first + count),
             recording=torch.zeros(count, dtype=torch.int64),
             cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
             key_points=torch.from_numpy(recording.key_points[rows]).double(),
             confidence=torch.from_numpy(recording.confidence[rows]).double(),
             valid=valid,
-            truth=torch.zeros(count, valid.shape[-1], 3),
-            truth_valid=torch.zeros(count, valid.shape[-1], dtype=torch.bool),
         )
         result = estimator(batch)
         points.append(result.points)

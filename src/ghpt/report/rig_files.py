@@ -18,7 +18,7 @@ from ghpt.calibration.rig import RigEstimate
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.files import atomic_write, finite, remove, write_json
 from ghpt.geometry.cameras import Cameras, CameraSet
-from ghpt.recording import Recording
+from ghpt.observations import Recording
 from ghpt.report.calibration import calibration_report
 from ghpt.report.rig_comparison import Similarity, align, upright
 from ghpt.report.rig_figure import rig_figure

@@ -17,7 +17,7 @@ from torch.utils.tensorboard.summary import hparams
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.models.pose.predictions import PredictionChunk, Predictions
 from ghpt.models.rows import WEIGHTS
-from ghpt.recording import PoseEstimate
+from ghpt.observations import PoseEstimate
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
 from ghpt.report.tables import title, trained_on
 
@@ -107,7 +107,7 @@ def _skeletons(writer: SummaryWriter, predictions: Predictions, metrics: Mapping
         error, whole = _relative_error(chunk)
         rows.append(start + whole.nonzero()[:, 0])
         errors.append(error[whole])
-        truth.append(chunk.truth[whole][::10])
+        truth.append(chunk.truth.points[whole][::10])
     if not len(torch.cat(rows)):
         return
     row = int(torch.cat(rows)[torch.cat(errors).median(dim=0).indices])
@@ -116,7 +116,7 @@ def _skeletons(writer: SummaryWriter, predictions: Predictions, metrics: Mapping
     take = predictions.recording_name[int(chunk.recording)]
     heading = f"{title(metrics)}\n{take}, frame {int(chunk.frame)}: the median of the errors under {SHOWN[0]}"
     up = up_axis(torch.cat(truth).double().numpy())
-    figure = skeletons(chunk.truth[0].double().numpy(), poses, up, heading)
+    figure = skeletons(chunk.truth.points[0].double().numpy(), poses, up, heading)
     writer.add_image("skeletons", image(figure), 0, dataformats="HWC")
 
 
@@ -164,9 +164,7 @@ def _sample(predictions: Predictions) -> Iterator[tuple[int, PredictionChunk]]:
 
 def _relative_error(chunk: PredictionChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
     """Each frame's error under the first shown selection, mm, and which frames are whole."""
-    errors, counted = joint_errors(
-        chunk.estimates[SHOWN[0]], chunk.truth, chunk.truth_valid, "relative"
-    )
+    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], chunk.truth, "relative")
     return errors.mean(-1), counted.all(-1)
 
 

@@ -12,7 +12,7 @@ from ghpt.calibration.check.setup import Look, Rays, Setup
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.triangulation import triangulate_subsets
 from ghpt.models.estimators.classical import Baseline, MEstimator
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 LARGEST = 0.1
 """Shares of the person's size. Beyond, an error says only that nothing agrees."""
@@ -136,11 +136,11 @@ def triangulated(
 ) -> tuple[Float[Tensor, "G F J 3"], Bool[Tensor, "G F J"]]:
     """Points from G choices of views by an estimator, in normalised image coordinates."""
     groups = len(used)
-    (frames, joints) = rays.valid.shape[1:]
+    frames = rays.valid.shape[1]
     valid = (rays.valid.transpose(0, 1) & used[:, None, :, None]).flatten(0, 1)
     count = groups * frames
     batch = Observations(
-        sample=torch.arange(count),
+        index=torch.arange(count),
         recording=torch.zeros(count, dtype=torch.int64),
         cameras=Cameras(
             *(
@@ -151,8 +151,6 @@ def triangulated(
         key_points=rays.xy.transpose(0, 1).repeat(groups, 1, 1, 1),
         confidence=valid.double(),
         valid=valid,
-        truth=torch.zeros(count, joints, 3),
-        truth_valid=torch.zeros(count, joints, dtype=torch.bool),
     )
     found = estimator(batch)
     return found.points.unflatten(0, (groups, frames)), found.estimated.unflatten(

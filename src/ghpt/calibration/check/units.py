@@ -10,7 +10,7 @@ from ghpt.geometry.cameras import CameraSet
 from ghpt.models.estimators.classical import Baseline
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.relative_pose.scale import HUMAN, STATURES, stature
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 UNITS_MM = {1.0: "millimetres", 10.0: "centimetres", 1000.0: "metres"}
 _ADULT = 1730.0

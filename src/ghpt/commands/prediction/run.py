@@ -20,8 +20,8 @@ from ghpt.commands.lost import told
 from ghpt.commands.prediction.frames import Frames
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.train import display_path, make_trainer
+from ghpt.observations import Observations
 from ghpt.reconstruction import Reconstruction
-from ghpt.recording import Observations
 
 Predictor = Callable[[Observations], Reconstruction]
 _log = logging.getLogger(__name__)

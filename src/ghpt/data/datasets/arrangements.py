@@ -13,7 +13,7 @@ from ghpt.data.datasets.store import file_stamps
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import synthetic_recordings
 from ghpt.errors import GhptDataError, check
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 
 
 class Synthetic(TypedDict):
@@ -38,7 +38,7 @@ class _Arrangement(KeyPointDataModule):
         self.cameras = list(cameras)
         self.synthetic = synthetic
 
-    def _synthetic(self, split: str) -> Iterable[Recording]:
+    def _synthetic(self, split: str) -> Iterable[LabelledRecording]:
         detector = Detector(**self.synthetic["detector"])
         return synthetic_recordings(
             self.name, split, self.synthetic["seed"], detector, self.cameras
@@ -85,7 +85,7 @@ class Human36M(_Arrangement):
         super().__init__(**settings)
         self.damaged = damaged
 
-    def generate(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[LabelledRecording]:
         if self.root is not None:
             return human36m_recordings(self._root(), split, self.cameras, self.damaged)
         return (r for r in self._synthetic(split) if self.damaged or r.name not in DAMAGED)
@@ -99,7 +99,7 @@ class Human36M(_Arrangement):
 class Panoptic(_Arrangement):
     """CMU Panoptic Studio's HD cameras by number; each sequence 60/20/20 % in time."""
 
-    def generate(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[LabelledRecording]:
         return (
             panoptic_recordings(self._root(), self.cameras, split)
             if self.root

@@ -14,7 +14,7 @@ from ghpt.data.datasets.frames import BatchOrder, FrameLoader, Frames, trainable
 from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.data.datasets.store import prepared
 from ghpt.errors import GhptDataError, check
-from ghpt.recording import Observations, PairBatch, Recording
+from ghpt.observations import Labelled, LabelledRecording
 
 SPLITS = ("train", "validation", "test")
 
@@ -85,7 +85,7 @@ class KeyPointDataModule(L.LightningDataModule):
         return "synthetic" if self.root is None else str(Path(self.root).resolve())
 
     @abstractmethod
-    def generate(self, split: str) -> Iterable[Recording]:
+    def generate(self, split: str) -> Iterable[LabelledRecording]:
         """The split's recordings from their source, slowly."""
 
     @abstractmethod
@@ -111,7 +111,7 @@ class KeyPointDataModule(L.LightningDataModule):
             else {"train": "train", "validation": "validation"}
         )
 
-    def recordings(self, split: str) -> list[Recording]:
+    def recordings(self, split: str) -> list[LabelledRecording]:
         """The split's recordings, prepared first where they are not in the cache. Raises
         GhptDataError.
         """
@@ -128,19 +128,19 @@ class KeyPointDataModule(L.LightningDataModule):
             )
         return recordings
 
-    def _choose(self, recordings: Sequence[Recording], training: bool) -> Frames | Pairs:
+    def _choose(self, recordings: Sequence[LabelledRecording], training: bool) -> Frames | Pairs:
         if self.pairs is not None:
             return Pairs(
                 recordings, self.pairs, self.seed, self.train_samples if training else None
             )
         return Frames(recordings, self._random(recordings) if training else self._every(recordings))
 
-    def _every(self, recordings: Sequence[Recording]) -> np.ndarray:
+    def _every(self, recordings: Sequence[LabelledRecording]) -> np.ndarray:
         """Every ``stride``-th frame of each recording."""
         starts = np.cumsum([0] + [len(r) for r in recordings])
         return np.concatenate([np.arange(a, b, self.stride) for a, b in pairwise(starts)])
 
-    def _random(self, recordings: Sequence[Recording]) -> np.ndarray:
+    def _random(self, recordings: Sequence[LabelledRecording]) -> np.ndarray:
         """``train_samples`` random frames that can teach."""
         order = randomness.permutation(
             self.seed, "training samples", 0, sum(map(len, recordings))
@@ -176,7 +176,7 @@ class KeyPointDataModule(L.LightningDataModule):
         order = BatchOrder(len(self.frames[role]), self.batch_size, rank, world, seed, done)
         return FrameLoader(self.frames[role], order, self.workers)
 
-    def all_training_batches(self) -> Iterator[Observations | PairBatch]:
+    def all_training_batches(self) -> Iterator[Labelled[Any, Any]]:
         """Every training sample once, in order, the same on every process: for the feature
         statistics.
         """

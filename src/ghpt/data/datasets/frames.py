@@ -10,18 +10,24 @@ from torch.utils.data import DataLoader, Dataset, Sampler
 
 from ghpt import randomness
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import Observations, Recording, joints_with_enough_views
+from ghpt.observations import (
+    Labelled,
+    LabelledRecording,
+    Observations,
+    Truth,
+    joints_with_enough_views,
+)
 from ghpt.skeleton import PELVIS
 
 
-class Frames(Dataset[Observations]):
+class Frames(Dataset[Labelled[Observations, Truth]]):
     """Chosen frames of recordings that share a number of views; one item is a whole batch.
 
     ``frames`` are positions in the recordings laid end to end, in any order; sample i is
     ``frames[i]``.
     """
 
-    def __init__(self, recordings: Sequence[Recording], frames: np.ndarray) -> None:
+    def __init__(self, recordings: Sequence[LabelledRecording], frames: np.ndarray) -> None:
         self.recordings = recordings
         self.frames = np.asarray(frames, dtype=np.int64)
         self.start = np.concatenate([[0], np.cumsum([len(r) for r in recordings])])
@@ -40,7 +46,7 @@ class Frames(Dataset[Observations]):
         recording = bisect_right(self.start, self.frames[sample]) - 1
         return recording, int(self.frames[sample] - self.start[recording])
 
-    def __getitem__(self, samples: Sequence[int]) -> Observations:
+    def __getitem__(self, samples: Sequence[int]) -> Labelled[Observations, Truth]:
         places = [self.locate(sample) for sample in samples]
         recording = torch.tensor([r for r, _ in places], dtype=torch.int64)
 
@@ -51,16 +57,15 @@ class Frames(Dataset[Observations]):
                 rows[row] = getattr(self.recordings[r], field)[t]
             return torch.from_numpy(rows)
 
-        return Observations(
-            sample=torch.tensor(list(samples), dtype=torch.int64),
+        observations = Observations(
+            index=torch.tensor(list(samples), dtype=torch.int64),
             recording=recording,
             cameras=self.cameras.index(recording),
             key_points=gather("key_points"),
             confidence=gather("confidence"),
             valid=gather("valid"),
-            truth=gather("truth"),
-            truth_valid=gather("truth_valid"),
         )
+        return Labelled(observations, Truth(gather("truth"), gather("truth_valid")))
 
     def frame_numbers(self, samples: Sequence[int]) -> np.ndarray:
         """The data set's own frame numbers."""
@@ -69,14 +74,16 @@ class Frames(Dataset[Observations]):
         )
 
 
-def trainable(recordings: Sequence[Recording], frames: np.ndarray, joints: int) -> np.ndarray:
+def trainable(
+    recordings: Sequence[LabelledRecording], frames: np.ndarray, joints: int
+) -> np.ndarray:
     """Which frames have a truth, with the pelvis and at least ``joints`` joints both true and
     triangulable.
     """
     data = Frames(recordings, frames)
     batch = data[range(len(frames))]
-    usable = joints_with_enough_views(batch.valid) & batch.truth_valid
-    return (usable[:, PELVIS] & (usable.sum(dim=1) >= joints)).numpy()
+    learnable = joints_with_enough_views(batch.observations.valid) & batch.truth.valid
+    return (learnable[:, PELVIS] & (learnable.sum(dim=1) >= joints)).numpy()
 
 
 class BatchOrder(Sampler[list[int]]):

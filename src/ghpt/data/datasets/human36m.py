@@ -18,7 +18,7 @@ from ghpt.data.datasets.labels import LABELS_FILE, Labels, read_labels
 from ghpt.data.formats.validate import check_cameras, check_names, read_npy
 from ghpt.errors import GhptDataError, check
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 
 SUBJECTS = {"train": ("S1", "S5", "S6", "S7"), "validation": ("S8",), "test": ("S9", "S11")}
 """Split -> subjects (paper, section 4.1)."""
@@ -42,7 +42,7 @@ def human36m_files(root: Path, split: str) -> list[Path]:
 
 def human36m_recordings(
     root: Path, split: str, numbers: Sequence[int], damaged: bool
-) -> Iterator[Recording]:
+) -> Iterator[LabelledRecording]:
     """The takes of a split (train, validation, test) in the views ``numbers`` of the labels'
     cameras.
 
@@ -173,7 +173,7 @@ def _recording(
     action: str,
     rows: Int[np.ndarray, " T"],
     frame: Int[np.ndarray, " T"],
-) -> Recording:
+) -> LabelledRecording:
     frames = len(rows)
     views = len(subject.views)
     key_points = np.empty((frames, views, 17, 2), np.float32)
@@ -195,7 +195,7 @@ def _recording(
             )
     truth_valid = np.isfinite(truth).all(-1)
     truth[~truth_valid] = 0
-    return Recording(
+    return LabelledRecording(
         name=take,
         subject=subject.name,
         action=action,

@@ -17,7 +17,13 @@ from torch.utils.data import Dataset
 from ghpt import randomness
 from ghpt.errors import GhptDataError, check
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import PairBatch, Recording
+from ghpt.observations import (
+    Labelled,
+    LabelledRecording,
+    PairObservations,
+    PairTruth,
+    select_views,
+)
 
 _VOLUME_FRAMES = 2000
 """Frames of a rig, evenly in time, whose true joints span its capture volume."""
@@ -53,7 +59,7 @@ class RigOfSplit:
     """X*: uniform in the box of the true joints, world, mm."""
 
 
-class Pairs(Dataset[PairBatch]):
+class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
     """Every pair of views of every rig with ``draws`` draws of M frames each, or ``samples`` random
     ones.
 
@@ -65,7 +71,7 @@ class Pairs(Dataset[PairBatch]):
 
     def __init__(
         self,
-        recordings: Sequence[Recording],
+        recordings: Sequence[LabelledRecording],
         settings: PairSettings,
         seed: int,
         samples: int | None = None,
@@ -111,7 +117,7 @@ class Pairs(Dataset[PairBatch]):
             if (which == i).any()
         ]
 
-    def __getitem__(self, samples: Sequence[int]) -> PairBatch:
+    def __getitem__(self, samples: Sequence[int]) -> Labelled[PairObservations, PairTruth]:
         places = [self.locate(sample) for sample in samples]
         rig = torch.tensor([place[0] for place in places], dtype=torch.int64)
         drawn: dict[int, dict[str, np.ndarray]] = {}
@@ -125,22 +131,22 @@ class Pairs(Dataset[PairBatch]):
                 return torch.from_numpy(_EMPTY[field](0, like[0], self.settings.frames, like[1]))
             return torch.from_numpy(np.stack([drawn[draw][field] for _, draw, _ in places]))
 
-        return PairBatch(
-            sample=torch.tensor(list(samples), dtype=torch.int64),
+        pair = torch.tensor([place[2] for place in places], dtype=torch.int64).reshape(-1, 2)
+        K, R, t = (torch.stack([getattr(r.cameras, n) for r in self.rigs])[rig] for n in "KRt")
+        cameras = Cameras(*(select_views(values, pair) for values in (K, R, t)))
+        observations = PairObservations(
+            index=torch.tensor(list(samples), dtype=torch.int64),
             rig=rig,
             draw=torch.tensor([place[1] for place in places], dtype=torch.int64),
-            pair=torch.tensor([place[2] for place in places], dtype=torch.int64).reshape(-1, 2),
-            cameras=Cameras(
-                *(
-                    torch.stack([getattr(r.cameras, n) for r in self.rigs])[rig]
-                    for n in ("K", "R", "t")
-                )
-            ),
+            pair=pair,
+            K=K,
+            baseline=(cameras.centre[:, 1] - cameras.centre[:, 0]).norm(dim=-1),
             key_points=gather("key_points"),
             confidence=gather("confidence"),
             valid=gather("valid"),
-            points=torch.stack([r.points for r in self.rigs])[rig],
         )
+        points = torch.stack([r.points for r in self.rigs])[rig]
+        return Labelled(observations, PairTruth(cameras, points))
 
     def _read(self, rig: int, draw: int) -> dict[str, np.ndarray]:
         """Key points, confidence and masks [V, M, J, ...] of a draw."""
@@ -176,7 +182,7 @@ def _distinct(seed: int, draw: int, total: int, count: int) -> Int[np.ndarray, "
     return np.array(sorted(chosen), dtype=np.int64)
 
 
-def _rigs(recordings: Sequence[Recording], points: int, seed: int) -> list[RigOfSplit]:
+def _rigs(recordings: Sequence[LabelledRecording], points: int, seed: int) -> list[RigOfSplit]:
     """Recordings with the same cameras are of one rig."""
     groups: dict[tuple[tuple[str, ...], bytes], list[int]] = {}
     for index, recording in enumerate(recordings):
@@ -202,7 +208,9 @@ def _rigs(recordings: Sequence[Recording], points: int, seed: int) -> list[RigOf
     return rigs
 
 
-def _volume(recordings: Sequence[Recording]) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
+def _volume(
+    recordings: Sequence[LabelledRecording],
+) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
     """The lowest and highest corner of the box of the true joints. Raises GhptDataError where there
     are none.
     """

@@ -21,7 +21,7 @@ from ghpt.data.datasets.panoptic_detections import detection_files, detections, 
 from ghpt.data.formats.validate import check_array, check_cameras, check_names, read_json
 from ghpt.errors import GhptDataError, check
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 from ghpt.skeleton import JOINT
 
 SPLITS = {"train": (0.0, 0.6), "validation": (0.6, 0.8), "test": (0.8, 1.0)}
@@ -77,7 +77,9 @@ def panoptic_files(root: Path, numbers: Sequence[int]) -> list[Path]:
     return files
 
 
-def panoptic_recordings(root: Path, numbers: Sequence[int], split: str) -> Iterator[Recording]:
+def panoptic_recordings(
+    root: Path, numbers: Sequence[int], split: str
+) -> Iterator[LabelledRecording]:
     """One recording for each sequence: the split's part in time, in the HD cameras ``numbers``.
 
     Frames are those of the 3D files, so that the split is the same for all cameras; detections are
@@ -105,7 +107,7 @@ def panoptic_recordings(root: Path, numbers: Sequence[int], split: str) -> Itera
                 cameras.K[view].numpy(),
                 distortion[view],
             )
-        yield Recording(
+        yield LabelledRecording(
             name=folder.name,
             subject=folder.name,
             action=_action(folder.name),

@@ -19,7 +19,7 @@ import torch
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_folder, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 from ghpt.skeleton import JOINTS
 
 FORMAT = "ghpt recordings"
@@ -49,9 +49,9 @@ def cache_root() -> Path:
 def prepared(
     root: str | Path | None,
     key: dict[str, Any],
-    make: Callable[[], Iterable[Recording]],
+    make: Callable[[], Iterable[LabelledRecording]],
     provenance: dict[str, Any],
-) -> list[Recording]:
+) -> list[LabelledRecording]:
     """Open the recordings that ``key`` stands for, after making them if no one has yet.
 
     ``key["name"]`` is for people; all of ``key`` (plain data) decides the folder below ``root``
@@ -82,7 +82,7 @@ def file_stamps(files: Iterable[Path], root: Path) -> str:
 
 
 def write_store(
-    folder: str | Path, recordings: Iterable[Recording], provenance: dict[str, Any]
+    folder: str | Path, recordings: Iterable[LabelledRecording], provenance: dict[str, Any]
 ) -> None:
     """Write recordings, which must have the same number of views, as a store at ``folder``; one
     that is there is kept.
@@ -138,7 +138,7 @@ def write_store(
         )
 
 
-def open_store(folder: str | Path) -> list[Recording]:
+def open_store(folder: str | Path) -> list[LabelledRecording]:
     """The recordings of a store, their arrays read-only views of memory maps; reads the manifest
     only.
 
@@ -211,7 +211,7 @@ def _digest(manifest: dict[str, Any]) -> str:
     return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()
 
 
-def _entry(recording: Recording, before: list[dict[str, Any]]) -> dict[str, Any]:
+def _entry(recording: LabelledRecording, before: list[dict[str, Any]]) -> dict[str, Any]:
     """The manifest's part on one recording, checked against those already written."""
     views = len(recording.camera_names)
     if before and views != len(before[0]["camera_names"]):
@@ -244,7 +244,7 @@ def _entry(recording: Recording, before: list[dict[str, Any]]) -> dict[str, Any]
     }
 
 
-def _chunks(recording: Recording) -> Iterator[tuple[str, np.ndarray]]:
+def _chunks(recording: LabelledRecording) -> Iterator[tuple[str, np.ndarray]]:
     """Contiguous pieces of each field in file order."""
     for field, (dtype, _, _) in FIELDS.items():
         array = getattr(recording, field)
@@ -263,9 +263,9 @@ def _chunks(recording: Recording) -> Iterator[tuple[str, np.ndarray]]:
             yield field, chunk
 
 
-def _recording(entry: dict[str, Any], arrays: dict[str, np.ndarray]) -> Recording:
+def _recording(entry: dict[str, Any], arrays: dict[str, np.ndarray]) -> LabelledRecording:
     take = slice(entry["offset"], entry["offset"] + entry["length"])
-    return Recording(
+    return LabelledRecording(
         name=entry["name"],
         subject=entry["subject"],
         action=entry["action"],

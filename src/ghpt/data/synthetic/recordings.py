@@ -17,7 +17,7 @@ from ghpt.data.synthetic.random_processes import generator
 from ghpt.data.synthetic.rigs import ARRANGEMENTS, human36m_rig, panoptic_rig
 from ghpt.errors import check
 from ghpt.geometry.cameras import CameraSet
-from ghpt.recording import Recording
+from ghpt.observations import LabelledRecording
 
 SPLITS = ("train", "validation", "test")
 HUMAN36M_SUBJECTS = {
@@ -54,7 +54,7 @@ class Take:
 
 def synthetic_recordings(
     data: str, split: str, seed: int, detector: Detector, cameras: Sequence[int] | None = None
-) -> Iterator[Recording]:
+) -> Iterator[LabelledRecording]:
     """The synthetic recordings of ``h36m``, of ``cmu1`` to ``cmu4``, or of ``panoptic`` with any HD
     ``cameras``.
 
@@ -109,11 +109,11 @@ def _panoptic(rig: CameraSet, split: str, seed: int) -> Iterator[Take]:
         )
 
 
-def _detect(take: Take, seed: int, detector: Detector) -> Recording:
+def _detect(take: Take, seed: int, detector: Detector) -> LabelledRecording:
     found = detector(
         take.truth, take.rig, take.rate_hz, seed, take.subject, take.name, take.familiar
     )
-    return Recording(
+    return LabelledRecording(
         name=take.name,
         subject=take.subject,
         action=take.action,

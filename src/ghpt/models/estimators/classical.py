@@ -20,7 +20,7 @@ from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.recording import Observations, PoseEstimate
+from ghpt.observations import Observations, PoseEstimate
 
 
 def person_scale(
@@ -52,7 +52,7 @@ def poses_of(result: Triangulation, batch: Observations) -> PoseEstimate:
 
 
 def everywhere(value: float, batch: Observations) -> Float[Tensor, " B"]:
-    return torch.full(batch.sample.shape, value, dtype=torch.float64, device=batch.sample.device)
+    return torch.full(batch.index.shape, value, dtype=torch.float64, device=batch.index.device)
 
 
 class Baseline(ABC):

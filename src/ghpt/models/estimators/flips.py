@@ -11,7 +11,7 @@ from torch import Tensor
 from ghpt.errors import check
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import Baseline, person_scale
-from ghpt.recording import Observations, PoseEstimate
+from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import JOINTS, MIRROR
 
 LIMBS = tuple(

@@ -11,10 +11,10 @@ from torch import Tensor
 
 from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
-from ghpt.geometry.normal_equations import usable_views
+from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.estimators.classical import Baseline, Linear, everywhere, otherwise, person_scale
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class LoRansac(Baseline):
         return everywhere(self.threshold, batch)
 
     def triangulate(self, batch: Observations) -> Triangulation:
-        usable = batch.valid & usable_views(batch.cameras, batch.key_points)
+        usable = batch.valid & valid_key_points(batch.cameras, batch.key_points)
         size = person_scale(batch.key_points, usable).double()
         usable &= (size > 0)[..., None]
         # in units of the person's size one threshold holds for all views

@@ -11,15 +11,15 @@ import torch
 from jaxtyping import Bool, Float, Int8
 from torch import Tensor
 
-from ghpt.geometry.normal_equations import usable_views
+from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation
 from ghpt.models.estimators.classical import Baseline, poses_of
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.estimators.uncertainty import JointUncertainty, UncertaintyModel
 from ghpt.models.estimators.view_weights import ViewWeights
+from ghpt.observations import Observations
 from ghpt.reconstruction import Reconstruction, State
-from ghpt.recording import Observations
 
 FAR = 20.0
 """A key point so many times as far from its view's median as the median one belongs to nobody."""
@@ -34,7 +34,7 @@ class Predictor(Protocol):
         """The same with the noise level of these frames: a few hundred, spread over the recording."""
 
     def __call__(self, batch: Observations) -> Reconstruction:
-        """The batch's frames, with ``frame`` = ``batch.sample``; on the CPU."""
+        """The batch's frames, with ``frame`` = ``batch.index``; on the CPU."""
 
 
 class Classical:
@@ -122,7 +122,8 @@ class Learned:
         state = _rejected(self.reject, clean, points, state)
         views = weighed.views & (state == State.OBSERVED)[:, None]
         found = self.uncertainty(clean, points, views)
-        score = (weighed.weights * weighed.logits).sum(-1)
+        pool = weighed.pool
+        score = (pool.weights() * pool.logits).sum(-1)
         return _reconstruction(batch, points, state, views, found, score, flipped)
 
 
@@ -150,7 +151,7 @@ def cleaned(batch: Observations) -> tuple[Observations, Bool[Tensor, "B V J"]]:
     """The batch without key points that no detection can be, and which those were: not finite, of a
     camera that is none, or ``FAR`` from all others of its view.
     """
-    usable = batch.valid & usable_views(batch.cameras, batch.key_points)
+    usable = batch.valid & valid_key_points(batch.cameras, batch.key_points)
     points = torch.where(usable[..., None], batch.key_points, torch.nan)
     offset = (points - points.nanmedian(-2, keepdim=True).values).abs().amax(-1)
     typical = offset.nanmedian(-1, keepdim=True).values.clamp(min=1.0)
@@ -197,5 +198,5 @@ def _reconstruction(
     points = torch.where(placed[..., None], points, 0.0).double()
     error = found.error.float()
     covariance = found.covariance.float()
-    fields = (batch.sample, points, state, error, views, covariance, score.float(), flipped)
+    fields = (batch.index, points, state, error, views, covariance, score.float(), flipped)
     return Reconstruction(*(x.cpu() for x in fields))

@@ -4,7 +4,6 @@ frame's noise.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -14,17 +13,17 @@ from torch import Tensor
 
 from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import Cameras, reprojection_error
-from ghpt.geometry.state import State
 from ghpt.geometry.triangulation import (
     System,
     Triangulation,
     flat_cameras,
-    in_parts,
+    select_frames,
+    solve_in_parts,
     triangulate_subsets,
 )
 from ghpt.models.estimators.classical import Baseline, everywhere, person_scale
+from ghpt.observations import Observations
 from ghpt.randomness import key, uniform
-from ghpt.recording import Observations
 
 
 @dataclass(frozen=True)
@@ -54,17 +53,16 @@ class Ransac(Baseline):
         size = person_scale(batch.key_points, batch.valid)
         pairs = self._pairs(batch)
 
-        def part(rows: slice) -> tuple[Tensor, ...]:
-            own = rig if len(rig.t) == 1 else rig.index(rows)
+        def solve(rows: slice) -> Triangulation:
+            own = select_frames(rig, rows)
             candidates = _Candidates(
                 own, batch.key_points[rows], batch.valid[rows], size[rows], pairs[rows]
             )
-            return candidates.fields(self._inliers(candidates))
+            return candidates.assess(self._inliers(candidates))
 
         frames, views, joints = batch.valid.shape
-        return Triangulation(
-            *in_parts(part, torch.Size((frames, max(views, pairs.shape[1]), joints)))
-        )
+        shape = torch.Size((frames, max(views, pairs.shape[1]), joints))
+        return solve_in_parts(solve, shape)
 
     def _inliers(self, candidates: _Candidates) -> Bool[Tensor, "V J B"]:
         return candidates.inliers(
@@ -82,7 +80,7 @@ class Ransac(Baseline):
         valid = batch.valid.mT[:, None]
         count = valid.sum(-1)
         draw = uniform(
-            key(self.seed, "ransac", batch.sample, device=device), (self.pairs, joints, 2)
+            key(self.seed, "ransac", batch.index, device=device), (self.pairs, joints, 2)
         )
         one = (draw[..., 0] * count).long()
         other = (draw[..., 1] * (count - 1)).long()
@@ -173,7 +171,7 @@ class _Candidates:
         self.residual = self.residuals(points.permute(3, 1, 2, 0).contiguous())
 
     @cached_property
-    def of_all_views(self) -> tuple[Sequence[Tensor], Float[Tensor, "J B"]]:
+    def of_all_views(self) -> tuple[Float[Tensor, "3 J B"], Float[Tensor, "J B"]]:
         """The solution of all views together; seldom needed."""
         return self.system.solve(self.system.used.double())
 
@@ -204,23 +202,20 @@ class _Candidates:
     def point(self, inlier: Bool[Tensor, "V J B"]) -> Float[Tensor, "3 J B"]:
         """Of the inliers; of all views where those do not fix one."""
         point, cond = self.system.solve(inlier.double())
-        point = torch.stack(list(point))
         fixed = torch.isfinite(cond)
-        return (
-            point
-            if fixed.all()
-            else torch.where(fixed, point, torch.stack(list(self.of_all_views[0])))
-        )
+        if fixed.all():
+            return point
+        fallback, _ = self.of_all_views
+        return torch.where(fixed, point, fallback)
 
-    def fields(self, inlier: Bool[Tensor, "V J B"]) -> tuple[Tensor, ...]:
-        """The fields of Triangulation, of the inliers; of all views where those have no point."""
+    def assess(self, inlier: Bool[Tensor, "V J B"]) -> Triangulation:
+        """Return the Triangulation of the inliers; of all views where those have no point."""
         system = self.system
-        robust = system.fields(*system.solve(inlier.double()), inlier, torch.zeros_like(inlier[0]))
-        ok = robust[1] == State.OBSERVED
-        if ok.all():
+        point, cond = system.solve(inlier.double())
+        robust = system.assess(point, cond, inlier, torch.zeros_like(inlier[0]))
+        if robust.ok.all():
             return robust
-        linear = system.fields(*self.of_all_views, system.used, (self.valid & ~system.used).any(0))
-        return tuple(
-            torch.where(ok[..., None] if a.ndim > ok.ndim else ok, a, b)
-            for a, b in zip(robust, linear, strict=True)
-        )
+        point, cond = self.of_all_views
+        rejected = (self.valid & ~system.used).any(0)
+        linear = system.assess(point, cond, system.used, rejected)
+        return robust.with_fallback(robust.ok, linear)

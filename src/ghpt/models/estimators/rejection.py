@@ -11,7 +11,7 @@ from torch import Tensor
 from ghpt.errors import check_positive
 from ghpt.geometry.cameras import project
 from ghpt.models.estimators.classical import person_scale
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 _FEW = 6
 """Joints in a view; the box around fewer is not the person's."""

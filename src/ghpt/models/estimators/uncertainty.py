@@ -9,10 +9,16 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.errors import check
-from ghpt.geometry.normal_equations import local_cameras, minors, products, views_of, weighted_sum
+from ghpt.geometry.normal_equations import (
+    form_equations,
+    local_cameras,
+    minors,
+    view_components,
+    weighted_sum,
+)
 from ghpt.geometry.triangulation import flat_cameras
 from ghpt.models.estimators.classical import person_scale
-from ghpt.recording import Observations
+from ghpt.observations import Observations
 
 
 @dataclass(frozen=True)
@@ -94,7 +100,7 @@ class UncertaintyModel:
         rig = flat_cameras(batch.cameras, batch.valid.shape[:1])
         local, origin = local_cameras(rig)
         used = views.permute(1, 2, 0)
-        seen_by = views_of(local, batch.key_points, used)
+        seen_by = view_components(local, batch.key_points, used)
         a, b = seen_by.rows()
         x, y, z = (points.double() - origin[:, None]).permute(2, 1, 0)
         depth = seen_by.depth(x, y, z)
@@ -103,7 +109,7 @@ class UncertaintyModel:
         square = over**2 + down**2
         size = person_scale(batch.key_points, batch.valid).double().mT[:, None].clamp(min=1e-12)
         weight = 1 / (depth * size) ** 2
-        normal = weighted_sum(products(a, b)[:, :6], weight)
+        normal = weighted_sum(form_equations(a, b)[:, :6], weight)
         return square.permute(2, 0, 1), (square / size**2).permute(2, 0, 1), normal.permute(2, 1, 0)
 
 

@@ -17,17 +17,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from ghpt.errors import check
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.models.aggregation import cap_logit_std, softmax_weights
 from ghpt.models.estimators.classical import Baseline, otherwise
 from ghpt.models.estimators.ransac import Ransac
 from ghpt.models.module import StochasticEstimator
-from ghpt.models.pose.problem import PoseHypotheses
-from ghpt.recording import Observations
+from ghpt.models.pool import Pool
+from ghpt.observations import Observations
 
 
 @dataclass(frozen=True)
@@ -38,10 +37,7 @@ class Weighed:
     """The joints."""
     views: Bool[Tensor, "B V J"]
     """The views that agree, from which the hypotheses are."""
-    hypotheses: PoseHypotheses
-    logits: Float[Tensor, "B H"]
-    """As the scorer gave them."""
-    weights: Float[Tensor, "B H"]
+    pool: Pool
 
 
 class ViewWeights(Baseline):
@@ -67,16 +63,13 @@ class ViewWeights(Baseline):
         """The joints and all that they were made of. ``robust``: what ``consensus`` makes of the
         batch, if that is known.
         """
-        model = self.model
-        problem = self.model.problem
         robust = robust or self.consensus.triangulate(batch)
         views, _ = self.consensus.inlier_views(batch, robust.points, robust.has_position)
         agreed = replace(batch, valid=views)
-        hypotheses = problem.generate(agreed, model.hypotheses, model.keys("view weights", batch))
-        logits = model.scorer(problem.featurize(hypotheses))
-        weights = softmax_weights(cap_logit_std(logits, model.logit_std_cap), model.temperature)
-        probability = torch.einsum("bh,bhjv->bvj", weights.double(), hypotheses.views.double())
+        pool = self.model.sample(agreed, "view weights")
+        weights = pool.weights().double()
+        probability = torch.einsum("bh,bhjv->bvj", weights, pool.hypotheses.views.double())
         inlier_threshold = self.consensus.inlier_threshold(batch, robust.points)
         power = self.power * (self.consensus.threshold / inlier_threshold[:, None, None]).sqrt()
         result = triangulate(batch.cameras, batch.key_points, views * probability**power)
-        return Weighed(otherwise(result, robust), views, hypotheses, logits, weights)
+        return Weighed(otherwise(result, robust), views, pool)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghpt.data.datasets.human36m import DAMAGED
@@ -13,7 +13,7 @@ from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.metrics.pose_prior import PARTS, PosePrior
 from ghpt.models.pose.predictions import Predictions
-from ghpt.recording import PoseEstimate
+from ghpt.observations import PoseEstimate, Truth
 from ghpt.skeleton import JOINTS
 
 FORMAT_VERSION = 1
@@ -63,13 +63,12 @@ class _Selection:
     def update(
         self,
         estimate: PoseEstimate,
-        truth: Float[Tensor, "B J 3"],
-        truth_valid: Bool[Tensor, "B J"],
+        truth: Truth,
         action: Int[Tensor, " B"],
         subject: Int[Tensor, " B"],
     ) -> None:
         for metric in (self.absolute, self.relative, self.aligned):
-            metric.update(estimate, truth, truth_valid, action)
+            metric.update(estimate, truth, action)
         self.prior.update(estimate, subject)
 
 
@@ -104,12 +103,10 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
         subject = subject_of[chunk.recording]
         for name in names:
             estimate = chunk.estimates[name]
-            whole[name].update(estimate, chunk.truth, chunk.truth_valid, action, subject)
+            whole[name].update(estimate, chunk.truth, action, subject)
             if sound:
-                kept = PoseEstimate(estimate.points[keep], estimate.estimated[keep])
-                sound[name].update(
-                    kept, chunk.truth[keep], chunk.truth_valid[keep], action[keep], subject[keep]
-                )
+                kept = estimate.rows(keep)
+                sound[name].update(kept, chunk.truth.rows(keep), action[keep], subject[keep])
     selections = {name: _selection(whole[name], actions, subjects) for name in names}
     for name, metrics in sound.items():
         selections[name]["without_damaged"] = metrics.numbers()

@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghpt.data.formats.stored_npz import Member, read_rows
 from ghpt.errors import GhptDataError
 from ghpt.models.rows import HINT, WEIGHTS, Layout, RowWriter, check_arrays, read_tables, row_count
-from ghpt.recording import PoseEstimate, Recording
+from ghpt.observations import PoseEstimate, Recording, Truth
 from ghpt.skeleton import JOINTS
 
 
@@ -41,8 +41,7 @@ class PredictionWriter:
         self,
         rows: Int[Tensor, " B"],
         estimates: Mapping[str, PoseEstimate],
-        truth: Float[Tensor, "B J 3"],
-        truth_valid: Bool[Tensor, "B J"],
+        truth: Truth,
         recording: Int[Tensor, " B"],
         frame: Int[Tensor, " B"],
         weights: Mapping[str, Float[Tensor, " B"]],
@@ -52,11 +51,11 @@ class PredictionWriter:
         """
         self._rows.check(estimates, weights)
         values: dict[str, Tensor] = {
-            "truth_seen": truth_valid,
+            "truth_seen": truth.valid,
             "recording": recording,
             "frame": frame,
         }
-        values["truth"] = truth.masked_fill(~truth_valid[..., None], torch.nan)
+        values["truth"] = truth.points.masked_fill(~truth.valid[..., None], torch.nan)
         for name, estimate in estimates.items():
             estimated = estimate.estimated & estimate.points.isfinite().all(-1)
             values[f"estimated_{name}"] = estimated
@@ -86,8 +85,7 @@ class PredictionChunk(NamedTuple):
     """Successive rows of a predictions file, as masked values without NaN."""
 
     estimates: dict[str, PoseEstimate]
-    truth: Float[Tensor, "B J 3"]
-    truth_valid: Bool[Tensor, "B J"]
+    truth: Truth
     recording: Int[Tensor, " B"]
     frame: Int[Tensor, " B"]
     weights: dict[str, Float[Tensor, " B"]]
@@ -131,9 +129,9 @@ class Predictions:
                 torch.where(estimated[..., None], points, 0.0), estimated
             )
         valid = rows["truth_seen"] & rows["truth"].isfinite().all(-1)
-        truth = torch.where(valid[..., None], rows["truth"], 0.0)
+        truth = Truth(torch.where(valid[..., None], rows["truth"], 0.0), valid)
         weights = {summary: rows[f"weights_{summary}"] for summary in WEIGHTS}
-        return PredictionChunk(estimates, truth, valid, recording, rows["frame"], weights)
+        return PredictionChunk(estimates, truth, recording, rows["frame"], weights)
 
     def chunks(self, size: int) -> Iterator[PredictionChunk]:
         """All rows, ``size`` at a time."""

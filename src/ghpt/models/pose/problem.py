@@ -13,13 +13,16 @@ from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.models.pose.features import body_part_lengths, normalised_coordinates
-from ghpt.recording import Observations, PoseEstimate
+from ghpt.models.problem import Hypotheses
+from ghpt.observations import Observations, PoseEstimate, Truth
 from ghpt.skeleton import BONES, JOINTS
 
 
 @dataclass(frozen=True)
-class PoseHypotheses:
+class PoseHypotheses(Hypotheses):
     """H 3D poses for each of B frames."""
+
+    shared = ("estimated",)
 
     points: Float[Tensor, "B H J 3"]
     """World frame, mm, float32."""
@@ -86,18 +89,13 @@ class PoseTriangulation:
         return PoseEstimate(hypotheses.points, estimated)
 
     def error(
-        self, estimate: PoseEstimate, batch: Observations
+        self, estimate: PoseEstimate, truth: Truth
     ) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
         """Pelvis-relative MPJPE (eq:mpjpe) over the joints that are estimated and have a truth, mm."""
         extra = (None,) * (estimate.points.dim() - 3)
-        truth = batch.truth[:, *extra]
-        truth_valid = batch.truth_valid[:, *extra]
-        errors, counted = joint_errors(
-            estimate,
-            truth.expand_as(estimate.points),
-            truth_valid.expand_as(estimate.estimated),
-            "relative",
-        )
+        points = truth.points[:, *extra].expand_as(estimate.points)
+        valid = truth.valid[:, *extra].expand_as(estimate.estimated)
+        errors, counted = joint_errors(estimate, Truth(points, valid), "relative")
         number = counted.sum(dim=-1)
         mean = torch.where(counted, errors, 0.0).sum(dim=-1) / number.clamp_min(1)
         return mean, (number > 0).flatten(1).all(dim=1) if extra else number > 0

@@ -22,13 +22,13 @@ from torch import Tensor
 from ghpt.errors import check, check_positive
 from ghpt.geometry.epipolar import MINIMUM, eight_point, pose_in_front, sampson_error
 from ghpt.models.estimators.classical import person_scale
+from ghpt.observations import PairObservations, RelativePoseEstimate
 from ghpt.randomness import key, uniform
-from ghpt.recording import PairBatch, RelativePoseEstimate
 
 
-def size_in_image(batch: PairBatch) -> Float[Tensor, " B"]:
+def size_in_image(batch: PairObservations) -> Float[Tensor, " B"]:
     """The person's size in the pair's views, in normalised image coordinates; 0 where it has none."""
-    K, pixels, valid = (batch.of_pair(x) for x in (batch.cameras.K, batch.key_points, batch.valid))
+    K, pixels, valid = (batch.of_pair(x) for x in (batch.K, batch.key_points, batch.valid))
     focal = (K[..., 0, 0] + K[..., 1, 1]).double() / 2
     size = person_scale(pixels.double(), valid) / focal[..., None]
     size = torch.where(size > 0, size, torch.nan).flatten(1)
@@ -53,14 +53,14 @@ class PairBaseline(ABC):
     """
 
     @abstractmethod
-    def __call__(self, batch: PairBatch) -> RelativePoseEstimate: ...
+    def __call__(self, batch: PairObservations) -> RelativePoseEstimate: ...
 
 
 class EightPoint(PairBaseline):
     """The normalised 8-point algorithm on all correspondences."""
 
     @torch.no_grad()
-    def __call__(self, batch: PairBatch) -> RelativePoseEstimate:
+    def __call__(self, batch: PairObservations) -> RelativePoseEstimate:
         return linear_pose(*batch.correspondences())[0]
 
 
@@ -78,7 +78,7 @@ class Robust(PairBaseline):
         """
 
     @torch.no_grad()
-    def __call__(self, batch: PairBatch) -> RelativePoseEstimate:
+    def __call__(self, batch: PairObservations) -> RelativePoseEstimate:
         a, b, used = batch.correspondences()
         size = size_in_image(batch)
         linear, determined = linear_pose(a, b, used)
@@ -86,7 +86,7 @@ class Robust(PairBaseline):
         t = linear.t.clone()
         ok = linear.estimated.clone()
         for i in torch.nonzero(determined & (size > 0)).flatten().tolist():
-            found = self.pose(a[i, used[i]], b[i, used[i]], size[i].item(), batch.sample[i])
+            found = self.pose(a[i, used[i]], b[i, used[i]], size[i].item(), batch.index[i])
             if found is not None and found.estimated:
                 R[i], t[i], ok[i] = found.R.to(R), found.t.to(t), True
         return RelativePoseEstimate(R, t, ok)

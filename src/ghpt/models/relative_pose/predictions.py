@@ -20,7 +20,7 @@ from ghpt.data.formats.stored_npz import Member, read_rows
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.rows import HINT, WEIGHTS, Layout, RowWriter, check_arrays, read_tables, row_count
-from ghpt.recording import RelativePoseEstimate
+from ghpt.observations import RelativePoseEstimate
 
 PROBLEM = "camera"
 

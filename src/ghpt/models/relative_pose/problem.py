@@ -27,7 +27,8 @@ from ghpt.geometry.epipolar import (
     robust_weights,
 )
 from ghpt.geometry.rotations import average_rotation
-from ghpt.recording import PairBatch, RelativePoseEstimate
+from ghpt.models.problem import Hypotheses
+from ghpt.observations import PairObservations, PairTruth, RelativePoseEstimate
 
 CHEIRALITY = 256
 """Correspondences, evenly over all, that tell which of four poses has them in front: more would
@@ -36,8 +37,10 @@ only repeat it.
 
 
 @dataclass(frozen=True)
-class RelativePoseHypotheses:
-    """H relative poses for each of B pairs, and the correspondences that all of them are judged by."""
+class RelativePoseHypotheses(Hypotheses):
+    """H relative poses for each of B pairs, and the correspondences that all are judged by."""
+
+    shared = ("estimated", "a", "b", "both")
 
     R: Float[Tensor, "B H 3 3"]
     t: Float[Tensor, "B H 3"]
@@ -72,7 +75,7 @@ class RelativePose:
         sample: int,
         refine: int,
         features: int,
-        scale: Callable[[RelativePoseEstimate, PairBatch], Tensor],
+        scale: Callable[[RelativePoseEstimate, PairObservations], Tensor],
         largest_error: float,
     ) -> None:
         check(
@@ -90,7 +93,7 @@ class RelativePose:
 
     @torch.no_grad()
     def generate(
-        self, batch: PairBatch, count: int, keys: Int[Tensor, " B"]
+        self, batch: PairObservations, count: int, keys: Int[Tensor, " B"]
     ) -> RelativePoseHypotheses:
         """The normalised 8-point algorithm on T random correspondences, then ``refine`` times on
         all, reweighted.
@@ -149,26 +152,26 @@ class RelativePose:
         return RelativePoseEstimate(hypotheses.R, hypotheses.t, estimated)
 
     def error(
-        self, estimate: RelativePoseEstimate, batch: PairBatch
+        self, estimate: RelativePoseEstimate, truth: PairTruth
     ) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
         """E_3D (eq:reprojection-3d-error), mm: the mean distance of random points from what the
         estimated pair makes of their true images. A point that it cannot see in front of both
         cameras has ``largest_error``.
         """
-        cameras = batch.pair_cameras()
-        pixels, depth = project(cameras, batch.points)
+        cameras = truth.cameras
+        pixels, depth = project(cameras, truth.points)
         x = normalise(cameras.K, pixels)
-        truth = batch.points @ cameras.R[:, 0].mT + cameras.t[:, 0, None]
+        in_a = truth.points @ cameras.R[:, 0].mT + cameras.t[:, 0, None]
         # linear triangulation counts a ray's distance by its camera's focal length
         focal = torch.linalg.det(cameras.K)
         share_a = (focal[:, 0] / focal.sum(-1))[:, None, None]
         extra = (None,) * (estimate.t.dim() - 2)
-        a, b, truth, share_a = (v[:, *extra] for v in (x[:, 0], x[:, 1], truth, share_a))
+        a, b, in_a, share_a = (v[:, *extra] for v in (x[:, 0], x[:, 1], in_a, share_a))
         alpha, beta = depths(estimate.R, estimate.t, a, b)
         on_a = homogeneous(a) * alpha[..., None]
         on_b = (homogeneous(b) * beta[..., None] - estimate.t[..., None, :]) @ estimate.R
         distance = (
-            (share_a * on_a + (1 - share_a) * on_b - truth)
+            (share_a * on_a + (1 - share_a) * on_b - in_a)
             .norm(dim=-1)
             .clamp(max=self.largest_error)
         )

@@ -16,7 +16,7 @@ from ghpt.data.synthetic.body import pose, random_body
 from ghpt.errors import check
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.triangulation import triangulate
-from ghpt.recording import PairBatch, RelativePoseEstimate
+from ghpt.observations import PairObservations, RelativePoseEstimate
 from ghpt.skeleton import BONES, JOINTS
 
 _PARTS = {
@@ -125,20 +125,21 @@ class Scale(ABC):
     """
 
     @abstractmethod
-    def __call__(self, estimate: RelativePoseEstimate, batch: PairBatch) -> Float[Tensor, "*B"]: ...
+    def __call__(
+        self, estimate: RelativePoseEstimate, batch: PairObservations
+    ) -> Float[Tensor, "*B"]: ...
 
 
 class KnownScale(Scale):
     """The true length of the pair's t, as in the paper."""
 
-    def __call__(self, estimate: RelativePoseEstimate, batch: PairBatch) -> Float[Tensor, "*B"]:
-        baseline = batch.pair_cameras().centre.double()
-        true = (baseline[:, 1] - baseline[:, 0]).norm(dim=-1)
+    def __call__(
+        self, estimate: RelativePoseEstimate, batch: PairObservations
+    ) -> Float[Tensor, "*B"]:
         length = estimate.t.double().norm(dim=-1)
-        true = true.reshape(-1, *[1] * (length.ndim - 1)).expand(length.shape)
-        return torch.where(
-            estimate.estimated & (length > 0), true / torch.where(length > 0, length, 1.0), 0.0
-        )
+        baseline = batch.baseline.reshape(-1, *[1] * (length.ndim - 1)).expand(length.shape)
+        scale = baseline / torch.where(length > 0, length, 1.0)
+        return torch.where(estimate.estimated & (length > 0), scale, 0.0)
 
 
 class BodyScale(Scale):
@@ -147,10 +148,12 @@ class BodyScale(Scale):
     lengths: tuple[float, ...]
 
     @torch.no_grad()
-    def __call__(self, estimate: RelativePoseEstimate, batch: PairBatch) -> Float[Tensor, "*B"]:
+    def __call__(
+        self, estimate: RelativePoseEstimate, batch: PairObservations
+    ) -> Float[Tensor, "*B"]:
         key_points = batch.of_pair(batch.key_points)
         valid = batch.of_pair(batch.valid)
-        K = batch.pair_cameras().K.double()
+        K = batch.of_pair(batch.K).double()
         lengths = torch.tensor(self.lengths, dtype=torch.float64)
         scales = [
             self._of_pair(

@@ -6,19 +6,13 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from ghpt.config import build
 from ghpt.data.datasets.frames import Frames
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
-from ghpt.models.aggregation import aggregation_weights, cap_logit_std
-from ghpt.models.checkpoint import load_model
+from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
-from ghpt.models.pose.problem import PoseHypotheses
-from ghpt.paper.engine.actions import CHECKPOINT
-from ghpt.recording import Observations
 from ghpt.skeleton import JOINTS
 
 AGGREGATIONS = ("weight", "average", "best")
@@ -33,7 +27,7 @@ def evaluate(config: dict[str, Any], dependencies: dict[str, Path], folder: Path
     result.json: set -> for each setting selection -> pelvis-relative MPJPE (mm). A smaller pool is
     the beginning of a larger one, the same that test.py draws with so many hypotheses.
     """
-    model, _ = load_model(dependencies["model"] / CHECKPOINT, seed=config["seed"])
+    model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
     model.eval()
     settings = [(h or model.hypotheses, t or model.temperature) for h, t in config["settings"]]
     result = {}
@@ -49,39 +43,15 @@ def errors(
 ) -> list[dict[str, float]]:
     """Pelvis-relative MPJPE (mm) of the selections under each setting."""
     metrics = [{name: MPJPE("relative", 1, len(JOINTS)) for name in AGGREGATIONS} for _ in settings]
+    model.hypotheses = max(count for count, _ in settings)
     for first in range(0, len(frames), batch_size):
         batch = frames[range(first, min(first + batch_size, len(frames)))]
-        keys = model.keys("test", batch)
-        pool = model.problem.generate(batch, max(h for h, _ in settings), keys)
-        logits = model.scorer(model.problem.featurize(pool))
+        pool = model.sample(batch.observations, "test", batch.truth)
         for each, (count, temperature) in zip(metrics, settings, strict=True):
-            part = PoseHypotheses(pool.points[:, :count], pool.views[:, :count], pool.estimated)
-            update(
-                each,
-                model,
-                part,
-                cap_logit_std(logits[:, :count], model.logit_std_cap),
-                temperature,
-                batch,
-                keys,
-            )
+            part = pool.first(count).with_temperature(temperature)
+            for name, metric in each.items():
+                group = torch.zeros_like(batch.observations.index)
+                metric.update(part.estimate(name), batch.truth, group)
     return [
         {name: metric.compute().mean.item() for name, metric in each.items()} for each in metrics
     ]
-
-
-def update(
-    metrics: dict[str, MPJPE],
-    model: StochasticEstimator,
-    pool: PoseHypotheses,
-    logits: Float[Tensor, "B H"],
-    temperature: float,
-    batch: Observations,
-    keys: Int[Tensor, " B"],
-) -> None:
-    """Add a batch to the metric of each selection."""
-    error, _ = model.problem.error(model.problem.as_estimates(pool), batch)
-    for name, metric in metrics.items():
-        weights = aggregation_weights(name, logits, error.to(logits.dtype), temperature, keys)
-        estimate = model.problem.aggregate(pool, weights)
-        metric.update(estimate, batch.truth, batch.truth_valid, torch.zeros_like(batch.sample))

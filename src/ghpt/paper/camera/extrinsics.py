@@ -21,12 +21,11 @@ from ghpt.errors import GhptDataError
 from ghpt.files import write_json
 from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.pose_error import MPJPE
-from ghpt.models.checkpoint import load_model
+from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.relative_pose.evaluation import camera_after
-from ghpt.paper.engine.actions import CHECKPOINT
+from ghpt.observations import PairObservations, RelativePoseEstimate
 from ghpt.paper.engine.tasks import read_json
-from ghpt.recording import PairBatch, RelativePoseEstimate
 from ghpt.skeleton import JOINTS
 
 PARTS = {"R": (True, False), "t": (False, True), "both": (True, True)}
@@ -63,7 +62,7 @@ def with_true_scale(cameras: Cameras, truth: Cameras) -> Extrinsics:
     return R, t * (torch.pdist(truth.centre) / torch.pdist(cameras.centre)).median()
 
 
-def from_pairs(estimate: RelativePoseEstimate, batch: PairBatch, name: str) -> Extrinsics:
+def from_pairs(estimate: RelativePoseEstimate, batch: PairObservations, name: str) -> Extrinsics:
     """The poses of the pairs (1, i), in their order, and the first camera's own."""
     rows = torch.nonzero(batch.pair[:, 0] == 0)[:, 0]
     if not estimate.estimated[rows].all():
@@ -73,9 +72,8 @@ def from_pairs(estimate: RelativePoseEstimate, batch: PairBatch, name: str) -> E
     return torch.cat((eye, estimate.R[rows].double())), torch.cat((zero, estimate.t[rows].double()))
 
 
-def from_rig(calibration: Any, batch: PairBatch) -> Extrinsics:
+def from_rig(calibration: Any, batch: PairObservations, truth: Cameras) -> Extrinsics:
     """All views of a draw calibrated together; the one scale is the true one."""
-    truth = batch.cameras.index(0)
     draw = int(batch.draw[0])
     arrays = (x[0].transpose(0, 1) for x in (batch.key_points, batch.confidence, batch.valid))
     found = calibration([str(view) for view in range(len(truth.K))], truth.K, *arrays, None, draw)
@@ -108,17 +106,18 @@ def estimate_extrinsics(
             "hypotheses": config["hypotheses"],
             "problem.frames": config["frames"],
         }
-        model = load_model(dependencies["model"] / CHECKPOINT, **changes)[0].eval()
+        model = load_model(dependencies["model"] / LAST, **changes)[0].eval()
     else:
         estimator = build(config["estimator"], "estimator")
         scale = build(config["scale"], "scale")
     found: list[list[list[Any]]] = [[] for _ in pairs.rigs]
     for draw in range(len(pairs.rigs) * draws):
-        batch = pairs[range(draw * len(pairs.pairs), (draw + 1) * len(pairs.pairs))]
+        rows = range(draw * len(pairs.pairs), (draw + 1) * len(pairs.pairs))
+        batch = pairs[rows].observations
         if source == "weight":
-            extrinsics = from_pairs(model.test_step(batch, 0)[0]["weight"], batch, source)
+            extrinsics = from_pairs(model.sample(batch, "test").estimate(), batch, source)
         elif source == "rig":
-            extrinsics = from_rig(estimator, batch)
+            extrinsics = from_rig(estimator, batch, pairs.rigs[draw // draws].cameras)
         else:
             pose = estimator(batch)
             extrinsics = from_pairs(
@@ -141,7 +140,7 @@ def poses_from_extrinsics(
     result.json: part of `PARTS` (or ``known``) -> kind -> MPJPE (mm) of ``weight``.
     """
     changes = {"seed": config["seed"], "hypotheses": config["hypotheses"]}
-    model = load_model(dependencies["model"] / CHECKPOINT, **changes)[0].eval()
+    model = load_model(dependencies["model"] / LAST, **changes)[0].eval()
     data = build(config["data"], "data")
     data.setup("test")
     frames = {"known": data.frames["test"]}
@@ -179,7 +178,7 @@ def pose_errors(model: StochasticEstimator, frames: Frames, batch_size: int) -> 
     metrics = {kind: MPJPE(kind, 1, len(JOINTS)) for kind in KINDS}
     for first in range(0, len(frames), batch_size):
         batch = frames[range(first, min(first + batch_size, len(frames)))]
-        estimate = model.test_step(batch, 0)[0]["weight"]
+        estimate = model.sample(batch.observations, "test").estimate()
         for metric in metrics.values():
-            metric.update(estimate, batch.truth, batch.truth_valid, torch.zeros_like(batch.sample))
+            metric.update(estimate, batch.truth, torch.zeros_like(batch.observations.index))
     return {kind: metric.compute().mean.item() for kind, metric in metrics.items()}

@@ -10,11 +10,10 @@ import torch
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.models.checkpoint import load_model
+from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.collect import CollectPairs
 from ghpt.models.relative_pose.evaluation import errors_of_pair, pair_name
 from ghpt.models.relative_pose.predictions import open_pairs
-from ghpt.paper.engine.actions import CHECKPOINT
 
 
 def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
@@ -26,7 +25,7 @@ def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folde
     """
     changes = {"problem.frames": config["frames"], "problem.draws": config["draws"]}
     changes |= {"seed": config["seed"], "hypotheses": config["hypotheses"]}
-    model = load_model(dependencies["model"] / CHECKPOINT, **changes)[0].eval()
+    model = load_model(dependencies["model"] / LAST, **changes)[0].eval()
     data = build(config["data"], "data")
     data.bind(model.problem)
     data.setup("test")
@@ -47,7 +46,7 @@ def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folde
     with torch.no_grad():
         for first in range(0, len(pairs), data.batch_size):
             batch = pairs[range(first, min(first + data.batch_size, len(pairs)))]
-            collect.write(model, batch, *model.test_step(batch, 0))
+            collect.write(model, batch, model.test_step(batch, 0))
     collect.finish()
     predictions = open_pairs(collect.path)
     result = {

@@ -82,7 +82,7 @@ class Setup:
         files = {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
         return Task(
             f"prepare-{data}-{split}",
-            "ghpt.paper.engine.actions.prepare_split",
+            "ghpt.paper.engine.preparation.prepare_split",
             config | files,
             seconds=8.0,
         )
@@ -103,7 +103,7 @@ class Setup:
         name = "-".join(filter(None, ["train", model, data, name, f"seed{self.seed}"]))
         command = " ".join(["python train.py", *self.words(data), *words, _output(name)])
         return Task(
-            name, "ghpt.paper.engine.actions.train_model", config, dependencies, command, seconds
+            name, "ghpt.paper.engine.training.train_model", config, dependencies, command, seconds
         )
 
     def tested(
@@ -139,7 +139,7 @@ class Setup:
         )
         seconds = seconds or SECONDS.get(data, 13.0)
         return Task(
-            name, "ghpt.paper.engine.actions.test_model", config, dependencies, command, seconds
+            name, "ghpt.paper.engine.testing.measure_model", config, dependencies, command, seconds
         )
 
 

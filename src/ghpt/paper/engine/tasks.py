@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ghpt.files import atomic_folder, write_json
-from ghpt.paper.engine.code import code_digest
+from ghpt.paper.engine.code import code_digest, target_names
 from ghpt.provenance import provenance
 
 
@@ -42,7 +42,7 @@ class Task:
             "action": self.action,
             "config": self.config,
             "dependencies": {name: task.key for name, task in self.dependencies.items()},
-            "code": code_digest(self.action.rpartition(".")[0]),
+            "code": code_digest(frozenset({self.action, *target_names(self.config)})),
         }
         return hashlib.sha256(
             json.dumps(content, sort_keys=True, allow_nan=False).encode()

@@ -30,12 +30,12 @@ def _qualitative(results: Results) -> Section:
     chunk = predictions.read(0, len(predictions))
     errors = {name: _relative_errors(chunk, name) for name in SHOWN}
     whole = np.flatnonzero(np.isfinite(sum(errors.values())))
-    up = up_axis(chunk.truth[::10].double().numpy())
+    up = up_axis(chunk.truth.points[::10].double().numpy())
     figures = {}
     for kind, quantile in QUANTILES.items():
         row = whole[np.argsort(errors["weight"][whole])[int(quantile * (len(whole) - 1))]]
         figures[f"qualitative-{kind}"] = skeletons(
-            chunk.truth[row].double().numpy(),
+            chunk.truth.points[row].double().numpy(),
             {name: chunk.estimates[name].points[row].double().numpy() for name in SHOWN},
             up,
             _heading(
@@ -63,9 +63,7 @@ def _qualitative(results: Results) -> Section:
 
 def _relative_errors(chunk: PredictionChunk, name: str) -> Float[np.ndarray, " N"]:
     """Pelvis-relative MPJPE (mm) of each frame; NaN where a joint is missing."""
-    errors, counted = joint_errors(
-        chunk.estimates[name], chunk.truth, chunk.truth_valid, "relative"
-    )
+    errors, counted = joint_errors(chunk.estimates[name], chunk.truth, "relative")
     return torch.where(counted.all(-1), errors.mean(-1), torch.nan).numpy()
 
 

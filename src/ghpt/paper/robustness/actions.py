@@ -12,11 +12,9 @@ import torch
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
-from ghpt.models.aggregation import aggregation_weights
-from ghpt.models.checkpoint import load_model
+from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
-from ghpt.paper.engine.actions import CHECKPOINT
-from ghpt.recording import Observations, PoseEstimate
+from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
 from ghpt.report.poses import estimators
 from ghpt.skeleton import JOINTS
 
@@ -40,42 +38,36 @@ def curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -
     data = build(config["data"], "data")
     data.setup("test")
     frames = data.frames["test"]
-    model, _ = load_model(dependencies["model"] / CHECKPOINT, seed=config["seed"])
+    model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
     everybody = together(model.eval(), estimators(config, model))
     perturbations = build(config["perturbations"], "perturbations")
     levels: list[dict[str, dict[str, MPJPE]]] = [{} for _ in perturbations]
     for first in range(0, len(frames), data.batch_size):
         batch = frames[range(first, min(first + data.batch_size, len(frames)))]
         for errors, perturbation in zip(levels, perturbations, strict=True):
-            found = everybody(
-                batch if perturbation is None else perturbation(batch, config["seed"])
-            )
+            observations = batch.observations
+            if perturbation is not None:
+                observations = perturbation(observations, config["seed"])
+            found = everybody(Labelled(observations, batch.truth))
             for name, estimate in found.items():
                 metrics = errors.setdefault(
                     name, {kind: MPJPE(kind, 1, len(JOINTS)) for kind in KINDS}
                 )
                 for metric in metrics.values():
-                    metric.update(
-                        estimate, batch.truth, batch.truth_valid, torch.zeros_like(batch.sample)
-                    )
+                    metric.update(estimate, batch.truth, torch.zeros_like(observations.index))
     content = [{name: _numbers(metrics) for name, metrics in errors.items()} for errors in levels]
     write_json(folder / "result.json", {"frames": len(frames), "levels": content})
 
 
 def together(
     model: StochasticEstimator, others: Mapping[str, Estimator]
-) -> Callable[[Observations], dict[str, PoseEstimate]]:
+) -> Callable[[Labelled[Observations, Truth]], dict[str, PoseEstimate]]:
     """The model's selections and the other estimators on a batch, by name."""
 
-    def estimate(batch: Observations) -> dict[str, PoseEstimate]:
-        keys = model.keys("test", batch)
-        pool = model.pool(batch, keys)
-        weights = {
-            n: aggregation_weights(n, pool.logits, pool.errors, model.temperature, keys)
-            for n in OF_POOL
-        }
-        of_pool = {name: model.problem.aggregate(pool.hypotheses, w) for name, w in weights.items()}
-        return of_pool | {name: estimator(batch) for name, estimator in others.items()}
+    def estimate(batch: Labelled[Observations, Truth]) -> dict[str, PoseEstimate]:
+        pool = model.sample(batch.observations, "test", batch.truth)
+        of_pool = {name: pool.estimate(name) for name in OF_POOL}
+        return of_pool | {name: estimator(batch.observations) for name, estimator in others.items()}
 
     return estimate
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ghpt.paper.engine.artefact import Results, Spread
-from ghpt.paper.engine.code import code_digest
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
 from ghpt.paper.robustness.actions import LEARNED
@@ -66,10 +65,7 @@ def measured(
         for key in ("data", "view_weights", "baselines", "seed", "files")
         if key in whole
     }
-    config |= {
-        "perturbations": list(perturbations),
-        "code of perturbations": code_digest(PERTURBATIONS),
-    }
+    config |= {"perturbations": list(perturbations)}
     dependencies = {
         "model": setup.trained(sizes["trained_on"]),
         "data": setup.prepared(data, "test"),

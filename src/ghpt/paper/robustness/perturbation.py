@@ -18,8 +18,8 @@ from ghpt.errors import check
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.models.estimators.classical import person_scale
+from ghpt.observations import Observations
 from ghpt.randomness import bits, key, uniform
-from ghpt.recording import Observations
 
 Perturbation = Callable[[Observations, int], Observations]
 
@@ -139,16 +139,14 @@ def _check_share(rate: float) -> None:
 
 
 def _keys(batch: Observations, seed: int, purpose: str) -> Int[Tensor, "B V"]:
-    device = batch.sample.device
+    device = batch.index.device
     camera = torch.arange(batch.valid.shape[1], device=device)
-    return key(
-        seed, purpose, *torch.broadcast_tensors(batch.sample[:, None], camera), device=device
-    )
+    return key(seed, purpose, *torch.broadcast_tensors(batch.index[:, None], camera), device=device)
 
 
 def _order(batch: Observations, seed: int, purpose: str) -> Int[Tensor, "B V"]:
     """A random order of each frame's views."""
-    keys = key(seed, purpose, batch.sample, device=batch.sample.device)
+    keys = key(seed, purpose, batch.index, device=batch.index.device)
     return bits(keys, (batch.valid.shape[1],)).argsort(dim=-1)
 
 
