@@ -29,7 +29,7 @@ from ghpt.data.people.views import Views, undistort_and_match
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras, CameraSet
-from ghpt.models.estimators.classical import Baseline
+from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.observations import Recording
 from ghpt.provenance import provenance
@@ -222,7 +222,7 @@ def from_files(config: Mapping[str, Any]) -> Case:
     )
 
 
-def in_unit(case: Case, estimator: Baseline) -> Case:
+def in_unit(case: Case, estimator: Estimator) -> Case:
     """With the file's own extrinsics in mm where the person tells their unit: they are compared
     with.
     """

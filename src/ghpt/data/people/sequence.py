@@ -14,7 +14,6 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghpt.data.points import KeyPoints
-from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.normal_equations import local_cameras
 from ghpt.observations import Observations
@@ -96,15 +95,6 @@ class Sequence:
         """Return at most so many rows, evenly spread."""
         count = min(most, len(self))
         return np.unique(np.linspace(0, len(self) - 1, count).astype(np.int64))
-
-    def check_calibrated(self) -> None:
-        """Raise GhptDataError unless there are two cameras or more, with extrinsics."""
-        names = self.cameras.names
-        if len(names) < 2:
-            problem = f"there is only {', '.join(names) or 'none'}"
-            hint = "A place in space takes two views or more of the same moment."
-            raise GhptDataError(self.source, "views", problem, hint)
-        self.cameras.cameras  # noqa: B018 raises where there are none
 
     @cached_property
     def origin(self) -> Float[Tensor, " 3"]:
