@@ -122,9 +122,9 @@ class Observations(Samples):
 class Truth(Batch):
     """The true poses of B frames."""
 
-    points: Float[Tensor, "B J 3"]
+    points: Float[Tensor, "*B J 3"]
     """World frame, mm."""
-    valid: Bool[Tensor, "B J"]
+    valid: Bool[Tensor, "*B J"]
 
 
 @dataclass(frozen=True)
