@@ -9,9 +9,9 @@ from pathlib import Path
 import hydra
 import numpy as np
 import torch
+from ghpt.commands.prediction.frames import Frames, Seen
 from torch import Tensor
 
-from ghpt.commands.prediction.frames import Frames, Seen
 from ghpt.config import plain
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.synthetic.recordings import motion

@@ -9,13 +9,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import yaml
+from ghpt.data.people.people import Detections, KeyPoints, as_people
+from ghpt.data.people.views import undistort_and_match, who
 
 from ghpt.data.formats.key_points import read_people
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.people.association import associate
-from ghpt.data.people.people import Detections, KeyPoints, as_people
 from ghpt.data.people.tracks import tracks
-from ghpt.data.people.views import undistort_and_match, who
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import motion
 from ghpt.data.synthetic.rigs import human36m_rig

@@ -12,9 +12,9 @@ from unittest.mock import MagicMock
 import numpy as np
 import pytest
 import torch
+from ghpt.commands.prediction.frames import Frames
 
 from ghpt.commands.predict import predict
-from ghpt.commands.prediction.frames import Frames
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.data.formats.stored_npz import add_member

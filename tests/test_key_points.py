@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from ghpt.commands.prediction.stored import open_stored
+from ghpt.data.people.views import matched, normal, undistort_and_match
 
 from damage import damage
-from ghpt.commands.prediction.stored import open_stored
 from ghpt.data.formats.key_points import KeyPoints, read_key_points, read_people, write_key_points
 from ghpt.data.formats.skeletons import SKELETONS
-from ghpt.data.people.views import matched, normal, undistort_and_match
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet, project
 from ghpt.geometry.lens import distort

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+from ghpt.commands.prediction.frames import Frames
 
 import ghpt
 import ghpt.commands.test as testing
@@ -17,7 +18,6 @@ from ghpt import provenance as origin
 from ghpt.commands import predict as prediction
 from ghpt.commands.app import Command
 from ghpt.commands.outputs import Files
-from ghpt.commands.prediction.frames import Frames
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.commands.train import train
 from ghpt.models.estimators.classical import Linear

@@ -13,6 +13,7 @@ import hydra
 import numpy as np
 import pytest
 import torch
+from ghpt.data.people.views import undistort_and_match
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from ghpt.calibration.check.units import unit_for, unit_of
@@ -24,7 +25,6 @@ from ghpt.config import build, plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_pose2sim
 from ghpt.data.formats.key_points import KeyPoints, write_key_points
-from ghpt.data.people.views import undistort_and_match
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import read_reconstruction

@@ -20,9 +20,9 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 
+from ghpt.commands.prediction.stored import open_stored
 from hostile import forked
 
-from ghpt.commands.prediction.stored import open_stored
 from ghpt.data.datasets.labels import read_labels
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_people

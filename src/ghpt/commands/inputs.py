@@ -66,9 +66,7 @@ def own_cameras(inputs: InputSettings, example: str) -> CameraSet:
 
 def own_people(inputs: InputSettings) -> Detections:
     """Return everybody in the user's key points."""
-    return read_key_points(
-        _required_path(inputs), inputs.skeleton, inputs.rate_hz, inputs.format
-    )
+    return read_key_points(_required_path(inputs), inputs.skeleton, inputs.rate_hz, inputs.format)
 
 
 def own_sequence(

@@ -16,9 +16,7 @@ _HEIGHT = 1750
 """mm: stands for the person's own."""
 
 
-def commands_on(
-    inputs: InputSettings, person: int, ckpt: str | None, output: Path
-) -> Commands:
+def commands_on(inputs: InputSettings, person: int, ckpt: str | None, output: Path) -> Commands:
     """Return the commands for what predict.py was given; each writes beside ``output``."""
     keys = [key for key in InputSettings.__annotations__ if key != "data"]
     values = {key: getattr(inputs, key) for key in keys}

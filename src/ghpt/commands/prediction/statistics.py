@@ -245,9 +245,7 @@ def _scaled_errors(
         error = own.error
         measured = own.valid & (scale > 0)
     relative = error / scale.clamp(min=1e-12)
-    views = {
-        name: _median(relative[:, view][measured[:, view]]) for view, name in enumerate(names)
-    }
+    views = {name: _median(relative[:, view][measured[:, view]]) for view, name in enumerate(names)}
     return ScaledErrors(_median(relative[measured]) if enough else None, views)
 
 
@@ -258,9 +256,7 @@ def _median(values: Float[Tensor, " N"]) -> float | None:
 def _errors_by_view(
     error: Float[Tensor, "T V J"], measured: Bool[Tensor, "T V J"], names: tuple[str, ...]
 ) -> ViewErrors:
-    views = {
-        name: quantiles(error[:, view][measured[:, view]]) for view, name in enumerate(names)
-    }
+    views = {name: quantiles(error[:, view][measured[:, view]]) for view, name in enumerate(names)}
     whole = quantiles(error[measured])
     return ViewErrors(whole.median, whole.p90, whole.count, views)
 

@@ -8,8 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from ghpt.data.formats.authors_npy import read_authors
 from ghpt.data.formats.coco import read_coco
 from ghpt.data.formats.mediapipe import is_caliscope, opening, read_caliscope

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from ghpt.data.formats.skeletons import joints_of, recognise
 from ghpt.data.points import KeyPoints

@@ -130,9 +130,7 @@ def _check_one_to_one(
                 raise _mismatch(where, views, cameras, f"{word} {name} has no {other}")
 
 
-def _mismatch(
-    where: str, views: Sequence[str], cameras: CameraSet, problem: str
-) -> GhptDataError:
+def _mismatch(where: str, views: Sequence[str], cameras: CameraSet, problem: str) -> GhptDataError:
     listed = ", ".join("/".join(names) for names in camera_labels(cameras))
     sides = f"views: {', '.join(views)}; cameras of {cameras.path}: {listed}"
     return GhptDataError(where, "views", f"{problem} ({sides})", _HINT)

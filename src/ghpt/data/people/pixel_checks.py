@@ -82,9 +82,7 @@ def _image_size(cameras: CameraSet) -> Float[np.ndarray, "V 2"]:
     return (2 * cameras.K[:, :2, 2] + 1).numpy()
 
 
-def _share_outside(
-    points: KeyPoints, size: Float[np.ndarray, "V 2"]
-) -> Float[np.ndarray, " V"]:
+def _share_outside(points: KeyPoints, size: Float[np.ndarray, "V 2"]) -> Float[np.ndarray, " V"]:
     """Return the share of each view's key points that lie beyond images of this size."""
     beyond = (points.pixels < -0.5) | (points.pixels > size[:, None] - 0.5)
     outside = points.valid & beyond.any(-1)

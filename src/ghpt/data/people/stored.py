@@ -186,7 +186,9 @@ def _rate(path: Path, members: Mapping[str, Member], rate_hz: float | None) -> f
 
 def _recognise(file: StoredFile, joints: int) -> str:
     points = file.read(file.spread())
-    return recognise(file.path, points.pixels.reshape(-1, joints, 2), points.valid.reshape(-1, joints))
+    return recognise(
+        file.path, points.pixels.reshape(-1, joints, 2), points.valid.reshape(-1, joints)
+    )
 
 
 def _check_views(file: StoredFile) -> None:
