@@ -9,7 +9,6 @@ import time
 from pathlib import Path
 
 import pytest
-from ghpt.commands.prediction.frames import Frames
 
 import ghpt
 import ghpt.commands.test as testing
@@ -20,10 +19,11 @@ from ghpt.commands.app import Command
 from ghpt.commands.outputs import Files
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.commands.train import train
+from ghpt.data.people.sequence import Sequence
 from ghpt.models.estimators.classical import Linear
 from ghpt.signals import stop as handler
 from ghpt.signals import stopped_by_signals
-from predicting import config, frames_of
+from predicting import config, sequence_of
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STATUS = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 143}
@@ -136,7 +136,7 @@ def test_pycolmap_is_imported_in_one_place():
 def predict(tmp_path, monkeypatch):
     """``predict(folder)`` predicts 500 frames in 5 shards into it."""
     monkeypatch.setattr(sys, "argv", ["predict.py"])
-    monkeypatch.setattr(prediction, "_from_data", lambda _: frames_of(500))
+    monkeypatch.setattr(prediction, "data_sequence", lambda _: sequence_of(500))
     settings = config("triangulation=linear", "shard_frames=100", "batch=50", "formats=[npz,csv]")
     monkeypatch.setattr(
         prediction,
@@ -152,7 +152,7 @@ def outputs(folder: Path) -> dict[str, bytes]:
 
 
 WHERE = {
-    "between the frames": (Frames, "batch", 4, 1),
+    "between the frames": (Sequence, "read", 4, 1),
     "before a shard is written": (Shards, "write", 3, 2),
     "while a format is written": (Shards, "read", 3, 5),
     "while another is written": (Shards, "read", 8, 5),

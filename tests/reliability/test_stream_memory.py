@@ -9,7 +9,7 @@ import ctypes, gc, sys
 sys.path.insert(0, {tests!r})
 import torch
 from pathlib import Path
-from predicting import config, frames_of
+from predicting import config, sequence_of
 from ghpt.commands import predict as command
 from ghpt.commands.prediction import run
 
@@ -26,7 +26,7 @@ def measured(self, shard, part):
     ctypes.CDLL(None).malloc_trim(0)
     seen.append(anonymous()["RssAnon"])
 run.Shards.write = measured
-command._from_data = lambda _: frames_of({frames})
+command.data_sequence = lambda _: sequence_of({frames})
 words = ("triangulation=linear", "shard_frames=2000", "batch=1000", "formats=[npz,csv]", "trainer.accelerator=cpu")
 command.predict(config(*words), Path({output!r}))
 third = len(seen) // 3
