@@ -13,7 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ghpt.config import plain
+from ghpt.commands.predict import PredictSettings, predict
+from ghpt.config import plain, settings
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.points import KeyPoints
