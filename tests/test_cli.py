@@ -80,11 +80,11 @@ def test_train_then_test_as_typed(command, tmp_path):
         "train.log",
     ]
     assert re.search(
-        r"Validation on synthetic \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
+        r"Validation on synthetic toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
         said,
     )
     assert said.replace("\n", "") in re.sub(
-        r".* INFO ghpt\.train: |\n", "", (output / "train.log").read_text()
+        r".* INFO ghpt\.commands\.train: |\n", "", (output / "train.log").read_text()
     )
     log = events(output)
     assert {"train/total", "train/entropy", "validation/weight", "final/weight"} <= set(
@@ -301,11 +301,12 @@ def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(
     tmp_path, uninterrupted, number, status
 ):
     script = ROOT / "tests" / "reliability" / "run_toy.py"
+    path = os.pathsep.join([str(ROOT / "src"), str(ROOT / "tests")])
     child = subprocess.Popen(
         [sys.executable, str(script), str(tmp_path), json.dumps(STOPPED)],
         text=True,
         stderr=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": str(ROOT / "tests"), "OMP_NUM_THREADS": "1"},
+        env=os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"},
     )
     last = tmp_path / "last.ckpt"
     while not last.exists():
@@ -409,7 +410,7 @@ def test_an_interrupt_while_the_data_are_prepared_leaves_nothing(tmp_path, monke
     def interrupted(self, split):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(toys.ToyData, "make", interrupted)
+    monkeypatch.setattr(toys.ToyData, "generate", interrupted)
     with restored(signal.SIGINT), pytest.raises(SystemExit) as stop:
         train(
             toys.TRAIN | {"data": toys.DATA | {"cache": str(tmp_path / "cache")}}, tmp_path / "run"

@@ -19,7 +19,7 @@ import ghpt.commands.test as testing
 from documented import PAGES, ROOT, Block, Command
 from ghpt.commands import calibrate, predict, train
 from ghpt.commands import cameras as doctor
-from ghpt.commands.overrides import check_overrides
+from ghpt.commands.overrides import Source, check_overrides
 from ghpt.data.synthetic import recordings as synthetic
 from ghpt.models import registry
 
@@ -220,7 +220,7 @@ def settings_of(command: Command, first: int = 2) -> list[str]:
 
 def composed(name: str, command: Command, first: int = 2) -> None:
     """A script whose words are settings of a configuration."""
-    check_overrides(ROOT / "conf", name, settings_of(command, first))
+    check_overrides(Source(ROOT / "conf", name), settings_of(command, first))
 
 
 SCRIPTS = {
@@ -297,7 +297,9 @@ def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, 
             block.language == "console"
         ):  # of a cluster or several processes; other tests run their like
             for command in documented.commands_of(block):
-                check_overrides(runner.conf, Path(command.script).stem, settings_of(command))
+                check_overrides(
+                    Source(runner.conf, Path(command.script).stem), settings_of(command)
+                )
     for command in documented.inline_commands(page):
         attempt(runner, command, page, models)
     assert Path.cwd() == tmp_path
@@ -327,4 +329,4 @@ REPRODUCE = [
 @pytest.mark.parametrize("command", REPRODUCE, ids=lambda command: command.where)
 def test_the_settings_of_reproduce_exist(command):
     words = settings_of(command)
-    assert len(check_overrides(ROOT / "conf", "reproduce", words)) == len(words)
+    assert len(check_overrides(Source(ROOT / "conf", "reproduce"), words)) == len(words)

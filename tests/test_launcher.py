@@ -19,7 +19,7 @@ import yaml
 
 import ghpt.commands.jobs
 import toys
-from ghpt.commands.overrides import check_overrides
+from ghpt.commands.overrides import Source, check_overrides
 from ghpt.commands.train import COMMAND
 from ghpt.models.checkpoint import read_checkpoint
 
@@ -218,9 +218,8 @@ def test_the_commands_of_the_page_about_clusters_are_understood():
     ]
     launchers = set()
     for _, script, *words in found:
-        overrides = check_overrides(
-            ROOT / "conf", script.removesuffix(".py"), [w for w in words if w != "-m"]
-        )
+        source = Source(ROOT / "conf", script.removesuffix(".py"))
+        overrides = check_overrides(source, [word for word in words if word != "-m"])
         launchers.add(ghpt.commands.jobs.chosen_launcher(overrides, compose_only=True))
     assert launchers == {"basic", "submitit_local", "submitit_slurm"}
 

@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from ghpt.commands import reproduce
-from ghpt.commands.reproduce import ARTEFACTS, chosen, spread
+from ghpt.commands.overrides import spread_seeds
+from ghpt.commands.reproduce import ARTEFACTS, chosen
 from ghpt.errors import GhptConfigError
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -40,7 +41,7 @@ def command(typed, tmp_path):
         flags = [word for word in words if word == "-m"]  # Hydra wants them first
         settings = [*SMALL, *(word for word in words if word not in flags)]
         folders = [f"output={tmp_path / 'report'}", f"tasks={tmp_path / 'tasks'}"]
-        return typed(CONF, reproduce.command(CONF), [*spread([*flags, *settings]), *folders])
+        return typed(CONF, reproduce.command(CONF), [*flags, *settings, *folders])
 
     return call
 
@@ -146,4 +147,4 @@ def test_every_table_and_figure_of_the_paper_is_an_item():
     ],
 )
 def test_a_sweep_spreads_its_seeds_over_jobs(typed_words, run):
-    assert spread(typed_words) == run
+    assert spread_seeds(typed_words) == run
