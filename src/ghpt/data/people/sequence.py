@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -34,6 +34,7 @@ Rows = Int[np.ndarray, " N"]
 """Positions of frames in a sequence, rising."""
 
 
+@runtime_checkable
 class KeyPointSource(Protocol):
     """Where a sequence's key points are: the 17 joints [N V J] of some of its frames."""
 
