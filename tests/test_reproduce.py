@@ -36,7 +36,7 @@ PAPER = (
 
 
 @pytest.fixture
-def command(typed, tmp_path):
+def command(typed, little_data, tmp_path):
     def call(*words):
         flags = [word for word in words if word == "-m"]  # Hydra wants them first
         settings = [*SMALL, *(word for word in words if word not in flags)]

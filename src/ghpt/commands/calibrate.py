@@ -16,6 +16,7 @@ from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.millimetres import in_millimetres, of_scale, read_scale
 from ghpt.calibration.rig import RigEstimate
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.inputs import (
     input_settings,
     own_cameras,
@@ -292,3 +293,7 @@ def _through(case: Case, views: list[int], cameras: Cameras) -> Recording:
 
 
 COMMAND = Command(name="calibrate", settings=dict, task=calibrate, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("calibrate")

@@ -24,6 +24,7 @@ from ghpt.calibration.check.setup import Setup, as_filed
 from ghpt.calibration.check.units import UNITS_MM
 from ghpt.commands.app import Command
 from ghpt.commands.calibrate import people_note
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.inputs import (
     find_recording,
     input_settings,
@@ -273,3 +274,7 @@ def _stature(numbers: dict[str, Any]) -> str:
 
 
 COMMAND = Command(name="cameras", settings=dict, task=examine, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("cameras")

@@ -31,6 +31,9 @@ _RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK
 """The variables by which launchers number a run's processes, as Lightning reads them."""
 _PATIENCE = 10.0
 """Seconds that interrupted jobs have to save their state."""
+_AT_MOST = 60.0
+"""Seconds in which the first of several processes comes to the error that another one has met, on a
+slow machine."""
 
 
 S = TypeVar("S")
@@ -236,7 +239,7 @@ def first_of_several_ends() -> bool:
     """
     if os.environ.get("LOCAL_RANK", "0") == "0":
         return False
-    end = time.monotonic() + _PATIENCE / 2
+    end = time.monotonic() + _AT_MOST
     while os.getppid() == _PARENT and time.monotonic() < end:
         time.sleep(0.05)
     return os.getppid() != _PARENT

@@ -15,6 +15,7 @@ import torch
 
 from ghpt.calibration.check.examination import Doctor
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
@@ -459,3 +460,7 @@ def _write_report(result: PredictionResult, output: Path) -> None:
 COMMAND = Command(
     name="predict", settings=PredictSettings, task=predict, summary=summary, files=files
 )
+
+
+if __name__ == "__main__":
+    run_by_name("predict")

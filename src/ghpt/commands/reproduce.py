@@ -15,6 +15,7 @@ from typing import Any, TypedDict
 import yaml
 
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.jobs import Job
 from ghpt.commands.outputs import Files
 from ghpt.commands.train import display_path
@@ -260,3 +261,7 @@ def command(conf: Path) -> Command:
     return Command(
         name="reproduce", settings=dict, task=task, summary=summary, files=files, after=after
     )
+
+
+if __name__ == "__main__":
+    run_by_name("reproduce")
