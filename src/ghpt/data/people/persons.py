@@ -158,16 +158,8 @@ def _across_views(
     indices = [np.flatnonzero(people.view == view) for view in at]
     index = np.concatenate(indices)
     camera = np.repeat(np.arange(len(at)), [len(each) for each in indices])
-    points = ideal[index]
-    found = associate(
-        cameras.cameras,
-        len(people.frame),
-        people.row[index],
-        camera,
-        points.pixels,
-        points.valid,
-        points.confidence,
-    )
+    rows = people.row[index]
+    found = associate(cameras.cameras, len(people.frame), rows, camera, ideal[index])
     persons = []
     for members in found:
         chosen = np.full((len(people.frame), len(people.views)), -1)
