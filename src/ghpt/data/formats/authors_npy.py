@@ -27,8 +27,8 @@ def read_authors(path: Path, skeleton: str | None) -> Detections:
     confidence. Raises GhptDataError.
     """
     folder = path if path.is_dir() else path.parent
-    pixels = []
-    there = []
+    pixels: list[np.ndarray] = []
+    there: list[np.ndarray] = []
     for predictions, boxes in _chunks(folder, path):
         crop = read_npy(predictions, (None, None, None, 2), "f")
         check_view_count(predictions, crop.shape[1])

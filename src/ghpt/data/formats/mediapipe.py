@@ -108,6 +108,11 @@ def _lines(handle: io.TextIOBase) -> Iterator[str]:
         yield line
 
 
+def _number(cell: str) -> float:
+    """Return a cell's number; an empty one is a point that was not found."""
+    return float(cell) if cell.strip() else np.nan
+
+
 def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
     line = handle.readline(_LONGEST_LINE)
     if ";" in line or "\t" in line:
@@ -116,12 +121,14 @@ def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
     try:
         header = [name.strip() for name in next(csv.reader([line]))]
         columns = [header.index(name) for name in COLUMNS]
-        # an empty cell is a point that was not found
-        empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a table without rows
             table = np.loadtxt(
-                _lines(handle), delimiter=",", usecols=columns, converters=empty, ndmin=2
+                _lines(handle),
+                delimiter=",",
+                usecols=columns,
+                converters=dict.fromkeys(columns, _number),
+                ndmin=2,
             )
     except (ValueError, StopIteration, csv.Error) as error:
         raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error

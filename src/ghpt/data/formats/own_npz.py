@@ -14,6 +14,7 @@ from jaxtyping import Int
 from ghpt.data.formats.skeletons import recognise
 from ghpt.data.formats.validate import (
     check_view_count,
+    finite_points,
     frame_rate,
     npy_header,
     open_input,
@@ -51,7 +52,8 @@ def write_key_points(
     with atomic_write(path) as handle:
         # zip's check sums guard the values but not the list of names, where damage may hide what
         # comes after it
-        np.savez_compressed(handle, members=np.array(sorted(arrays)), **arrays)
+        names = np.array(sorted(arrays))
+        np.savez_compressed(handle, allow_pickle=False, members=names, **arrays)
 
 
 def read_own(path: Path, skeleton: str | None) -> Detections:
@@ -86,7 +88,7 @@ def read_own(path: Path, skeleton: str | None) -> Detections:
     if skeleton is None and "skeleton" in there:
         skeleton = _texts(path, "skeleton")[0]
     joints = _texts(path, "joints") if skeleton is None and "joints" in there else ()
-    finite = np.isfinite(values).all(-1)
+    finite = finite_points(values)
     valid = finite & more.get("seen", finite)
     values = np.where(valid[..., None], values, 0)
     joints = joints or joints_for(

@@ -16,7 +16,7 @@ import zlib
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Literal
 
 import numpy as np
 import torch
@@ -194,9 +194,15 @@ def check_array(
     return array
 
 
+def finite_points(pixels: np.ndarray) -> np.ndarray:
+    """Return which points [..., 2] have two finite coordinates."""
+    return np.asarray(np.isfinite(pixels).all(-1))
+
+
 def read_npy(path: Path, shape: Shape, kinds: str) -> np.ndarray:
-    """A read-only memory map of an npy file that holds exactly an array of this form; else
-    GhptDataError.
+    """Return a read-only memory map of an npy file.
+
+    Raises GhptDataError unless it holds exactly an array of this form.
     """
     with open_input(path) as handle:
         found, order, dtype = npy_header(path, "", handle, path.stat().st_size)
@@ -204,11 +210,11 @@ def read_npy(path: Path, shape: Shape, kinds: str) -> np.ndarray:
     _check_form(path, "", found, dtype, shape, kinds)
     if math.prod(found) == 0:
         return np.empty(found, dtype)
-    return np.asarray(np.memmap(path, dtype, "r", offset, found, order))
+    return np.asarray(np.memmap(path, dtype, "r", offset, found, order=order))
 
 
 def read_npz(path: Path, fields: dict[str, tuple[Shape, str]]) -> dict[str, np.ndarray]:
-    """The named arrays of an npz file, of these shapes and kinds; else GhptDataError."""
+    """Return the named arrays of an npz file. Raises GhptDataError unless all have these forms."""
     arrays = {}
     try:
         with open_input(path) as handle, zipfile.ZipFile(handle) as archive:
@@ -313,9 +319,9 @@ def _check_form(
 
 
 def npy_header(
-    where: object, field: str, handle: io.BufferedIOBase, size: int, pickled: bool = False
-) -> tuple[tuple[int, ...], str, np.dtype]:
-    """Shape, order and dtype of the npy array in ``handle``, which then stands at its data.
+    where: object, field: str, handle: IO[bytes], size: int, pickled: bool = False
+) -> tuple[tuple[int, ...], Literal["C", "F"], np.dtype]:
+    """Return shape, order and dtype of the npy array in ``handle``, which then stands at its data.
 
     Raises GhptDataError unless what follows is as long as the header claims (``size`` counts from
     the start).

@@ -25,6 +25,7 @@ from ghpt.models.estimators.classical import Estimator, fall_back
 from ghpt.models.estimators.ransac import Ransac
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pool import Pool
+from ghpt.models.pose.problem import PoseHypotheses
 from ghpt.observations import Observations
 
 
@@ -69,10 +70,16 @@ class ViewWeights(Estimator):
         agreed = replace(batch, valid=views)
         pool = self.model.sample(agreed, "view weights")
         weights = pool.weights().double()
-        subsets = pool.hypotheses.views.double()
-        probability = torch.einsum("bh,bhjv->bvj", weights, subsets)
+        probability = torch.einsum("bh,bhjv->bvj", weights, _subsets(pool).double())
         threshold = self.consensus.inlier_threshold(batch, robust.points)
         trust = (self.consensus.threshold / threshold[:, None, None]).sqrt()
         view_weights = probability ** (self.power * trust)
         result = triangulate(batch.cameras, batch.key_points, views * view_weights)
         return WeightedViews(fall_back(result, robust), views, pool)
+
+
+def _subsets(pool: Pool) -> Bool[Tensor, "B H J V"]:
+    """Return the views that each hypothesis of a joint is made of."""
+    if not isinstance(pool.hypotheses, PoseHypotheses):
+        raise TypeError("view weights are made of poses, not of other hypotheses")
+    return pool.hypotheses.views
