@@ -7,6 +7,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -39,7 +40,8 @@ def write_key_points(
     rate_hz: float | None = None,
 ) -> None:
     """Write one person's key points [T V K] as the npz file that ``read_key_points`` reads."""
-    arrays = {
+    # Any: numpy's types take any of the names for its option allow_pickle
+    arrays: dict[str, Any] = {
         "key_points": points.pixels,
         "views": np.array(views, dtype=np.str_),
         "joints": np.array(joints, dtype=np.str_),
@@ -52,8 +54,7 @@ def write_key_points(
     with atomic_write(path) as handle:
         # zip's check sums guard the values but not the list of names, where damage may hide what
         # comes after it
-        names = np.array(sorted(arrays))
-        np.savez_compressed(handle, allow_pickle=False, members=names, **arrays)
+        np.savez_compressed(handle, members=np.array(sorted(arrays)), **arrays)
 
 
 def read_own(path: Path, skeleton: str | None) -> Detections:
