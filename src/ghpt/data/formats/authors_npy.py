@@ -13,18 +13,21 @@ from ghpt.data.people.detections import Detections, joints_for
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
-_LAYOUT = "A folder must hold all_2d_preds.npy and all_bboxes.npy, or all_2d_preds<n>.npy and all_bboxes<n>.npy."
+_LAYOUT = (
+    "A folder must hold all_2d_preds.npy and all_bboxes.npy, "
+    "or all_2d_preds<n>.npy and all_bboxes<n>.npy."
+)
 
 
 def read_authors(path: Path, skeleton: str | None) -> Detections:
-    """The one person of a folder of predictions [T, V, 17, 2] in pixels of the 384-high crop, or of
-    its first file.
+    """Return the one person of a folder of predictions, or of one of its files.
 
-    Chunks 0, 1, ... follow one another. Back into the image by all_bboxes.npy [T, V, 2, 2] (two
-    corners), which must be there; a box without height is a view in which nobody is. Optional:
-    all_frames.npy [T], frame numbers; all_cameras.json, a list of the views' names (else ``cam_0``,
-    ``cam_1``, ...). Joints are the project's 17 unless ``skeleton`` says another; there is no
-    confidence. Raises GhptDataError.
+    The predictions [T, V, 17, 2] are in pixels of the 384-high crop; chunks 0, 1, ... follow one
+    another. They come back into the image by all_bboxes.npy [T, V, 2, 2] (two corners), which must
+    be there; a box without height is a view in which nobody is. Optional: all_frames.npy [T], frame
+    numbers; all_cameras.json, a list of the views' names (else ``cam_0``, ``cam_1``, ...). Joints
+    are the project's 17 unless ``skeleton`` says another; there is no confidence. Raises
+    GhptDataError.
     """
     folder = path if path.is_dir() else path.parent
     pixels: list[np.ndarray] = []

@@ -51,8 +51,9 @@ def is_caliscope(text: str) -> bool:
 def read_caliscope(path: Path) -> Detections:
     """Return the one person of the table: 33 landmarks in the views ``cam_<port>``.
 
-    The frame numbers are ``sync_index``. Points beyond the body's (hands, face) are left out. There is no confidence in these files.
-    Raises GhptDataError for a table that is damaged, or that has a point twice.
+    The frame numbers are ``sync_index``. Points beyond the body's (hands, face) are left out. There
+    is no confidence in these files. Raises GhptDataError for a table that is damaged, or that has a
+    point twice.
     """
     table = _table(path)
     body = (table[:, 2] >= 0) & (table[:, 2] < _JOINTS)
@@ -116,7 +117,10 @@ def _number(cell: str) -> float:
 def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
     line = handle.readline(_LONGEST_LINE)
     if ";" in line or "\t" in line:
-        hint = "Save it with commas between the columns and points in the numbers (a spreadsheet may have changed it)."
+        hint = (
+            "Save it with commas between the columns and points in the numbers "
+            "(a spreadsheet may have changed it)."
+        )
         raise GhptDataError(path, "", "has columns that commas do not part", hint)
     try:
         header = [name.strip() for name in next(csv.reader([line]))]

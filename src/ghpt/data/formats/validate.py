@@ -1,5 +1,5 @@
-"""Checks of users' cameras, arrays and files; each error names the file, the field, the problem and
-the mend.
+"""Checks of users' cameras, arrays and files; each error names the file, the field, the problem
+and the hint.
 
 No reader here allocates what a file only claims to hold: sizes are compared with the file's own
 first.
@@ -93,7 +93,10 @@ def _rotation(where: object, name: str, R: np.ndarray) -> np.ndarray:
     det = np.linalg.det(R)
     if error > 1e-3 or det < 0:
         problem = f"R is not a rotation (|R R^T - I| = {error:.3g}, det = {det:.3g})"
-        hint = "R must be the 3x3 world-to-camera rotation: without scale, not mirrored, not a Rodrigues vector."
+        hint = (
+            "R must be the 3x3 world-to-camera rotation: "
+            "without scale, not mirrored, not a Rodrigues vector."
+        )
         raise GhptDataError(where, f"camera {name}, R", problem, hint)
     if error < 1e-9:
         return R
@@ -148,14 +151,14 @@ def frame_rate(where: object, value: float | int) -> float | None:
 
 
 def read_flag(where: object, field: str, value: object) -> bool:
-    """A file's true or false, which may be written 1 or 0. Raises GhptDataError for anything else."""
+    """Return a file's true or false, which may be written 1 or 0. Raises GhptDataError."""
     if type(value) is bool or (type(value) is int and value in (0, 1)):
         return bool(value)
     raise GhptDataError(where, field, f"is {value!r}, not true or false", "Write true or false.")
 
 
 def read_name(where: object, field: str, value: object) -> str:
-    """A file's name of a camera, which may be a number. Raises GhptDataError for anything else."""
+    """Return a file's name of a camera, which may be a number. Raises GhptDataError."""
     if type(value) is int or (isinstance(value, str) and value.strip()):
         return str(value)
     raise GhptDataError(where, field, f"is {value!r}, not a name", "Give each camera a name.")
@@ -178,7 +181,7 @@ def numbers_in(value: object) -> np.ndarray | None:
 
 
 def _all_numbers(value: object, depth: int = 3) -> bool:
-    """Whether all that is in lists, at most so ``depth`` of them within one another, is a number."""
+    """Return whether all that is in lists, of at most this depth, is a number."""
     if isinstance(value, list | tuple):
         return depth > 0 and all(_all_numbers(item, depth - 1) for item in value)
     return type(value) in (int, float)
@@ -282,7 +285,7 @@ def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
 
 
 def open_input(path: Path) -> io.BufferedReader:
-    """Open a user's file for reading. Raises GhptDataError if there is none, or it cannot be read."""
+    """Open a user's file for reading. Raises GhptDataError if that cannot be done."""
     try:
         return open(path, "rb")
     except FileNotFoundError as error:

@@ -1,10 +1,11 @@
 """Learned view weights: the scorer says how much each view's key point is worth.
 
-One triangulation uses them. The average of 3D hypotheses, the paper's estimate, is made of triangulations from few views and is
-hardly better than they are. Their weights say more: views that are in likely poses are good views.
-So the weight of a view, for a joint, is the probability that a hypothesis drawn by its weight has
-that view in its subset, and the joint is triangulated once from all views under these weights. The
-scorer still sees 3D poses alone, and is the one that the paper's loss trained.
+One triangulation uses them. The average of 3D hypotheses, the paper's estimate, is made of
+triangulations from few views and is hardly better than they are. Their weights say more: views that
+are in likely poses are good views. So the weight of a view, for a joint, is the probability that a
+hypothesis drawn by its weight has that view in its subset, and the joint is triangulated once from
+all views under these weights. The scorer still sees 3D poses alone, and is the one that the paper's
+loss trained.
 
 The pool is drawn from views that agree. A scorer trained on a good detector has never seen what a
 far outlier does to a pose; a robust estimator finds those without any knowledge of poses, so each
