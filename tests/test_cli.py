@@ -20,10 +20,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import children
 import ghpt.commands.test as testing
 import toys
-from ghpt.commands.train import COMMAND, shell_override, train
+from ghpt.commands.display import shell_override
+from ghpt.commands.train import COMMAND
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
+from toys import train
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = (

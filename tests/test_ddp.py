@@ -18,11 +18,10 @@ import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import children
-import ghpt.commands.test as testing
 import toys
-from ghpt.commands.train import train
 from ghpt.config import plain
 from ghpt.models.checkpoint import read_checkpoint
+from toys import train
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = ("data=toy", "progress_bar=false", "trainer.accelerator=cpu")
@@ -143,7 +142,7 @@ def test_testing_on_two_processes(composed, typed_for_two, tmp_path, capsys):
     train(composed("train", *MODELS["pose"]), checkpoint.parent)
     one, two = tmp_path / "one", tmp_path / "two"
     child = typed_for_two("test", f"ckpt={checkpoint}", f"output={two}")
-    testing.test(composed("test", f"ckpt={checkpoint}"), one)
+    toys.run_test(composed("test", f"ckpt={checkpoint}"), one)
     out, errors = child.communicate(timeout=children.LIMIT)
     assert child.returncode == 0, errors
     assert out == capsys.readouterr().out

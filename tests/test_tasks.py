@@ -2,7 +2,6 @@
 happens.
 """
 
-import multiprocessing
 import os
 import signal
 import time
@@ -58,10 +57,7 @@ def test_only_what_changed_is_done_again(diary, tmp_path):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_names_the_task_and_keeps_what_is_finished(diary, tmp_path, monkeypatch, jobs):
-    if hasattr(os, "fork"):  # the test above has the pool start its processes as it does
-        monkeypatch.setattr(multiprocessing, "get_context", multiprocessing.get_context)
-        fork_the_pool()
+def test_an_error_names_the_task_and_keeps_what_is_finished(diary, tmp_path, jobs):
     good = task(diary, 1)
     bad = task(diary, -1, good)  # after it: an error ends at once what is made beside it
     with pytest.raises(
@@ -85,18 +81,11 @@ def test_the_key_knows_config_needs_and_code(diary, monkeypatch):
 PROGRAM = """
 import sys
 from pathlib import Path
-import test_tasks
+from test_tasks import slow
 from ghpt.paper.engine.pool import perform_all
 if __name__ == "__main__":
-    test_tasks.fork_the_pool()
-    perform_all(test_tasks.slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
+    perform_all(slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
 """
-
-
-def fork_the_pool():
-    """Have the pool's processes be forks of this one, which import nothing anew."""
-    fork = multiprocessing.get_context("fork")
-    multiprocessing.get_context = lambda method: fork
 
 
 def slow(diary):

@@ -49,11 +49,11 @@ def child(folder: str, steps: int) -> None:
                 )
 
     memory.keep_no_freed_memory()
-    training.progress = lambda config: [Probe()]
+    training.progress = lambda shown: [Probe()]
     data = toys.DATA | {"batch_size": 1, "workers": 1}
     model = toys.MODEL | {"hypotheses": 4, "scorer": toys.MODEL["scorer"] | {"layers": [4]}}
     trainer = toys.TRAINER | {"max_epochs": 10_000_000, "check_val_every_n_epoch": 50}
-    training.train(toys.TRAIN | {"data": data, "model": model, "trainer": trainer}, Path(folder))
+    toys.train(toys.TRAIN | {"data": data, "model": model, "trainer": trainer}, Path(folder))
 
 
 def gone(pid: int) -> bool:

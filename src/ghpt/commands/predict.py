@@ -16,6 +16,7 @@ import torch
 from ghpt.calibration.check.examination import Doctor
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
@@ -29,7 +30,7 @@ from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
 from ghpt.commands.prediction.gaps import Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
-from ghpt.commands.prediction.report import prediction_report, print_prediction, print_verdict
+from ghpt.commands.prediction.report import print_prediction, print_verdict, report_document
 from ghpt.commands.prediction.run import RunSettings, predict_shards
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.prediction.statistics import (
@@ -42,20 +43,20 @@ from ghpt.commands.prediction.statistics import (
     pose_estimate,
 )
 from ghpt.commands.prediction.verdict import Judge, Level, Verdict
-from ghpt.commands.train import display_path
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Chunks, Evidence, Scene
 from ghpt.export.scene import origin_note
-from ghpt.files import atomic_write, sweep_temporaries, write_json
+from ghpt.files import sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.predictors import Classical, Learned
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About
+from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NAMES
 from ghpt.skeleton import JOINTS
 
@@ -449,8 +450,7 @@ def _write_report(result: PredictionResult, output: Path) -> None:
     """Write prediction.json and report.md, and print the tables and the verdict."""
     values = result.plain()
     write_json(output / "prediction.json", values)
-    with atomic_write(output / "report.md", "w") as handle:
-        handle.write(prediction_report(values))
+    write_markdown(output / "report.md", report_document(values))
     print_prediction(values)
     written = ", ".join(WRITERS[name].file for name in result.formats)
     _log.info("Written: %s and report.md in %s.", written, display_path(output))

@@ -1,6 +1,7 @@
 """The figure of the camera problem: a rig with its true and its estimated cameras."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -8,6 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.typing import LineStyleType
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
@@ -16,20 +18,45 @@ from ghpt.observations import RelativePoseEstimate
 from ghpt.report.figures import TRUTH, wrapped
 from ghpt.report.pair_tables import NAMES
 
+
+@dataclass(frozen=True)
+class Style:
+    """How the cameras of an estimator are drawn."""
+
+    colour: str
+    dashes: LineStyleType
+    marker: str
+
+
 # Okabe and Ito's palette again; told apart in grey print by markers and dashes.
 METHOD_STYLES = {
-    "weight": ("#0072B2", "-", "o"),
-    "average": ("#56B4E9", (0, (4, 1)), "v"),
-    "eight_point": ("#D55E00", "--", "s"),
-    "ransac": ("#E69F00", "-.", "D"),
-    "usac_magsac": ("#009E73", (0, (1, 1)), "^"),
-    "usac_accurate": ("#999999", (0, (5, 1, 1, 1)), "<"),
-    "poselib": ("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"),
-    "rig": ("#000000", (0, (6, 2)), "X"),
+    "weight": Style("#0072B2", "-", "o"),
+    "average": Style("#56B4E9", (0, (4, 1)), "v"),
+    "eight_point": Style("#D55E00", "--", "s"),
+    "ransac": Style("#E69F00", "-.", "D"),
+    "usac_magsac": Style("#009E73", (0, (1, 1)), "^"),
+    "usac_accurate": Style("#999999", (0, (5, 1, 1, 1)), "<"),
+    "poselib": Style("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"),
+    "rig": Style("#000000", (0, (6, 2)), "X"),
 }
-OTHER_STYLE = ("#F0E442", ":", "*")
+OTHER_STYLE = Style("#F0E442", ":", "*")
+_TRUE_STYLE = Style(TRUTH, "-", "")
 _MANY_CAMERAS = 8
 """With more cameras than these only the estimates from the first camera are drawn."""
+
+
+@dataclass(frozen=True)
+class _Offsets:
+    """Where the target cameras of an estimator are; world, mm."""
+
+    targets: Cameras
+    """The estimated target cameras, of the pairs that were estimated."""
+    true: Float[np.ndarray, "N 3"]
+    """The true centres of these."""
+    difference: Float[np.ndarray, "N 3"]
+    """Estimated minus true centres."""
+    summary: str
+    """How far the centres are off, in words."""
 
 
 def rig_figure(
@@ -40,77 +67,84 @@ def rig_figure(
     estimates: Mapping[str, RelativePoseEstimate],
     heading: str,
 ) -> Figure:
-    """A rig from above and from the side: its true cameras, and over them the target camera of
-    every pair, put after the pair's true reference camera as each of ``estimates`` (N poses, mm)
-    has it; points X* as dots.
+    """Return a figure of a rig from above and from the side.
+
+    It shows the true cameras, and over them the target camera of every pair, put after the pair's
+    true reference camera as each of ``estimates`` (N poses, mm) has it; the points X* are dots.
     """
     if len(names) > _MANY_CAMERAS:
         first = pair[:, 0] == pair[:, 0].min()
         pair = pair[first]
-        estimates = {
-            k: RelativePoseEstimate(e.R[first], e.t[first], e.estimated[first])
-            for k, e in estimates.items()
-        }
+        estimates = {name: estimate.rows(first) for name, estimate in estimates.items()}
     right, forward, up = _axes_of(cameras)
     centre = cameras.centre.numpy()
     extent = float(np.linalg.norm(np.ptp(centre, axis=0)))
     size = 0.09 * extent * min(1.0, (_MANY_CAMERAS / len(names)) ** 0.5)
-    off = {name: _off(cameras, pair, estimate) for name, estimate in estimates.items()}
-    times = _enlargement(np.concatenate([d for _, d in off.values()]), extent)
+    offsets = {name: _offsets(cameras, pair, estimate) for name, estimate in estimates.items()}
+    times = _enlargement(np.concatenate([each.difference for each in offsets.values()]), extent)
     figure = Figure(figsize=(10, 5.6), layout="constrained")
     panels = figure.subplots(1, 2)
     views = (np.stack((right, forward)), np.stack((right, up)))
     for axes, view, caption in zip(panels, views, ("from above", "from the side"), strict=True):
-        axes.plot(*(points.numpy() @ view.T / 1000).T, ".", color="#DDDDDD", markersize=2, zorder=0)
-        _draw(axes, cameras, size, view, TRUTH, "-", 4.5, 1)
-        for name, estimate in estimates.items():
-            colour, style, marker = METHOD_STYLES.get(name, OTHER_STYLE)
-            _draw(axes, _targets(cameras, pair, estimate), size, view, colour, style, 0.9, 2)
-            start, difference = (x @ view.T / 1000 for x in off[name])
-            stalks = np.stack((start, start + times * difference), axis=1)
-            axes.add_collection(LineCollection(stalks, colors=colour, linewidths=1.6, zorder=3))
-            axes.plot(*stalks[:, 1].T, marker, color=colour, markersize=5, zorder=4)
-        _limits(
-            axes,
-            (cameras.centre.numpy() @ view.T) / 1000,
-            points.numpy() @ view.T / 1000,
-            size / 1000,
-        )
+        _draw_panel(axes, view, cameras, points.numpy(), offsets, times, size)
         axes.set_title(caption, fontsize=10)
     if len(names) <= _MANY_CAMERAS:
-        _name(
-            panels[0],
-            names,
-            centre @ views[0].T / 1000,
-            centre.mean(0) @ views[0].T / 1000,
-            size / 1000,
-        )
+        from_above = centre @ views[0].T / 1000
+        _write_names(panels[0], names, from_above, size / 1000)
     handles = [Line2D([], [], color=TRUTH, linewidth=4.5, label="true cameras")]
-    for name, estimate in estimates.items():
-        colour, style, marker = METHOD_STYLES.get(name, OTHER_STYLE)
-        label = (
-            f"{NAMES.get(name, name)}: {_said(estimate, off[name][1])}; stalks: {times} times that"
-        )
-        handles.append(
-            Line2D(
-                [],
-                [],
-                color=colour,
-                linestyle=style,
-                linewidth=1.2,
-                marker=marker,
-                markersize=5,
-                label=label,
-            )
-        )
+    for name, each in offsets.items():
+        label = f"{NAMES.get(name, name)}: {each.summary}; stalks: {times} times that"
+        handles.append(_handle(METHOD_STYLES.get(name, OTHER_STYLE), label))
     figure.legend(handles=handles, loc="outside lower center", ncols=1, frameon=False, fontsize=9)
     figure.suptitle(wrapped(heading, 110), fontsize=10)
     return figure
 
 
+def _draw_panel(
+    axes: Axes,
+    view: Float[np.ndarray, "2 3"],
+    cameras: Cameras,
+    points: Float[np.ndarray, "P 3"],
+    offsets: Mapping[str, _Offsets],
+    times: int,
+    size: float,
+) -> None:
+    """Draw the points, the true cameras and the estimated ones, seen along one direction."""
+    dots = points @ view.T / 1000
+    axes.plot(dots[:, 0], dots[:, 1], ".", color="#DDDDDD", markersize=2, zorder=0)
+    _draw(axes, cameras, size, view, _TRUE_STYLE, width=4.5, order=1)
+    for name, each in offsets.items():
+        style = METHOD_STYLES.get(name, OTHER_STYLE)
+        _draw(axes, each.targets, size, view, style, width=0.9, order=2)
+        start = each.true @ view.T / 1000
+        end = start + times * (each.difference @ view.T / 1000)
+        stalks = np.stack((start, end), axis=1)
+        lines = LineCollection(list(stalks), colors=style.colour, linewidths=1.6, zorder=3)
+        axes.add_collection(lines)
+        x, y = end.T
+        axes.plot(x, y, style.marker, color=style.colour, markersize=5, zorder=4)
+    centres = cameras.centre.numpy() @ view.T / 1000
+    _set_limits(axes, np.concatenate((centres, dots)), size / 1000)
+
+
+def _handle(style: Style, label: str) -> Line2D:
+    """Return the entry of an estimator in the legend."""
+    return Line2D(
+        [],
+        [],
+        color=style.colour,
+        linestyle=style.dashes,
+        linewidth=1.2,
+        marker=style.marker,
+        markersize=5,
+        label=label,
+    )
+
+
 def _axes_of(cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right, forward and up in the world, unit vectors: up is what the images have above on
-    average, right is the first camera's.
+    """Return right, forward and up in the world, unit vectors.
+
+    Up is what the images have above on average, right is the first camera's.
     """
     up = -cameras.R[:, 1].mean(dim=0).numpy()
     x = cameras.R[0, 0].numpy()
@@ -125,43 +159,59 @@ def _axes_of(cameras: Cameras) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _targets(cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseEstimate) -> Cameras:
-    """The estimated target cameras, of the pairs that were estimated."""
-    pair, R, t = (x[estimate.estimated] for x in (pair, estimate.R, estimate.t))
-    return Cameras(cameras.K[pair[:, 1]], *camera_after(cameras.index(pair[:, 0]), R, t))
+    """Return the estimated target cameras, of the pairs that were estimated."""
+    found = estimate.estimated
+    reference = cameras.index(pair[found, 0])
+    R, t = camera_after(reference, estimate.R[found], estimate.t[found])
+    return Cameras(cameras.K[pair[found, 1]], R, t)
+
+
+def _offsets(
+    cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseEstimate
+) -> _Offsets:
+    targets = _targets(cameras, pair, estimate)
+    true = cameras.centre[pair[estimate.estimated][:, 1]]
+    difference = (targets.centre - true).numpy()
+    return _Offsets(targets, true.numpy(), difference, _summarize(estimate, difference))
 
 
 def _draw(
     axes: Axes,
     cameras: Cameras,
     size: float,
-    view: np.ndarray,
-    colour: str,
-    style: object,
+    view: Float[np.ndarray, "2 3"],
+    style: Style,
     width: float,
     order: int,
 ) -> None:
-    """Each camera as a pyramid ``size`` (mm) deep, as wide as its image if the principal point is
-    the middle.
+    """Draw each camera as a pyramid ``size`` (mm) deep.
+
+    It is as wide as the camera's image if the principal point is the middle.
     """
     K = cameras.K.numpy()
-    corner = np.stack((K[:, 0, 2] / K[:, 0, 0], K[:, 1, 2] / K[:, 1, 1], np.ones(len(K))), axis=-1)
+    x = K[:, 0, 2] / K[:, 0, 0]
+    y = K[:, 1, 2] / K[:, 1, 1]
+    corner = np.stack((x, y, np.ones(len(K))), axis=-1)
     signs = np.array([[-1, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]])
-    corners = size * corner[:, None] * signs @ cameras.R.numpy() + cameras.centre.numpy()[:, None]
-    apex = np.broadcast_to(cameras.centre.numpy()[:, None], corners.shape)
+    apex = cameras.centre.numpy()[:, None]
+    corners = size * corner[:, None] * signs @ cameras.R.numpy() + apex
     edges = np.stack((corners, np.roll(corners, -1, axis=1)), axis=2)
-    sides = np.stack((apex, corners), axis=2)
+    sides = np.stack((np.broadcast_to(apex, corners.shape), corners), axis=2)
     segments = np.concatenate((edges, sides), axis=1).reshape(-1, 2, 3) @ view.T / 1000
     collection = LineCollection(
-        segments, colors=colour, linestyles=[style], linewidths=width, zorder=order
+        list(segments),
+        colors=style.colour,
+        linestyles=[style.dashes],
+        linewidths=width,
+        zorder=order,
     )
     axes.add_collection(collection)
 
 
-def _limits(axes: Axes, centres: np.ndarray, points: np.ndarray, size: float) -> None:
-    """About the true rig: an estimate that is far out is left out of the figure."""
-    everything = np.concatenate((centres, points))
-    low = everything.min(0) - 2 * size
-    high = everything.max(0) + 2 * size
+def _set_limits(axes: Axes, places: Float[np.ndarray, "N 2"], size: float) -> None:
+    """Set the limits about the true rig: an estimate that is far out is not in the figure."""
+    low = places.min(0) - 2 * size
+    high = places.max(0) + 2 * size
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xlabel="m")
     axes.tick_params(labelsize=8)
     axes.grid(color="#EEEEEE", linewidth=0.6)
@@ -169,38 +219,26 @@ def _limits(axes: Axes, centres: np.ndarray, points: np.ndarray, size: float) ->
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _name(
-    axes: Axes, names: Sequence[str], places: np.ndarray, middle: np.ndarray, size: float
+def _write_names(
+    axes: Axes, names: Sequence[str], places: Float[np.ndarray, "V 2"], size: float
 ) -> None:
+    """Write the cameras' numbers and names, away from the middle of the rig."""
+    middle = places.mean(0)
     for number, (name, place) in enumerate(zip(names, places, strict=True), start=1):
         away = place - middle
-        away = away / max(np.linalg.norm(away), 1e-9)
-        axes.text(
-            *(place + 0.8 * size * away), f"{number}: {name}", ha="center", va="center", fontsize=8
-        )
-
-
-def _off(
-    cameras: Cameras, pair: Int[Tensor, "N 2"], estimate: RelativePoseEstimate
-) -> tuple[np.ndarray, np.ndarray]:
-    """True centres of the target cameras that were estimated, and what the estimated ones differ
-    by; world, mm.
-    """
-    true = cameras.centre[pair[estimate.estimated][:, 1]]
-    return true.numpy(), (_targets(cameras, pair, estimate).centre - true).numpy()
+        x, y = place + 0.8 * size * away / max(np.linalg.norm(away), 1e-9)
+        axes.text(x, y, f"{number}: {name}", ha="center", va="center", fontsize=8)
 
 
 def _enlargement(differences: Float[np.ndarray, "N 3"], extent: float) -> int:
-    """A round number of times by which the differences are seen in a figure of the rig."""
+    """Return a round number of times by which the differences are seen in a figure of the rig."""
     largest = float(np.linalg.norm(differences, axis=-1).max(initial=0))
-    return max(
-        (times for times in (1, 2, 5, 10, 20, 50, 100) if times * largest <= 0.15 * extent),
-        default=1,
-    )
+    possible = [times for times in (1, 2, 5, 10, 20, 50, 100) if times * largest <= 0.15 * extent]
+    return max(possible, default=1)
 
 
-def _said(estimate: RelativePoseEstimate, differences: Float[np.ndarray, "N 3"]) -> str:
-    """How far the estimated centres are from the true ones, in words."""
+def _summarize(estimate: RelativePoseEstimate, differences: Float[np.ndarray, "N 3"]) -> str:
+    """Say how far the estimated centres are from the true ones."""
     total = len(estimate.estimated)
     missing = int((~estimate.estimated).sum())
     if missing == total:

@@ -1,7 +1,6 @@
 """A test run of the camera problem in TensorBoard."""
 
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +8,12 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from ghpt.models.relative_pose.evaluation import ERRORS, pair_errors
-from ghpt.models.relative_pose.predictions import PairPredictions
-from ghpt.models.rows import WEIGHTS
+from ghpt.models.relative_pose.schema import PairPredictions
 from ghpt.observations import RelativePoseEstimate
 from ghpt.report.figures import image
 from ghpt.report.pair_figures import rig_figure
-from ghpt.report.pair_tables import MANY
+from ghpt.report.pair_tables import MANY, print_pair_tables, write_pair_report
+from ghpt.report.report import Report
 from ghpt.report.tables import title
 from ghpt.report.tensorboard import write_hyperparameters, write_parts, write_weights
 
@@ -26,7 +25,7 @@ _CHUNK = 2048
 def write_pair_events(
     folder: str | Path, predictions: PairPredictions, metrics: Mapping[str, Any]
 ) -> int:
-    """Write a test run's scalars, histograms, figure and hyper-parameters, as ``write_parts`` does."""
+    """Write a test run's scalars, histograms, figure and settings, as ``write_parts`` does."""
     return write_parts(
         folder,
         {
@@ -55,34 +54,30 @@ def _add(writer: SummaryWriter, of: str, name: str, numbers: Mapping[str, Any]) 
 
 
 def _weights(writer: SummaryWriter, predictions: PairPredictions) -> None:
-    chunks = [chunk.weights for chunk in predictions.chunks(_CHUNK)]
-    write_weights(
-        writer,
-        {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS},
-    )
+    write_weights(writer, [chunk.weights for chunk in predictions.chunks(_CHUNK)])
 
 
 def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[str, Any]) -> None:
-    """The draw whose mean E_3D over its pairs is the median: neither a good nor a bad one."""
+    """Draw the rig in the draw whose mean E_3D over its pairs is the median."""
     rows = _typical_draw(predictions)
     chunks = [predictions.read(row, row + 1) for row in rows]
-    rig = int(chunks[0].rig[0])
-    estimates = {
-        name: RelativePoseEstimate(
-            *(
-                torch.cat([getattr(c.estimates[name], field.name) for c in chunks])
-                for field in fields(RelativePoseEstimate)
-            )
-        )
-        for name in SHOWN
-        if name in predictions.names
-    }
-    heading = f"{title(metrics)}\nrig of {predictions.rig_name[rig]}, the draw of median E_3D under {SHOWN[0]}"
+    rig = int(chunks[0].sample.rig[0])
+    estimates = {}
+    for name in SHOWN:
+        if name in predictions.names:
+            each = [chunk.estimates[name] for chunk in chunks]
+            R = torch.cat([estimate.R for estimate in each])
+            t = torch.cat([estimate.t for estimate in each])
+            estimated = torch.cat([estimate.estimated for estimate in each])
+            estimates[name] = RelativePoseEstimate(R, t, estimated)
+    which = f"rig of {predictions.tables.rig_name[rig]}"
+    heading = f"{title(metrics)}\n{which}, the draw of median E_3D under {SHOWN[0]}"
+    tables = predictions.tables
     figure = rig_figure(
-        predictions.cameras.index(rig),
-        predictions.camera_name[rig],
-        predictions.points[rig],
-        torch.cat([chunk.pair for chunk in chunks]),
+        tables.cameras.index(rig),
+        tables.camera_name[rig].tolist(),
+        tables.points[rig],
+        torch.cat([chunk.sample.pair for chunk in chunks]),
         estimates,
         heading,
     )
@@ -90,13 +85,17 @@ def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[s
 
 
 def _typical_draw(predictions: PairPredictions) -> list[int]:
-    """The rows of a draw that is median in E_3D under the first shown selection."""
+    """Return the rows of a draw that is median in E_3D under the first shown name."""
     errors = []
     draws = []
     for chunk in predictions.chunks(_CHUNK):
         errors.append(pair_errors(predictions, chunk, SHOWN[0])["E_3D"].double())
-        draws.append(chunk.draw)
+        draws.append(chunk.sample.draw)
     numbers, which = torch.cat(draws).unique(return_inverse=True)
     total = torch.zeros(len(numbers), dtype=torch.float64).index_add(0, which, torch.cat(errors))
     middle = int(total.argsort()[(len(numbers) - 1) // 2])
     return (which == middle).nonzero()[:, 0].tolist()
+
+
+REPORT = Report(print_pair_tables, write_pair_report, write_pair_events)
+"""Of the camera problem."""

@@ -1,9 +1,9 @@
-"""A test run in TensorBoard. It shows what metrics.json holds; it can fail without costing the run
-anything.
-"""
+"""A test run in TensorBoard: it shows what metrics.json holds, and costs nothing if it fails."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,12 @@ from torch.utils.tensorboard import SummaryWriter
 from torch.utils.tensorboard.summary import hparams
 
 from ghpt.metrics.pose_error import joint_errors
-from ghpt.models.pose.predictions import PredictionChunk, Predictions
-from ghpt.models.rows import WEIGHTS
+from ghpt.models.aggregation import WeightSummary
+from ghpt.models.pose.schema import PoseChunk, PosePredictions
 from ghpt.observations import PoseEstimate
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
-from ghpt.report.tables import title, trained_on
+from ghpt.report.report import Report
+from ghpt.report.tables import print_table, title, training_data, write_report
 
 SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
@@ -30,7 +31,9 @@ _BLOCK = 1000
 _log = logging.getLogger(__name__)
 
 
-def write_events(folder: str | Path, predictions: Predictions, metrics: Mapping[str, Any]) -> int:
+def write_events(
+    folder: str | Path, predictions: PosePredictions, metrics: Mapping[str, Any]
+) -> int:
     """Write a test run's scalars, histograms, figures and hyper-parameters, as ``write_parts``
     does.
     """
@@ -71,7 +74,7 @@ def write_parts(folder: str | Path, parts: Mapping[str, Callable[[SummaryWriter]
     writer = attempt("the event file", lambda: SummaryWriter(str(folder)))
     if writer is not None:
         for part, write in parts.items():
-            attempt(part, lambda write=write: write(writer))
+            attempt(part, partial(write, writer))
         attempt("the event file", writer.close)
     return len(failures)
 
@@ -83,55 +86,56 @@ def _scalars(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
                 writer.add_scalar(f"{scalar}/{name}", numbers[scalar], 0)
 
 
-def _weights(writer: SummaryWriter, predictions: Predictions) -> None:
-    chunks = [chunk.weights for _, chunk in _sample(predictions)]
-    write_weights(
-        writer,
-        {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS},
-    )
+def _weights(writer: SummaryWriter, predictions: PosePredictions) -> None:
+    write_weights(writer, [chunk.weights for _, chunk in _sample(predictions)])
 
 
-def write_weights(writer: SummaryWriter, weights: Mapping[str, Float[Tensor, " N"]]) -> None:
-    """Mean and histogram of each summary of the weights."""
-    for summary, values in weights.items():
-        writer.add_scalar(f"weights/{summary}", values.mean().item(), 0)
-        writer.add_histogram(f"weights/{summary}", values.numpy(), 0)
+def write_weights(writer: SummaryWriter, weights: Sequence[WeightSummary]) -> None:
+    """Write mean and histogram of each summary of the weights, over all chunks."""
+    for summary in fields(WeightSummary):
+        values = torch.cat([getattr(chunk, summary.name) for chunk in weights])
+        writer.add_scalar(f"weights/{summary.name}", values.mean().item(), 0)
+        writer.add_histogram(f"weights/{summary.name}", values.numpy(), 0)
 
 
-def _skeletons(writer: SummaryWriter, predictions: Predictions, metrics: Mapping[str, Any]) -> None:
-    """The whole frame whose error under ``weight`` is the median: neither a good nor a bad one."""
+def _skeletons(
+    writer: SummaryWriter, predictions: PosePredictions, metrics: Mapping[str, Any]
+) -> None:
+    """Write the whole frame whose error under ``weight`` is the median: neither good nor bad."""
     rows = []
     errors = []
-    truth = []
+    points = []
     for start, chunk in _sample(predictions):
         error, whole = _relative_error(chunk)
         rows.append(start + whole.nonzero()[:, 0])
         errors.append(error[whole])
-        truth.append(chunk.truth.points[whole][::10])
-    if not len(torch.cat(rows)):
+        points.append(chunk.sample.as_truth().points[whole][::10])
+    candidates = torch.cat(rows)
+    if not len(candidates):
         return
-    row = int(torch.cat(rows)[torch.cat(errors).median(dim=0).indices])
+    row = int(candidates[torch.cat(errors).median(dim=0).indices])
     chunk = predictions.read(row, row + 1)
     poses = {name: _with_nan(chunk.estimates[name]) for name in SHOWN if name in predictions.names}
-    take = predictions.recording_name[int(chunk.recording)]
-    heading = f"{title(metrics)}\n{take}, frame {int(chunk.frame)}: the median of the errors under {SHOWN[0]}"
-    up = up_axis(torch.cat(truth).double().numpy())
-    figure = skeletons(chunk.truth.points[0].double().numpy(), poses, up, heading)
+    take = predictions.tables.recording_name[int(chunk.sample.recording)]
+    frame = f"{take}, frame {int(chunk.sample.frame)}"
+    heading = f"{title(metrics)}\n{frame}: the median of the errors under {SHOWN[0]}"
+    up = up_axis(torch.cat(points).double().numpy())
+    truth = chunk.sample.as_truth().points[0].double().numpy()
+    figure = skeletons(truth, poses, up, heading)
     writer.add_image("skeletons", image(figure), 0, dataformats="HWC")
 
 
 def _pose_prior(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
     for subject in next(iter(metrics["selections"].values()))["pose_prior"]:
-        writer.add_image(
-            f"pose_prior/{subject}", image(pose_prior_bars(metrics, subject)), 0, dataformats="HWC"
-        )
+        figure = pose_prior_bars(metrics, subject)
+        writer.add_image(f"pose_prior/{subject}", image(figure), 0, dataformats="HWC")
 
 
 def write_hyperparameters(
     writer: SummaryWriter, meta: Mapping[str, Any], metrics: Mapping[str, Any], error: str
 ) -> None:
     """The settings of a test run beside each selection's ``error``."""
-    trained, source = trained_on(metrics)
+    trained, source = training_data(metrics)
     values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
     values |= {
         "trained_on": trained,
@@ -150,25 +154,27 @@ def write_hyperparameters(
         writer.add_scalar(name, number, 0)
 
 
-def _sample(predictions: Predictions) -> Iterator[tuple[int, PredictionChunk]]:
-    """At most ``_SAMPLE`` blocks with their first row, so that memory does not grow with the
-    frames.
-    """
+def _sample(predictions: PosePredictions) -> Iterator[tuple[int, PoseChunk]]:
+    """Yield at most ``_SAMPLE`` blocks with their first row: memory does not grow with frames."""
     starts = range(0, len(predictions), _BLOCK)
-    chosen = sorted({round(i) for i in np.linspace(0, len(starts) - 1, min(len(starts), _SAMPLE))})
-    return (
-        (starts[i], predictions.read(starts[i], min(starts[i] + _BLOCK, len(predictions))))
-        for i in chosen
-    )
+    places = np.linspace(0, len(starts) - 1, min(len(starts), _SAMPLE))
+    for place in sorted({round(place) for place in places}):
+        start = starts[place]
+        yield start, predictions.read(start, min(start + _BLOCK, len(predictions)))
 
 
-def _relative_error(chunk: PredictionChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
-    """Each frame's error under the first shown selection, mm, and which frames are whole."""
-    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], chunk.truth, "relative")
+def _relative_error(chunk: PoseChunk) -> tuple[Float[Tensor, " B"], Bool[Tensor, " B"]]:
+    """Return each frame's error under the first shown name, mm, and which frames are whole."""
+    truth = chunk.sample.as_truth()
+    errors, counted = joint_errors(chunk.estimates[SHOWN[0]], truth, "relative")
     return errors.mean(-1), counted.all(-1)
 
 
 def _with_nan(estimate: PoseEstimate) -> Float[np.ndarray, "J 3"]:
-    return (
-        estimate.points[0].double().masked_fill(~estimate.estimated[0, :, None], torch.nan).numpy()
-    )
+    """Return the first pose, NaN where a joint is missing."""
+    missing = ~estimate.estimated[0, :, None]
+    return estimate.points[0].double().masked_fill(missing, torch.nan).numpy()
+
+
+REPORT = Report(print_table, write_report, write_events)
+"""Of the pose problem."""

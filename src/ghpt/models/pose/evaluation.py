@@ -1,18 +1,17 @@
 """metrics.json: all numbers of a test run, computed from its predictions alone."""
 
 import math
-from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghpt.data.datasets.human36m import DAMAGED
-from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.metrics.pose_prior import PARTS, PosePrior
-from ghpt.models.pose.predictions import Predictions
+from ghpt.models.pose.schema import PosePredictions
 from ghpt.observations import PoseEstimate, Truth
 from ghpt.skeleton import JOINTS
 
@@ -76,7 +75,7 @@ def _number(value: Float[Tensor, ""]) -> float | None:
     return None if math.isnan(value.item()) else value.item()
 
 
-def evaluate(predictions: Predictions) -> dict[str, Any]:
+def evaluate_poses(predictions: PosePredictions) -> dict[str, Any]:
     """The content of metrics.json; lengths in mm, null where nothing could be measured.
 
     ``selections[name]``: ``mpjpe_absolute``, ``mpjpe_relative`` (to the pelvis), ``mpjpe_aligned``
@@ -85,11 +84,10 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
     ``pose_prior`` (S^2 by subject and part) and, where the data hold damaged takes,
     ``without_damaged`` (the four means again).
     """
-    actions = sorted(set(predictions.recording_action))
-    subjects = sorted(set(predictions.recording_subject))
-    action_of = torch.tensor([actions.index(a) for a in predictions.recording_action])
-    subject_of = torch.tensor([subjects.index(s) for s in predictions.recording_subject])
-    damaged = torch.tensor([name in DAMAGED for name in predictions.recording_name])
+    tables = predictions.tables
+    actions, action_of = _groups(tables.recording_action)
+    subjects, subject_of = _groups(tables.recording_subject)
+    damaged = torch.tensor([name in DAMAGED for name in tables.recording_name.tolist()])
     names = sorted(
         predictions.names, key=lambda n: (NAMES.index(n) if n in NAMES else len(NAMES), n)
     )
@@ -98,15 +96,17 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
         {name: _Selection(len(actions), len(subjects)) for name in names} if damaged.any() else {}
     )
     for chunk in predictions.chunks(_CHUNK):
-        keep = ~damaged[chunk.recording]
-        action = action_of[chunk.recording]
-        subject = subject_of[chunk.recording]
+        recording = chunk.sample.recording
+        truth = chunk.sample.as_truth()
+        keep = ~damaged[recording]
+        action = action_of[recording]
+        subject = subject_of[recording]
         for name in names:
             estimate = chunk.estimates[name]
-            whole[name].update(estimate, chunk.truth, action, subject)
+            whole[name].update(estimate, truth, action, subject)
             if sound:
                 kept = estimate.rows(keep)
-                sound[name].update(kept, chunk.truth.rows(keep), action[keep], subject[keep])
+                sound[name].update(kept, truth.rows(keep), action[keep], subject[keep])
     selections = {name: _selection(whole[name], actions, subjects) for name in names}
     for name, metrics in sound.items():
         selections[name]["without_damaged"] = metrics.numbers()
@@ -137,6 +137,7 @@ def _selection(metrics: _Selection, actions: list[str], subjects: list[str]) -> 
     }
 
 
-def write_metrics(path: str | Path, metrics: dict[str, Any]) -> None:
-    """Write ``evaluate``'s result as metrics.json."""
-    write_json(path, metrics)
+def _groups(labels: np.ndarray) -> tuple[list[str], Int[Tensor, " R"]]:
+    """Return the distinct labels in their order, and which of them each recording has."""
+    distinct, of_recording = np.unique(labels, return_inverse=True)
+    return distinct.tolist(), torch.from_numpy(of_recording)
