@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ghpt.data.datasets.detections import in_image
+from ghpt.data.datasets.detections import uncrop
 from ghpt.data.formats.validate import check_view_count, read_json, read_npy
 from ghpt.data.people.detections import Detections, joints_for
 from ghpt.data.points import KeyPoints
@@ -46,7 +46,7 @@ def read_authors(path: Path, skeleton: str | None) -> Detections:
             )
             raise GhptDataError(predictions, "", problem, "Keep the chunks of one rig in a folder.")
         with np.errstate(over="ignore", invalid="ignore"):
-            found, valid = in_image(crop.astype(np.float64), corners)
+            found, valid = uncrop(crop.astype(np.float64), corners)
         pixels.append(found)
         there.append(valid & np.isfinite(found).all(-1))
     valid = np.concatenate(there)

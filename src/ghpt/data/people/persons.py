@@ -9,7 +9,7 @@ from collections.abc import Sequence as Items
 import numpy as np
 from jaxtyping import Int
 
-from ghpt.data.datasets.detections import undistorted
+from ghpt.data.datasets.detections import undistort_key_points
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.skeletons import joints17
 from ghpt.data.people.association import associate
@@ -87,7 +87,7 @@ def undistort_view(points: KeyPoints, cameras: CameraSet, camera: int) -> KeyPoi
     """
     K = cameras.K[camera].numpy()
     distortion = cameras.distortion[camera].numpy()
-    pixels, valid = undistorted(points.pixels, points.valid, K, distortion)
+    pixels, valid = undistort_key_points(points.pixels, points.valid, K, distortion)
     return KeyPoints(pixels, points.confidence, valid)
 
 
