@@ -1,4 +1,4 @@
-"""Figures of a test run, drawn without pyplot, so that a user's own plots share nothing with them."""
+"""Figures of a test run, drawn without pyplot: a user's own plots share nothing with them."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _side_handles(with_truth: bool) -> list[Line2D]:
 
 
 def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
-    """Draw fig:pose-prior: S² of a subject's six parts under the eight selections, on a log scale."""
+    """Draw fig:pose-prior: S² of a subject's six parts under the eight selections, log scale."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
     selections = [name for name in AGGREGATIONS if name in metrics["selections"]]
@@ -196,6 +196,7 @@ def _draw_bones(
 
 def _draw_scale(axes: Axes, low: Float[np.ndarray, 2]) -> None:
     """Draw a bar of 500 mm."""
-    x, y = low + (20, 30)
+    x = low[0] + 20
+    y = low[1] + 30
     axes.plot([x, x + 500], [y, y], color=MIDDLE, linewidth=1.5)
     axes.text(x + 520, y, "500 mm", ha="left", va="center", fontsize=8)
