@@ -8,7 +8,6 @@ import re
 import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import hydra
@@ -105,11 +104,7 @@ def alive(pid):
 
 
 def until_saved(child, folder):
-    end = time.monotonic() + children.LIMIT
-    while not (folder / "last.ckpt").exists():
-        assert child.poll() is None, child.communicate()
-        assert time.monotonic() < end, "training did not begin"
-        time.sleep(0.05)
+    children.wait_until((folder / "last.ckpt").exists, child)
 
 
 def written(folder):
@@ -208,10 +203,7 @@ def test_a_killed_process_ends_both_in_a_line_and_the_training_goes_on(
     (second,) = others_of(child.pid)
     os.kill(second if dies == "the second" else child.pid, signal.SIGKILL)
     _, errors = child.communicate(timeout=children.LIMIT)
-    end = time.monotonic() + children.LIMIT
-    while alive(second):
-        assert time.monotonic() < end, "the other process hangs"
-        time.sleep(0.05)
+    children.wait_until(lambda: not alive(second))
     if dies == "the second":
         *how, error = errors.splitlines()
         assert child.returncode == 1
