@@ -14,7 +14,7 @@ from torch import Tensor
 from ghpt.commands.prediction.frames import Frames, Seen
 from ghpt.config import plain
 from ghpt.data.formats.camera_writers import write_pose2sim
-from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINTS
@@ -33,7 +33,7 @@ def config(*words: str) -> dict:
 @cache
 def walk(frames: int = 200) -> Tensor:
     """A walking person, mm [T, 17, 3]."""
-    return torch.from_numpy(motion(0, "S9", "S9/Walking-1", "Walking", frames, 50.0)).double()
+    return torch.from_numpy(draw_motion(0, "S9", "S9/Walking-1", "Walking", frames, 50.0)).double()
 
 
 def frames_of(count: int, noise: float = 1.0, gaps: float = 0.1) -> Frames:

@@ -17,7 +17,7 @@ from ghpt.data.people.people import Detections, KeyPoints, as_people
 from ghpt.data.people.tracks import tracks
 from ghpt.data.people.views import undistort_and_match, who
 from ghpt.data.synthetic.detector import Detector
-from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
@@ -57,7 +57,7 @@ def scene(detector: Detector, rig: CameraSet, seed: int = 1) -> tuple[Detections
     parts, owner = [], []
     for person, action in enumerate(("Walking", "Greeting")):
         name = f"{person}-{seed}"
-        points = motion(seed, name, name, action, FRAMES, 50.0)
+        points = draw_motion(seed, name, name, action, FRAMES, 50.0)
         found = detector(points, rig, 50.0, seed, name, name)
         there = found.valid.any(-1)
         for view in range(len(rig)):

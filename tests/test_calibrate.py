@@ -22,7 +22,7 @@ from ghpt.config import plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.formats.key_points import KeyPoints, write_key_points
-from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import project
 from ghpt.geometry.lens import distort
@@ -57,7 +57,7 @@ def scene():
     truth with it.
     """
     rig = human36m_rig("S9")
-    truth = motion(0, "S9", "S9/Walking-1", "Walking", 400, 50.0)[::5]
+    truth = draw_motion(0, "S9", "S9/Walking-1", "Walking", 400, 50.0)[::5]
     pixels, _ = project(rig.cameras, torch.from_numpy(truth).double())
     seen_by_lens = distort(pixels.transpose(0, 1).flatten(1, 2), rig.cameras.K, rig.distortion)
     values = seen_by_lens.unflatten(1, truth.shape[:2]).transpose(0, 1).numpy()

@@ -9,7 +9,7 @@ from typing import Any, TypedDict
 
 from ghpt.config import build, suggest
 from ghpt.data.datasets.datamodule import KeyPointDataModule
-from ghpt.data.datasets.store import prepared
+from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import KeyPoints, read_key_points
 from ghpt.data.formats.names import Name
@@ -52,7 +52,7 @@ def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, Labelle
     """A recording of ``config["data"]`` by name; without a name S9/Walking-1 or the first."""
     data = build(config["data"], "data")
     made = {"source": data.source, "split": data.evaluate}
-    stored = prepared(
+    stored = prepare(
         data.cache, data.cache_key(data.evaluate), lambda: data.generate(data.evaluate), made
     )
     recordings = {recording.name: recording for recording in stored}

@@ -31,7 +31,7 @@ from ghpt.commands.prediction.frames import (
 )
 from ghpt.commands.prediction.gaps import Gaps, after, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
-from ghpt.commands.prediction.report import prediction_report, print_prediction, print_verdict
+from ghpt.commands.prediction.report import print_prediction, print_verdict, report_document
 from ghpt.commands.prediction.run import predicted
 from ghpt.commands.prediction.statistics import Estimate, counts, estimate_of, evaluate
 from ghpt.commands.prediction.stored import frames_of_stored, open_stored
@@ -43,13 +43,14 @@ from ghpt.data.people.views import as_one_person, undistort_and_match
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Scene
 from ghpt.export.scene import origin_note
-from ghpt.files import atomic_write, sweep_temporaries, write_json
+from ghpt.files import sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.predictors import Classical, Learned
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About
+from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NAMES
 from ghpt.skeleton import JOINTS
 
@@ -209,8 +210,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     verdict = judge(numbers, checkup, unit, commands_on(config, output))
     numbers["verdict"] = verdict.numbers()
     write_json(output / "prediction.json", numbers)
-    with atomic_write(output / "report.md", "w") as handle:
-        handle.write(prediction_report(numbers))
+    write_markdown(output / "report.md", report_document(numbers))
     print_prediction(numbers)
     files = ", ".join(WRITERS[name].file for name in formats)
     _log.info("Written: %s and report.md in %s.", files, display_path(output))

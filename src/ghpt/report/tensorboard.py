@@ -22,7 +22,7 @@ from ghpt.models.pose.schema import PoseChunk, PosePredictions
 from ghpt.observations import PoseEstimate
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
 from ghpt.report.report import Report
-from ghpt.report.tables import print_table, title, trained_on, write_report
+from ghpt.report.tables import print_table, title, training_data, write_report
 
 SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
@@ -136,7 +136,7 @@ def write_hyperparameters(
     writer: SummaryWriter, meta: Mapping[str, Any], metrics: Mapping[str, Any], error: str
 ) -> None:
     """The settings of a test run beside each selection's ``error``."""
-    trained, source = trained_on(metrics)
+    trained, source = training_data(metrics)
     values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
     values |= {
         "trained_on": trained,

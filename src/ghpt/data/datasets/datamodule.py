@@ -14,7 +14,7 @@ from ghpt.data.datasets.frames import (
     Sampling,
     draw_frames,
 )
-from ghpt.data.datasets.store import prepared
+from ghpt.data.datasets.store import prepare
 from ghpt.errors import GhptDataError, check
 from ghpt.observations import Labelled, LabelledRecording
 
@@ -118,7 +118,7 @@ class KeyPointDataModule(L.LightningDataModule):
         """
         about = {"source": self.source, "split": split}
         key = self.cache_key(split)
-        recordings = prepared(self.cache, key, lambda: self.generate(split), about)
+        recordings = prepare(self.cache, key, lambda: self.generate(split), about)
         if not sum(map(len, recordings)):
             where = f"{self.name} {split}"
             hint = "Choose another split, or check what data.root holds."
