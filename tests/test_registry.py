@@ -271,6 +271,14 @@ def test_a_package_has_all_its_modules_trusted(
     assert type(model.loss).__module__ == "mine.losses"
 
 
+def test_a_problem_of_one_s_own_is_derived_from_problem(
+    own: Path, checkpoint_of: Callable[..., Path]
+) -> None:
+    path = checkpoint_of(problem={"_target_": "mine.scorers.NoModule"})
+    with pytest.raises(GhptCheckpointError, match=r"is no ghpt\.models\.problem\.Problem"):
+        load_model(path, ["mine.scorers"])
+
+
 @pytest.mark.parametrize(
     ("trust", "model", "reason"),
     [

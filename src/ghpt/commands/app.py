@@ -238,7 +238,7 @@ class _Job:
                 if self.sweep and values.get("resume") is False and not values.get("overwrite"):
                     values["resume"] = "auto"
                 command = self.loaded()
-                _quieten()  # what Lightning has set itself when it was imported
+                _quieten()  # not before: the import of Lightning sets its levels anew
                 settings = _settings_of(command, values)
                 files = command.files(settings)
                 folder = stack.enter_context(_output_folder(output, files, values))

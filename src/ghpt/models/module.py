@@ -1,4 +1,4 @@
-"""The loop of the framework as a LightningModule: generate, featurize, score, aggregate, compare."""
+"""The loop as a LightningModule: generate, featurize, score, aggregate, compare."""
 
 from collections.abc import Callable, Iterable
 from typing import Any

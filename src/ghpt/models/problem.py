@@ -102,7 +102,7 @@ class Problem(ABC):
 
     def baselines(
         self, settings: BaselineSettings, model: Any
-    ) -> Mapping[str, Callable[[Any], Estimate]]:
+    ) -> Mapping[str, Callable[[Any], Any]]:
         """Return the estimators that are tested beside the aggregations, by name."""
         return {}
 

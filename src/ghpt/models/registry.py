@@ -36,7 +36,7 @@ class Untrusted(GhptConfigError):
 
 @dataclass
 class Part:
-    """A key of a model's configuration that holds a class."""
+    """A key of a model's configuration that names a class."""
 
     kind: type
     """What a class must be derived from."""
@@ -113,7 +113,7 @@ def check_trust(trust: Sequence[str]) -> None:
 
 
 def packages_to_trust(config: Mapping[str, Any]) -> list[str]:
-    """The modules of the user's own classes in a model's configuration, by name."""
+    """Return the modules of the user's own classes in a model's configuration, by name."""
     targets = [node["_target_"] for _, node, _ in _nodes(config, "model")]
     return sorted({target.rpartition(".")[0] for target in targets if _is_users(target)})
 
@@ -123,7 +123,7 @@ def _nodes(
     path: str,
     inside: bool = False,
 ) -> Iterator[tuple[str, Mapping[str, Any], bool]]:
-    """Each node with ``_target_``: its path, itself, whether it is inside a class of the user's."""
+    """Yield each node with ``_target_``: path, node, whether it is inside a class of the user's."""
     if isinstance(config, Mapping):
         if "_target_" in config:
             yield path, config, inside
@@ -136,13 +136,13 @@ def _nodes(
 
 
 def _classes(config: Mapping[str, Any], trust: Sequence[str]) -> dict[str, type]:
-    """The class of every name in a model's configuration."""
+    """Return the class of every name in a model's configuration."""
     nodes = _nodes(config, "model")
     return {node["_target_"]: _class(node, path, inside, trust) for path, node, inside in nodes}
 
 
 def _is_users(target: Any) -> bool:
-    """Whether a name can be that of a class of the user's own."""
+    """Return whether a name can be that of a class of the user's own."""
     if not (isinstance(target, str) and "." in target and _NAME.fullmatch(target)):
         return False
     return target.split(".")[0] not in _NEVER_TRUSTED
@@ -153,7 +153,7 @@ def _is_within(module: str, packages: Sequence[str]) -> bool:
 
 
 def _class(node: Mapping[str, Any], path: str, inside: bool, trust: Sequence[str]) -> type:
-    """The class of a node.
+    """Return the class of a node.
 
     What is ``inside`` a class of the user's is that class's business: it may be any registered
     class, and any of the trusted packages.

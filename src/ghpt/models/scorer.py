@@ -56,9 +56,10 @@ class Standardise(nn.Module):
 class Scorer(nn.Module):
     """Multi-layer perceptron with ReLUs on standardised features.
 
-    ``layers``: the widths (tab:hyperparameters: 1000-900-900-900-700). ``bfloat16``: training multiplies matrices in bfloat16, about twice as fast where the processor
-    can (weights and optimiser stay float32; gradients are rounded, so several processes agree to
-    1e-2 only). Testing never does.
+    ``layers``: the widths (tab:hyperparameters: 1000-900-900-900-700). ``bfloat16``: training
+    multiplies matrices in bfloat16, about twice as fast where the processor can (weights and
+    optimiser stay float32; gradients are rounded, so several processes agree to 1e-2 only). Testing
+    never does.
     """
 
     def __init__(self, size: int, layers: Sequence[int], clip: float, bfloat16: bool) -> None:

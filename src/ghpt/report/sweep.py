@@ -75,7 +75,7 @@ def frames_sweep(sweep: Sweep, heading: str) -> Figure:
 
 
 def _draw_method(axes: Axes, name: str, by_frames: Mapping[int, Sequence[float]]) -> None:
-    colour, style, marker = METHOD_STYLES.get(name, OTHER_STYLE)
+    style = METHOD_STYLES.get(name, OTHER_STYLE)
     frames = sorted(by_frames)
     statistics = [Statistics.of(by_frames[m]) for m in frames]
     mean = np.array([of_frames.mean for of_frames in statistics])
@@ -83,13 +83,13 @@ def _draw_method(axes: Axes, name: str, by_frames: Mapping[int, Sequence[float]]
     low = _clip(mean - deviation)
     high = _clip(mean + deviation)
     alpha = 0.2 if name in _BANDS else 0.08
-    axes.fill_between(frames, low, high, color=colour, alpha=alpha, linewidth=0)
+    axes.fill_between(frames, low, high, color=style.colour, alpha=alpha, linewidth=0)
     axes.plot(
         frames,
         np.minimum(mean, CLIP),
-        color=colour,
-        linestyle=style,
-        marker=marker,
+        color=style.colour,
+        linestyle=style.line,
+        marker=style.marker,
         markersize=5,
         markeredgecolor="white",
         markeredgewidth=0.6,

@@ -27,8 +27,9 @@ Draw = Callable[[Sequence[LabelledRecording], Sampling], SampleSet]
 class KeyPointDataModule(L.LightningDataModule):
     """What all arrangements share: preparation, choice of samples, batches.
 
-    ``root`` None means the synthetic source, a path the real data set there. ``seed`` chooses the training samples and their order. ``batch_size`` is the global one, divided among
-    the processes. ``evaluate`` names the split that ``test`` runs on.
+    ``root`` None means the synthetic source, a path the real data set there. ``seed`` chooses the
+    training samples and their order. ``batch_size`` is the global one, divided among the processes.
+    ``evaluate`` names the split that ``test`` runs on.
     """
 
     def __init__(
