@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,18 +31,16 @@ from ghpt.commands.prediction.camera_check import check_cameras
 from ghpt.commands.prediction.gaps import Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
 from ghpt.commands.prediction.report import print_prediction, print_verdict, report_document
+from ghpt.commands.prediction.result import PredictionResult
 from ghpt.commands.prediction.run import RunSettings, predict_shards
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.prediction.statistics import (
-    Coverage,
     Estimate,
-    Evaluation,
-    ScaledErrors,
     evaluate,
     measure_coverage,
     pose_estimate,
 )
-from ghpt.commands.prediction.verdict import Judge, Level, Verdict
+from ghpt.commands.prediction.verdict import Judge, Level
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
@@ -134,39 +132,6 @@ class PoseEstimator:
     weights: torch.nn.Module | None
     identity: dict[str, Any]
     """What its results depend on, as plain data."""
-
-
-@dataclass(frozen=True)
-class PredictionResult:
-    """What prediction.json holds."""
-
-    data: str
-    source: str
-    cameras: tuple[str, ...]
-    estimator: str
-    estimator_text: str
-    rate_hz: float | None
-    fill_frames: int | None
-    smooth_hz: float | None
-    coverage: Coverage
-    scales: ScaledErrors
-    unit_mm: float
-    evaluation: Evaluation
-    formats: list[str]
-    provenance: dict[str, Any]
-    verdict: Verdict | None = None
-
-    def plain(self) -> dict[str, Any]:
-        """Return the result as plain data; the coverage is not a group of its own."""
-        values: dict[str, Any] = {}
-        for key, value in asdict(self).items():
-            if key == "coverage":
-                values |= value
-            elif key == "verdict":
-                values |= {key: self.verdict.numbers()} if self.verdict else {}
-            else:
-                values[key] = value
-        return values
 
 
 def files(settings: PredictSettings) -> Files:
