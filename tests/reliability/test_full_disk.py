@@ -71,7 +71,7 @@ def test_command(typed, conf, tmp_path, train_command):
 
 @pytest.fixture
 def predict_command(typed, tmp_path, monkeypatch):
-    monkeypatch.setattr(prediction, "data_sequence", lambda _: sequence_of(400))
+    monkeypatch.setattr(prediction, "recording_sequence", lambda _: sequence_of(400))
     words = (
         "triangulation=linear",
         "shard_frames=100",
