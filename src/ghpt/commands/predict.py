@@ -30,7 +30,7 @@ from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
 from ghpt.commands.prediction.gaps import Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
-from ghpt.commands.prediction.report import print_prediction, print_verdict, report_document
+from ghpt.commands.prediction.report import report_document, summary_document, verdict_document
 from ghpt.commands.prediction.result import PredictionResult
 from ghpt.commands.prediction.run import RunSettings, predict_shards
 from ghpt.commands.prediction.shards import Shards
@@ -56,6 +56,7 @@ from ghpt.provenance import provenance
 from ghpt.reconstruction import About
 from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NAMES
+from ghpt.report.terminal import print_document
 from ghpt.skeleton import JOINTS
 
 SHARDS = ".shards"
@@ -408,13 +409,12 @@ def _evidence(sequence: Sequence, shards: Shards) -> Iterator[Evidence]:
 
 def _write_report(result: PredictionResult, output: Path) -> None:
     """Write prediction.json and report.md, and print the tables and the verdict."""
-    values = result.plain()
-    write_json(output / "prediction.json", values)
-    write_markdown(output / "report.md", report_document(values))
-    print_prediction(values)
+    write_json(output / "prediction.json", result.plain())
+    write_markdown(output / "report.md", report_document(result))
+    print_document(summary_document(result))
     written = ", ".join(WRITERS[name].file for name in result.formats)
     _log.info("Written: %s and report.md in %s.", written, display_path(output))
-    print_verdict(values["verdict"])
+    print_document(verdict_document(result))
 
 
 COMMAND = Command(

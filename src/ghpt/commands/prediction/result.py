@@ -1,4 +1,4 @@
-"""What a prediction is, beside the poses: the content of prediction.json."""
+"""What a prediction ends in, as prediction.json holds it."""
 
 from __future__ import annotations
 
