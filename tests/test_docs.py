@@ -263,7 +263,7 @@ def lay_out(runner: Page, models: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_commands_and_the_code_of_a_page_run(
-    page, tmp_path, models, little_data, typed, monkeypatch
+    page, tmp_path, models, little_data, blank_figures, typed, monkeypatch
 ):
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.chdir(tmp_path)
