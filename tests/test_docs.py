@@ -39,7 +39,7 @@ SMALL = {
         "trainer.max_epochs=1",
     ),
     "test.py": (*QUICK, "data.stride=40"),
-    "predict.py": (*QUICK, "evaluated_frames=8"),
+    "predict.py": (*QUICK, "evaluated_frames=8", "verdict.clean=1.0"),
     "cameras.py": ("doctor.frames=16", "doctor.shift=2"),
     "calibrate.py": ("evaluated_frames=8", "calibration.frames=40"),
 }
@@ -112,6 +112,7 @@ class Page:
             self.laid_out.discard(output)
         if "resume=true" in words:  # what was stopped was begun by the same command
             self.typed(self.conf, main, [word for word in words if word != "resume=true"])
+        words = [re.sub(r"^(data=\w+,\w+),.*", r"\1", word) for word in words]  # two of a sweep
         status, said, errors = self.typed(self.conf, main, words)
         spoilt = next((word.split("=")[1] for word in words if word.startswith("spoil=")), None)
         if spoilt:

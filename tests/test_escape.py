@@ -10,13 +10,29 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from ghpt.commands.cameras import _print as print_checkup
 from ghpt.commands.cameras import report as checkup_report
-from ghpt.commands.prediction.report import print_prediction, print_verdict, report_document
+from ghpt.commands.prediction.report import (
+    report_document,
+    summary_document,
+    verdict_document,
+)
+from ghpt.commands.prediction.result import PredictionResult
+from ghpt.commands.prediction.statistics import (
+    BoneVariation,
+    Coverage,
+    EstimatorErrors,
+    Evaluation,
+    Quantiles,
+    ScaledErrors,
+    ViewErrors,
+)
+from ghpt.commands.prediction.verdict import Finding, Level, Verdict
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.scale import SEGMENTS
 from ghpt.report.calibration import calibration_report, print_calibration
 from ghpt.report.markdown import render_markdown
 from ghpt.report.rig_comparison import Similarity
 from ghpt.report.rig_figure import rig_figure
+from ghpt.report.terminal import print_document
 
 BAD = "a|b<c>[red]"
 
@@ -33,47 +49,36 @@ def rendered(text: str) -> list[tuple[str, str]]:
     return shown
 
 
-ERRORS = {"median": 1.0, "p90": 2.0}
 PROVENANCE = {"ghpt": "0", "commit": None, "seed": 0, "command": "python predict.py 'a`b'"}
 
 
-def prediction() -> dict:
-    each = {"views": {BAD: ERRORS}, **ERRORS}
-    found = {
-        "reprojection": each,
-        "held_out": each,
-        "placed": 1.0,
-        "segments": {"median": 0.1, "each": {}},
-    }
-    found["segments"]["each"] = dict.fromkeys(SEGMENTS, 0.1)
-    return {
-        "data": BAD,
-        "cameras": [BAD],
-        "estimator": "linear",
-        "estimator_text": BAD,
-        "frames": 3,
-        "smooth_hz": None,
-        "share": {"observed": 1.0, "filled": 0.0},
-        "swapped": {BAD: 2},
-        "observed": {BAD: 1.0},
-        "evaluation": {"frames": 3, "estimators": {"linear": found, "x": found}},
-        "provenance": PROVENANCE,
-        "stature_mm": 1700.0,
-        "verdict": {
-            "level": "look at this",
-            "undecidable": [BAD],
-            "findings": [
-                {
-                    "level": "look at this",
-                    "code": "moved",
-                    "text": f"{BAD} is off",
-                    "value": 0.1,
-                    "limit": 0.0,
-                    "command": f"python cameras.py {BAD}",
-                },
-            ],
-        },
-    }
+def prediction() -> PredictionResult:
+    errors = ViewErrors(1.0, 2.0, 3, {BAD: Quantiles(1.0, 2.0, 3)})
+    found = EstimatorErrors(
+        reprojection=errors,
+        held_out=errors,
+        segments=BoneVariation(0.1, dict.fromkeys(SEGMENTS, 0.1)),
+        placed=1.0,
+        scales=ScaledErrors(None, {}),
+    )
+    finding = Finding("moved", Level.LOOK, f"{BAD} is off", 0.1, 0.0, f"python cameras.py {BAD}")
+    return PredictionResult(
+        data=BAD,
+        source=BAD,
+        cameras=(BAD,),
+        estimator="linear",
+        estimator_text=BAD,
+        rate_hz=None,
+        fill_frames=None,
+        smooth_hz=None,
+        coverage=Coverage(3, {"observed": 1.0, "filled": 0.0}, {BAD: 1.0}, {BAD: 2}, 1700.0),
+        scales=ScaledErrors(None, {}),
+        unit_mm=1.0,
+        evaluation=Evaluation(3, {"linear": found, "x": found}),
+        formats=[],
+        provenance=PROVENANCE,
+        verdict=Verdict((finding,), (BAD,)),
+    )
 
 
 def calibration() -> dict:
@@ -127,8 +132,8 @@ def test_a_report_shows_names_as_they_are(numbers, report, times):
 @pytest.mark.parametrize(
     ("numbers", "show", "times"),
     [
-        (prediction, print_prediction, 4),
-        (lambda: prediction()["verdict"], print_verdict, 3),
+        (prediction, lambda result: print_document(summary_document(result)), 4),
+        (prediction, lambda result: print_document(verdict_document(result)), 3),
         (calibration, print_calibration, 6),
         (checkup, print_checkup, 3),
     ],

@@ -150,7 +150,7 @@ def test_events_hold_the_numbers_of_metrics_json(tmp_path):
         assert scalar.value == pytest.approx(numbers["mpjpe_relative"], rel=1e-6)
     assert set(tags["images"]) == {"skeletons", "pose_prior/S9"}
     assert set(tags["histograms"]) == {f"weights/{x}" for x in ("entropy", "max", "effective")}
-    entropy = predictions.read(0, 40).weights["entropy"]
+    entropy = predictions.read(0, 40).weights.entropy
     assert events.Scalars("weights/entropy")[0].value == pytest.approx(
         entropy.mean().item(), rel=1e-6
     )

@@ -13,9 +13,10 @@ from ghpt.report.pair_tables import (
     comparison_table,
     dissection_table,
     pair_report_document,
+    pair_summary_document,
     paper_numbers,
-    print_pair_tables,
 )
+from ghpt.report.terminal import print_document
 
 
 def metrics(
@@ -60,7 +61,8 @@ def report(**changes) -> str:
 
 def printed(values: dict) -> list[str]:
     buffer = io.StringIO()
-    print_pair_tables(values, Console(file=buffer, width=80, color_system=None))
+    console = Console(file=buffer, width=80, color_system=None)
+    print_document(pair_summary_document(values), console)
     return buffer.getvalue().splitlines()
 
 

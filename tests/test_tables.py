@@ -12,9 +12,10 @@ from ghpt.report.tables import (
     display_name,
     main_rows,
     max_difference,
-    print_table,
     report_document,
+    summary_document,
 )
+from ghpt.report.terminal import print_document
 
 MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 
@@ -126,9 +127,8 @@ def test_report_fits_100_columns_and_every_row_has_every_column():
 
 def test_terminal_table_fits_80_columns():
     buffer = io.StringIO()
-    print_table(
-        metrics(data="cmu4", trained="cmu2"), Console(file=buffer, width=80, color_system=None)
-    )
+    document = summary_document(metrics(data="cmu4", trained="cmu2"))
+    print_document(document, Console(file=buffer, width=80, color_system=None))
     lines = buffer.getvalue().splitlines()
     assert "synthetic Panoptic CMU4" in " ".join(lines)
     assert max(map(len, lines)) <= 80

@@ -125,7 +125,7 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         # ours, which read
         "ghpt.export.npz.read_reconstruction": {"path": str(ckpt)},
         "ghpt.data.formats.camera_files.read_cameras": {"path": str(ckpt)},
-        "ghpt.data.formats.key_points.read_people": {"path": str(ckpt)},
+        "ghpt.data.formats.key_points.read_key_points": {"path": str(ckpt)},
         "ghpt.data.datasets.store.open_store": {"folder": folder},
         "ghpt.data.datasets.store.cache_root": {},
         "ghpt.models.predictions.open_predictions": {"path": str(ckpt), "schema": None},
@@ -136,7 +136,7 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.files.atomic_write": {"path": f"{folder}/keep.txt"},
         "ghpt.files.atomic_folder": {"path": folder},
         "ghpt.files.write_json": {"path": f"{folder}/keep.txt", "content": {}},
-        "ghpt.report.tables.write_report": {"path": f"{folder}/keep.txt", "metrics": {}},
+        "ghpt.report.markdown.write_markdown": {"path": f"{folder}/keep.txt", "document": {}},
         "ghpt.report.tensorboard.write_parts": {"folder": f"{folder}/events", "parts": {}},
         "ghpt.models.rows.RowWriter": {"folder": folder, "count": 1, "layout": {}},
         "ghpt.data.datasets.store.write_store": {

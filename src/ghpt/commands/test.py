@@ -20,7 +20,9 @@ from ghpt.models.collect import CollectPredictions
 from ghpt.models.predictions import Predictions, open_predictions
 from ghpt.models.problem import BaselineSettings, Problem
 from ghpt.provenance import provenance
+from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NONE, title
+from ghpt.report.terminal import print_document
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +42,7 @@ class TestSettings(OutputSettings):
     frames: int | None
     """Frames of a pair of cameras; None: as many as in training."""
     data: Target
-    trainer: dict[str, Any]
+    trainer: Target
     view_weights: Target | None = None
     baselines: Target = field(default_factory=dict)
     camera_baselines: Target = field(default_factory=dict)
@@ -87,9 +89,9 @@ def test(settings: TestSettings, output: Path) -> TestResult | None:
         return None
     report = result.problem.report()
     page = output / "report.md"
-    report.write_report(page, result.metrics)
+    write_markdown(page, report.document(result.metrics))
     report.write_events(output, result.predictions, result.metrics)
-    report.print_table(result.metrics)
+    print_document(report.summary(result.metrics))
     _log.info("Report: %s, beside it metrics.json and predictions.npz.", display_path(page))
     _log.info("Figures: tensorboard --logdir %s", display_path(output))
     return result

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 from torch import Tensor
 
-from ghpt.models.estimators.classical import Baseline
+from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import SEGMENTS
 from ghpt.observations import Recording
 from ghpt.report.escape import escaped, plain
@@ -29,7 +29,7 @@ Numbers = dict[str, Any]
 _COLOURS = {"error": "red", "warning": "yellow"}
 
 
-def explains(recordings: Mapping[str, Recording], estimator: Baseline, frames: int) -> Numbers:
+def explains(recordings: Mapping[str, Recording], estimator: Estimator, frames: int) -> Numbers:
     """How well each calibration of the same key points explains them: name -> held-out-view errors
     (pixels) over the joints that all of them estimate, overall and by view, and the variation of
     the segments' lengths; over at most so many ``frames``, evenly spread.

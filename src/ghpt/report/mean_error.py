@@ -5,11 +5,9 @@ from typing import Any
 
 from ghpt.models.predictions import Predictions
 from ghpt.report.document import Document, Table
-from ghpt.report.markdown import write_markdown
 from ghpt.report.report import Metrics, Report
 from ghpt.report.tables import NONE, title
 from ghpt.report.tensorboard import write_hyperparameters, write_parts, write_weights
-from ghpt.report.terminal import print_document
 
 _CHUNK = 2048
 
@@ -23,16 +21,6 @@ def error_document(metrics: Metrics) -> Document:
         text = NONE if error is None else f"{error:.1f}"
         rows.append((name, text, f"{100 * numbers['coverage']:.1f}"))
     return Document(f"{metrics['problem']}: {title(metrics)}", [Table(header, rows)])
-
-
-def print_errors(metrics: Metrics) -> None:
-    """Print the table of mean errors."""
-    print_document(error_document(metrics))
-
-
-def write_errors(path: Path, metrics: Metrics) -> None:
-    """Write the table of mean errors as Markdown."""
-    write_markdown(path, error_document(metrics))
 
 
 def write_error_events(
@@ -51,4 +39,4 @@ def write_error_events(
     )
 
 
-REPORT = Report(print_errors, write_errors, write_error_events)
+REPORT = Report(error_document, error_document, write_error_events)

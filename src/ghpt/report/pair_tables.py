@@ -5,18 +5,13 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any
-
-from rich.console import Console
 
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.relative_pose.evaluation import ALONE, ERRORS
 from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
 from ghpt.report.document import Block, Document, Heading, Paragraph, Strong, Table, Text, prose
-from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NONE, Metrics, origin_text, title, training_data
-from ghpt.report.terminal import print_document
 
 NAMES = {
     "eight_point": "8-point",
@@ -137,11 +132,6 @@ def _comparison_summary(metrics: Metrics) -> Table:
     )
 
 
-def print_pair_tables(metrics: Metrics, console: Console | None = None) -> None:
-    """Print both tables to the terminal (or to ``console``)."""
-    print_document(pair_summary_document(metrics), console)
-
-
 def comparison_table(metrics: Metrics) -> Table:
     """Return E_3D of every name on each pair; where there are many, of the median and the worst."""
     order = pair_order(metrics)
@@ -195,11 +185,6 @@ def _origin(metrics: Metrics) -> Text:
     cameras = ", ".join(metrics["cameras"])
     size = f"{metrics['draws']} draws of {metrics['frames']} frames"
     return (f"{size}, cameras {cameras}, seed {metrics['seed']}, ", *origin_text(metrics))
-
-
-def write_pair_report(path: str | Path, metrics: Metrics) -> None:
-    """Write the report as Markdown."""
-    write_markdown(path, pair_report_document(metrics))
 
 
 def dissection_table(metrics: Metrics) -> Table:

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ghpt.report.document import Document
+
 Metrics = Mapping[str, Any]
 """The content of metrics.json."""
 
@@ -13,10 +15,10 @@ Metrics = Mapping[str, Any]
 class Report:
     """What a problem shows of a test run, in the terminal and in files."""
 
-    print_table: Callable[[Metrics], None]
-    """Prints the main numbers."""
-    write_report: Callable[[Path, Metrics], None]
-    """Writes report.md."""
+    summary: Callable[[Metrics], Document]
+    """Returns the main numbers, for the terminal."""
+    document: Callable[[Metrics], Document]
+    """Returns all numbers, for report.md."""
     write_events: Callable[[Path, Any, Metrics], int]
     """Writes TensorBoard's events of the opened predictions and metrics into a folder.
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.rotations import nearest_rotation
 from ghpt.metrics.relative_pose import rotation_deg
-from ghpt.models.estimators.classical import Baseline
+from ghpt.models.estimators.classical import Estimator
 from ghpt.observations import Observations, Recording
 from ghpt.skeleton import BONES, JOINT, PELVIS, THORAX
 
@@ -79,7 +79,7 @@ def rig_difference(cameras: Cameras, reference: Cameras) -> RigDifference:
 
 
 def triangulate_recording(
-    recording: Recording, estimator: Baseline, without: int | None = None
+    recording: Recording, estimator: Estimator, without: int | None = None
 ) -> tuple[Float[Tensor, "T J 3"], Bool[Tensor, "T J"]]:
     """The recording's joints (world, mm) by ``estimator``, and which are estimated; ``without``
     leaves out a view.
@@ -108,7 +108,7 @@ def triangulate_recording(
 
 
 def held_out_errors(
-    recording: Recording, estimator: Baseline
+    recording: Recording, estimator: Estimator
 ) -> tuple[Float[Tensor, "T V J"], Bool[Tensor, "T V J"]]:
     """For each view the distance (pixels) of its key points from the joints that the *other* views
     give, and where there is one: seen in the view, estimated without it, and in front of it.

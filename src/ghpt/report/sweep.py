@@ -88,7 +88,7 @@ def _draw_method(axes: Axes, name: str, by_frames: Mapping[int, Sequence[float]]
         frames,
         np.minimum(mean, CLIP),
         color=style.colour,
-        linestyle=style.dashes,
+        linestyle=style.line,
         marker=style.marker,
         markersize=5,
         markeredgecolor="white",

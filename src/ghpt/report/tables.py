@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
-
-from rich.console import Console
 
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
@@ -22,8 +19,7 @@ from ghpt.report.document import (
     Table,
     Text,
 )
-from ghpt.report.markdown import render_markdown, write_markdown
-from ghpt.report.terminal import print_document
+from ghpt.report.markdown import render_markdown
 
 NAMES = {
     "h36m": "Human3.6M",
@@ -130,11 +126,6 @@ def summary_document(metrics: Metrics) -> Document:
     return Document("", [table])
 
 
-def print_table(metrics: Metrics, console: Console | None = None) -> None:
-    """Print the main table to the terminal (or to ``console``)."""
-    print_document(summary_document(metrics), console)
-
-
 def report_document(metrics: Metrics) -> Document:
     """Return the report of a test run."""
     about = (
@@ -157,11 +148,6 @@ def report_document(metrics: Metrics) -> Document:
     for subject in _first_selection(metrics)["pose_prior"]:
         blocks += [Heading(subject, 3), prior_table(metrics, subject)]
     return Document(f"Test on {title(metrics)}", blocks)
-
-
-def write_report(path: str | Path, metrics: Metrics) -> None:
-    """Write the report as Markdown."""
-    write_markdown(path, report_document(metrics))
 
 
 def origin_text(metrics: Metrics) -> tuple[Span, ...]:

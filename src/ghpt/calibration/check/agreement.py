@@ -11,7 +11,7 @@ from torch import Tensor
 from ghpt.calibration.check.setup import Look, Rays, Setup
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.estimators.classical import Baseline, MEstimator
+from ghpt.models.estimators.classical import Estimator, MEstimator
 from ghpt.observations import Observations
 
 LARGEST = 0.1
@@ -132,7 +132,7 @@ def _without(core: Bool[Tensor, " V"]) -> Bool[Tensor, "V V"]:
 
 
 def triangulated(
-    rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: Baseline
+    rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: Estimator
 ) -> tuple[Float[Tensor, "G F J 3"], Bool[Tensor, "G F J"]]:
     """Points from G choices of views by an estimator, in normalised image coordinates."""
     groups = len(used)

@@ -4,7 +4,7 @@ gave them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,12 +12,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.data.formats.key_points import KeyPoints
-from ghpt.data.formats.names import Name
-from ghpt.data.formats.skeletons import joints17
-from ghpt.data.people.views import check_pixels, matched
+from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError
-from ghpt.geometry.cameras import CameraSet
 
 _LEAST_JOINTS = 6
 """Seen in two views for a frame to be looked at."""
@@ -48,47 +44,31 @@ class Evidence:
         return (self.valid.shape[1] - 1) // 2
 
 
-def gather(
-    points: KeyPoints,
-    cameras: CameraSet,
-    match: Mapping[Name, Name],
-    views: Sequence[Name] | None,
-    frames: int,
-    max_shift: int,
-) -> tuple[Evidence, CameraSet, tuple[int, ...]]:
-    """At most ``frames`` frames, evenly spread over those in which people are seen; their cameras
-    in the order of the views; and which of the key points' views these are. ``max_shift``:
-    the largest shift, at most a quarter of the frames.
+def gather(sequence: Sequence, frames: int, max_shift: int) -> Evidence:
+    """Return at most ``frames`` frames, evenly spread over those in which people are seen.
 
-    Raises GhptDataError where views and cameras do not match, without extrinsics, and with fewer
-    than two views.
+    ``max_shift``: the largest shift, at most a quarter of the frames. Raises GhptDataError without
+    extrinsics, and with fewer than two views.
     """
-    pairs = matched(points.path, points.views, cameras, match, views)
-    if len(pairs) < 2:
-        raise GhptDataError(
-            points.path, "views", f"{len(pairs)} with a camera", "Give two views or more."
-        )
-    at = [view for view, _ in pairs]
-    ordered = cameras.select([camera for _, camera in pairs])
-    if not ordered.calibrated:
+    cameras = sequence.cameras
+    if len(cameras) < 2:
+        problem = f"{len(cameras)} with a camera"
+        raise GhptDataError(sequence.source, "views", problem, "Give two views or more.")
+    if not cameras.calibrated:
         hint = "Calibrate them first: python calibrate.py --help"
         raise GhptDataError(
             cameras.path, "extrinsics", "are missing: there is nothing to check", hint
         )
-    return of_points(points, at, ordered, frames, max_shift), ordered, tuple(at)
-
-
-def of_points(
-    points: KeyPoints, at: Sequence[int], cameras: CameraSet, frames: int, max_shift: int
-) -> Evidence:
-    """The evidence of the views ``at``, whose cameras these are. Raises GhptDataError for key
-    points that are no pixels.
-    """
-    at = list(at)
-    arrays = points.key_points[:, at], points.confidence[:, at], points.valid[:, at]
-    check_pixels(points.path, arrays[0], arrays[2], cameras)
-    pixels, _, valid = joints17(points.path, points.joints, *arrays)
-    return choose(cameras.names, pixels, valid, points.frame, frames, max_shift, points.path)
+    points = sequence.detected()
+    return choose(
+        cameras.names,
+        points.pixels,
+        points.valid,
+        sequence.frame,
+        frames,
+        max_shift,
+        sequence.source,
+    )
 
 
 def choose(

@@ -37,7 +37,7 @@ from ghpt.calibration.check.units import unit_of
 from ghpt.errors import check
 from ghpt.geometry.cameras import camera_centre
 from ghpt.metrics.relative_pose import rotation_deg
-from ghpt.models.estimators.classical import Baseline, MEstimator
+from ghpt.models.estimators.classical import Estimator, MEstimator
 from ghpt.models.relative_pose.scale import STATURES, stature
 
 _FEW = 80
@@ -112,7 +112,7 @@ class Doctor:
     pairs: int
     rounds: int
     estimator: MEstimator
-    consensus: Baseline
+    consensus: Estimator
 
     def __post_init__(self) -> None:
         for name in ("discrete", "shifted", "lens", "lenses", "fitted"):

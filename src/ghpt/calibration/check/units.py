@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
-from ghpt.models.estimators.classical import Baseline
+from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.relative_pose.scale import HUMAN, STATURES, stature
 from ghpt.observations import Observations
@@ -39,7 +39,7 @@ def unit_for(height: float) -> float:
 
 
 def decide_unit(
-    cameras: CameraSet, batch: Observations, estimator: Baseline, ask: bool
+    cameras: CameraSet, batch: Observations, estimator: Estimator, ask: bool
 ) -> CameraSet:
     """The cameras in mm, by the size of the person whom they show in these frames; as they are
     where the file says its unit, and where the views do not agree on a person, which is another

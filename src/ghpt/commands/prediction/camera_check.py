@@ -8,7 +8,7 @@ from jaxtyping import Int
 from ghpt.calibration.check.evidence import choose
 from ghpt.calibration.check.examination import Checkup, Doctor
 from ghpt.calibration.check.setup import as_filed
-from ghpt.commands.prediction.frames import Frames
+from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError
 
 _WHOLE = 2048
@@ -16,27 +16,26 @@ _WHOLE = 2048
 _WINDOWS = 12
 
 
-def check_cameras(frames: Frames, doctor: Doctor) -> Checkup | None:
-    """What the camera check finds on a bounded number of frames; None where no frame shows enough."""
-    if frames.detected is None:
-        return None
-    rows = _windows(len(frames))
-    file = frames.detected.cameras
-    pixels, _, valid = frames.detected.read(rows)
-    pixels = np.asarray(pixels, np.float64)
+def check_cameras(sequence: Sequence, doctor: Doctor) -> Checkup | None:
+    """Return what the camera check finds on a bounded number of frames.
+
+    Returns None where no frame shows enough.
+    """
+    rows = _windows(len(sequence))
+    points = sequence.detected(rows)
     try:
         evidence = choose(
-            file.names,
-            pixels,
-            np.array(valid),
-            frames.frame[rows],
+            sequence.cameras.names,
+            points.pixels.astype(np.float64),
+            np.array(points.valid),
+            sequence.frame[rows],
             doctor.frames,
             doctor.shift,
-            frames.source,
+            sequence.source,
         )
     except GhptDataError:  # no frame has enough joints in two views: nothing can be told
         return None
-    return doctor(evidence, as_filed(file))
+    return doctor(evidence, as_filed(sequence.cameras))
 
 
 def _windows(count: int) -> Int[np.ndarray, " N"]:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from rich.console import Console
-
+from ghpt.commands.prediction.result import PredictionResult
+from ghpt.commands.prediction.statistics import EstimatorErrors, Quantiles
 from ghpt.commands.prediction.verdict import verdict_lines
 from ghpt.models.relative_pose.scale import SEGMENTS
 from ghpt.report.document import (
@@ -22,110 +22,104 @@ from ghpt.report.document import (
     prose,
 )
 from ghpt.report.tables import NAMES, NONE
-from ghpt.report.terminal import print_document
-
-Numbers = Mapping[str, Any]
-"""The content of prediction.json, or a part of it."""
 
 
-def summary_lines(numbers: Numbers) -> list[str]:
+def summary_lines(result: PredictionResult) -> list[str]:
     """Return the sentences that hold for the recording as a whole."""
-    lines = [f"Estimator: {numbers['estimator_text']}.", _coverage_line(numbers)]
-    flipped = [f"{count} frames of {view}" for view, count in numbers["swapped"].items() if count]
+    coverage = result.coverage
+    lines = [f"Estimator: {result.estimator_text}.", _coverage_line(result)]
+    flipped = [f"{count} frames of {view}" for view, count in coverage.swapped.items() if count]
     if flipped:
         lines.append(f"Left and right exchanged in {', '.join(flipped)}.")
-    if numbers["stature_mm"]:
-        lines.append(f"The person measures {numbers['stature_mm'] / 1000:.2f} m.")
-    if numbers["smooth_hz"]:
-        lines.append(f"Smoothed: zero-phase Butterworth, {numbers['smooth_hz']:g} Hz.")
+    if coverage.stature_mm:
+        lines.append(f"The person measures {coverage.stature_mm / 1000:.2f} m.")
+    if result.smooth_hz:
+        lines.append(f"Smoothed: zero-phase Butterworth, {result.smooth_hz:g} Hz.")
     return lines
 
 
-def _coverage_line(numbers: Numbers) -> str:
+def _coverage_line(result: PredictionResult) -> str:
     """Return which shares of the joints are observed, filled and missing."""
-    share = numbers["share"]
+    missing = dict(result.coverage.share)
+    observed = missing.pop("observed")
+    filled = missing.pop("filled")
     line = (
-        f"{numbers['frames']} frames, {len(numbers['cameras'])} views: "
-        f"{100 * share['observed']:.1f} % of the joints observed"
+        f"{result.coverage.frames} frames, {len(result.cameras)} views: "
+        f"{100 * observed:.1f} % of the joints observed"
     )
-    if share["filled"]:
-        line += f", {100 * share['filled']:.1f} % filled"
-    missing = [
-        f"{100 * part:.1f} % {state.replace('_', ' ')}"
-        for state, part in share.items()
-        if part and state not in ("observed", "filled")
+    if filled:
+        line += f", {100 * filled:.1f} % filled"
+    shares = [
+        f"{100 * share:.1f} % {state.replace('_', ' ')}"
+        for state, share in missing.items()
+        if share
     ]
-    return f"{line}; missing: {', '.join(missing)}." if missing else f"{line}."
+    return f"{line}; missing: {', '.join(shares)}." if shares else f"{line}."
 
 
-def error_table(numbers: Numbers, title: str = "") -> Table:
+def error_table(result: PredictionResult, title: str = "") -> Table:
     """Return the reprojection and held-out errors of the estimator for each view."""
-    own = next(iter(_estimators(numbers).values()))
-    reprojection = own["reprojection"]
-    held_out = own["held_out"]
+    own = next(iter(_estimators(result).values()))
     rows = []
-    for view in numbers["cameras"]:
-        errors = [*_quantiles(reprojection["views"][view]), *_quantiles(held_out["views"][view])]
-        rows.append([view, *errors])
-    rows.append(["all", *_quantiles(reprojection), *_quantiles(held_out)])
+    for view in result.cameras:
+        reprojection = _quantiles(own.reprojection.views[view])
+        rows.append([view, *reprojection, *_quantiles(own.held_out.views[view])])
+    rows.append(["all", *_quantiles(own.reprojection), *_quantiles(own.held_out)])
     return Table(["view", "reprojected px", "90 %", "held out px", "90 %"], rows, title)
 
 
-def comparison_table(numbers: Numbers, title: str = "") -> Table:
+def comparison_table(result: PredictionResult, title: str = "") -> Table:
     """Return the errors of each estimator."""
     header = ["estimator", "reproj. px", "90 %", "held out px", "90 %", "segm. %", "joints %"]
     rows = []
-    for name, errors in _estimators(numbers).items():
+    for name, errors in _estimators(result).items():
         rows.append(
             [
                 _display_name(name),
-                *_quantiles(errors["reprojection"]),
-                *_quantiles(errors["held_out"]),
-                format_number(errors["segments"]["median"], 1, 100),
-                format_number(errors["placed"], 1, 100),
+                *_quantiles(errors.reprojection),
+                *_quantiles(errors.held_out),
+                format_number(errors.segments.median, 1, 100),
+                format_number(errors.placed, 1, 100),
             ]
         )
     return Table(header, rows, title)
 
 
-def _estimators(numbers: Numbers) -> Mapping[str, Numbers]:
-    return numbers["evaluation"]["estimators"]
+def _estimators(result: PredictionResult) -> Mapping[str, EstimatorErrors]:
+    return result.evaluation.estimators
 
 
 def _display_name(estimator: str) -> str:
     return NAMES.get(estimator, estimator.replace("_", " "))
 
 
-def summary_document(numbers: Numbers) -> Document:
+def summary_document(result: PredictionResult) -> Document:
     """Return the table of the views, that of several estimators, and what holds for all."""
-    blocks: list[Block] = [error_table(numbers, f"Prediction of {numbers['data']}")]
-    if len(_estimators(numbers)) > 1:
-        blocks.append(comparison_table(numbers, "Estimators on the same key points"))
-    blocks += [Paragraph(line) for line in summary_lines(numbers)]
+    blocks: list[Block] = [error_table(result, f"Prediction of {result.data}")]
+    if len(_estimators(result)) > 1:
+        blocks.append(comparison_table(result, "Estimators on the same key points"))
+    blocks += [Paragraph(line) for line in summary_lines(result)]
     return Document("", blocks)
 
 
-def print_prediction(numbers: Numbers, console: Console | None = None) -> None:
-    """Print the summary."""
-    print_document(summary_document(numbers), console)
+def verdict_document(result: PredictionResult) -> Document:
+    """Return the last words in the terminal."""
+    if result.verdict is None:
+        return Document("", [])
+    lines = verdict_lines(result.verdict.numbers())
+    return Document("", [Paragraph(line) for line in lines])
 
 
-def print_verdict(verdict: dict[str, Any], console: Console | None = None) -> None:
-    """Print the last words in the terminal."""
-    lines = [Paragraph(line) for line in verdict_lines(verdict)]
-    print_document(Document("", lines), console)
-
-
-def report_document(numbers: Numbers) -> Document:
+def report_document(result: PredictionResult) -> Document:
     """Return the report of a prediction."""
-    frames = numbers["evaluation"]["frames"]
+    frames = result.evaluation.frames
+    verdict = result.verdict.numbers() if result.verdict else None
     return Document(
-        f"Prediction of {numbers['data']}",
+        f"Prediction of {result.data}",
         [
-            Paragraph(_origin(numbers["provenance"])),
-            Bullets(summary_lines(numbers)),
-            Heading("Verdict"),
-            *_verdict_blocks(numbers["verdict"]),
+            Paragraph(_origin(result.provenance)),
+            Bullets(summary_lines(result)),
+            *(_verdict_blocks(verdict) if verdict else []),
             Heading("Errors by view"),
             Paragraph(
                 prose(
@@ -135,7 +129,7 @@ def report_document(numbers: Numbers) -> Document:
                     str(frames),
                 )
             ),
-            error_table(numbers),
+            error_table(result),
             Heading("Estimators"),
             Paragraph(
                 prose(
@@ -144,46 +138,46 @@ def report_document(numbers: Numbers) -> Document:
                     "much their lengths vary over the frames; *joints*: those with a position."
                 )
             ),
-            comparison_table(numbers),
+            comparison_table(result),
             Heading("Joints"),
             Paragraph("Frames in which each joint is observed, %."),
-            _joint_table(numbers),
+            _joint_table(result),
             Heading("Segments"),
             Paragraph(
                 "Variation of their lengths over the frames, % (1.4826 x median deviation over "
                 "median)."
             ),
-            _segment_table(numbers),
+            _segment_table(result),
         ],
     )
 
 
-def _origin(provenance: Numbers) -> Text:
+def _origin(provenance: Mapping[str, Any]) -> Text:
     commit = Code(provenance["commit"] or NONE)
     command = Code(provenance["command"])
     version = f"ghpt {provenance['ghpt']}, commit "
     return (version, commit, f", seed {provenance['seed']}: ", command, ".")
 
 
-def _joint_table(numbers: Numbers) -> Table:
+def _joint_table(result: PredictionResult) -> Table:
     rows = []
-    for name, share in numbers["observed"].items():
+    for name, share in result.coverage.observed.items():
         rows.append([name.replace("_", " "), format_number(share, 1, 100)])
     return Table(["joint", "observed"], rows)
 
 
-def _segment_table(numbers: Numbers) -> Table:
-    estimators = _estimators(numbers)
+def _segment_table(result: PredictionResult) -> Table:
+    estimators = _estimators(result)
     rows = []
     for name in SEGMENTS:
-        variations = [errors["segments"]["each"][name] for errors in estimators.values()]
+        variations = [errors.segments.each[name] for errors in estimators.values()]
         cells = [format_number(variation, 1, 100) for variation in variations]
         rows.append([name.replace("_", " "), *cells])
     return Table(["segment", *map(_display_name, estimators)], rows)
 
 
-def _verdict_blocks(verdict: Numbers) -> list[Block]:
-    blocks: list[Block] = [Paragraph(Strong(verdict["level"]))]
+def _verdict_blocks(verdict: Mapping[str, Any]) -> list[Block]:
+    blocks: list[Block] = [Heading("Verdict"), Paragraph(Strong(verdict["level"]))]
     findings = [_finding_text(finding) for finding in verdict["findings"]]
     if findings:
         blocks.append(Bullets(findings))
@@ -192,7 +186,7 @@ def _verdict_blocks(verdict: Numbers) -> list[Block]:
     return blocks
 
 
-def _finding_text(finding: Numbers) -> Text:
+def _finding_text(finding: Mapping[str, Any]) -> Text:
     limit = ""
     if finding["limit"]:
         limit = f" ({finding['value']:.3g}, limit {finding['limit']:g})"
@@ -206,5 +200,5 @@ def format_number(value: float | None, digits: int, factor: int = 1) -> str:
     return NONE if value is None else f"{factor * value:.{digits}f}"
 
 
-def _quantiles(errors: Numbers) -> list[str]:
-    return [format_number(errors["median"], 1), format_number(errors["p90"], 1)]
+def _quantiles(errors: Quantiles) -> list[str]:
+    return [format_number(errors.median, 1), format_number(errors.p90, 1)]

@@ -11,10 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.formats.validate import open_input
+from ghpt.data.people.detections import Detections
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
 COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
@@ -46,16 +48,12 @@ def is_caliscope(text: str) -> bool:
     return set(COLUMNS) <= {name.strip().strip('"') for name in re.split("[,;\t]", header)}
 
 
-def read_caliscope(
-    path: Path,
-) -> tuple[
-    tuple[str, ...], Int[np.ndarray, " T"], Float[np.ndarray, "T V K 2"], Bool[np.ndarray, "T V K"]
-]:
-    """Camera names (``cam_<port>``), frames (``sync_index``), the body's 33 landmarks (pixels) and
-    which are there.
+def read_caliscope(path: Path) -> Detections:
+    """Return the one person of the table: 33 landmarks in the views ``cam_<port>``.
 
-    Points beyond the body's (hands, face) are left out. There is no confidence in these files.
-    Raises GhptDataError for a table that is damaged, or that has a point twice.
+    The frame numbers are ``sync_index``. Points beyond the body's (hands, face) are left out. There
+    is no confidence in these files. Raises GhptDataError for a table that is damaged, or that has a
+    point twice.
     """
     table = _table(path)
     body = (table[:, 2] >= 0) & (table[:, 2] < _JOINTS)
@@ -75,8 +73,11 @@ def read_caliscope(
     shape = (len(frames), len(ports), _JOINTS)
     points = np.zeros((*shape, 2))
     valid = np.zeros(shape, np.bool_)
-    points.reshape(-1, 2)[place], valid.reshape(-1)[place] = table[:, 3:5], True
-    return tuple(f"cam_{port}" for port in ports), frames, points, valid
+    points.reshape(-1, 2)[place] = table[:, 3:5]
+    valid.reshape(-1)[place] = True
+    views = tuple(f"cam_{port}" for port in ports)
+    key_points = KeyPoints(points, valid.astype(np.float64), valid)
+    return Detections.of_person(path, views, SKELETONS["mediapipe_33"], frames, key_points)
 
 
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:
@@ -108,20 +109,30 @@ def _lines(handle: io.TextIOBase) -> Iterator[str]:
         yield line
 
 
+def _number(cell: str) -> float:
+    """Return a cell's number; an empty one is a point that was not found."""
+    return float(cell) if cell.strip() else np.nan
+
+
 def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
     line = handle.readline(_LONGEST_LINE)
     if ";" in line or "\t" in line:
-        hint = "Save it with commas between the columns and points in the numbers (a spreadsheet may have changed it)."
+        hint = (
+            "Save it with commas between the columns and points in the numbers "
+            "(a spreadsheet may have changed it)."
+        )
         raise GhptDataError(path, "", "has columns that commas do not part", hint)
     try:
         header = [name.strip() for name in next(csv.reader([line]))]
         columns = [header.index(name) for name in COLUMNS]
-        # an empty cell is a point that was not found
-        empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a table without rows
             table = np.loadtxt(
-                _lines(handle), delimiter=",", usecols=columns, converters=empty, ndmin=2
+                _lines(handle),
+                delimiter=",",
+                usecols=columns,
+                converters=dict.fromkeys(columns, _number),
+                ndmin=2,
             )
     except (ValueError, StopIteration, csv.Error) as error:
         raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error

@@ -25,7 +25,8 @@ OF_POOL = ("weight", "average", "most", "best")
 LEARNED = (*OF_POOL, "view_weights")
 """Every estimator that is not classical."""
 
-Estimator = Callable[[Observations], PoseEstimate]
+Estimator = Callable[[Any], Any]
+"""From observations to an estimate, as the problem of the model has them."""
 
 
 @dataclass(frozen=True)
