@@ -62,7 +62,7 @@ def train_command(typed, conf, tmp_path):
 
 
 @pytest.fixture
-def test_command(typed, conf, tmp_path, train_command):
+def test_command(typed, conf, tmp_path, train_command, blank_figures):
     assert train_command(f"output={tmp_path / 'model'}")[0] == 0
     words = ("data=toy", f"ckpt={tmp_path / 'model' / 'last.ckpt'}", f"output={tmp_path / 'out'}")
     quiet = ("progress_bar=false", "trainer.accelerator=cpu")
