@@ -4,7 +4,6 @@ happens.
 
 import os
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -98,11 +97,11 @@ def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_pat
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
     run = children.start(program, diary, tmp_path / "tasks")
-    until(lambda: {2, 3} <= set(numbers(diary)))
+    children.wait_until(lambda: {2, 3} <= set(numbers(diary)), run)
     run.send_signal(getattr(signal, stop))
     assert run.wait(children.LIMIT) == status
     workers = {int(line.split()[1]) for line in diary.read_text().splitlines()}
-    until(lambda: not any(alive(worker) for worker in workers))
+    children.wait_until(lambda: not any(alive(worker) for worker in workers))
     first, *others = slow(diary)
     assert first.done(tmp_path / "tasks")
     assert not any(other.done(tmp_path / "tasks") for other in others)
@@ -119,10 +118,3 @@ def alive(process):
         )
     except OSError:
         return False
-
-
-def until(condition):
-    end = time.monotonic() + children.LIMIT
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.1)

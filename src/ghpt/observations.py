@@ -151,7 +151,7 @@ class PairObservations(Samples):
     confidence: Float[Tensor, "B V M J"]
     valid: Bool[Tensor, "B V M J"]
 
-    def of_pair(self, values: Tensor) -> Tensor:
+    def select_pair(self, values: Tensor) -> Tensor:
         """Select from values [B, V, ...] those of the two views: [B, 2, ...]."""
         return select_views(values, self.pair)
 
@@ -162,10 +162,10 @@ class PairObservations(Samples):
 
         N = M x J; normalised image coordinates, float64. A point that one view misses is 0.
         """
-        pixels = self.of_pair(self.key_points).flatten(2, 3)
-        points = normalise(self.of_pair(self.K), pixels)
+        pixels = self.select_pair(self.key_points).flatten(2, 3)
+        points = normalise(self.select_pair(self.K), pixels)
         finite = torch.isfinite(points).all(-1).all(1)
-        both = self.of_pair(self.valid).flatten(2, 3).all(dim=1) & finite
+        both = self.select_pair(self.valid).flatten(2, 3).all(dim=1) & finite
         points = torch.where(both[:, None, :, None], points, 0.0)
         return points[:, 0], points[:, 1], both
 

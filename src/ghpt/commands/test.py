@@ -42,7 +42,7 @@ class TestSettings(OutputSettings):
     frames: int | None
     """Frames of a pair of cameras; None: as many as in training."""
     data: Target
-    trainer: dict[str, Any]
+    trainer: Target
     view_weights: Target | None = None
     baselines: Target = field(default_factory=dict)
     camera_baselines: Target = field(default_factory=dict)

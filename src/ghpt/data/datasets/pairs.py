@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -60,6 +61,17 @@ class RigOfSplit:
     """X*: uniform in the box of the true joints, world, mm."""
 
 
+class Place(NamedTuple):
+    """What a sample is of."""
+
+    rig: int
+    """Index among the rigs."""
+    draw: int
+    """Number of the draw of frames, over all rigs."""
+    pair: tuple[int, int]
+    """The two views."""
+
+
 class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
     """Every pair of views of every rig, with ``draws`` draws of M frames each, or random ones.
 
@@ -93,17 +105,18 @@ class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
             return self.samples
         return len(self.rigs) * self.draws * len(self.pairs)
 
-    def locate(self, sample: int) -> tuple[int, int, tuple[int, int]]:
-        """Return the rig's index, the number of the draw over all rigs, and the pair of views."""
+    def locate(self, sample: int) -> Place:
+        """Return what a sample is of."""
         if self.samples is None:
             draw, pair = divmod(sample, len(self.pairs))
-            return draw // self.draws, draw, self.pairs[pair]
+            return Place(draw // self.draws, draw, self.pairs[pair])
         key = randomness.key(self.seed, "pair", sample)
-        of_rig, of_pair = randomness.uniform(key, (2,)).tolist()
-        rig = int(of_rig * len(self.rigs))
-        return rig, sample, self.pairs[int(of_pair * len(self.pairs))]
+        for_rig, for_pair = randomness.uniform(key, (2,)).tolist()
+        rig = int(for_rig * len(self.rigs))
+        pair = int(for_pair * len(self.pairs))
+        return Place(rig, sample, self.pairs[pair])
 
-    def frames_of(self, rig: int, draw: int) -> list[tuple[int, Int[np.ndarray, " F"]]]:
+    def locate_frames(self, rig: int, draw: int) -> list[tuple[int, Int[np.ndarray, " F"]]]:
         """Return the frames of a draw: recording and positions in it, in order of time.
 
         There are at most M of them.
@@ -122,14 +135,14 @@ class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
 
     def __getitem__(self, samples: Sequence[int]) -> Labelled[PairObservations, PairTruth]:
         places = [self.locate(sample) for sample in samples]
-        rig = torch.tensor([place[0] for place in places], dtype=torch.int64)
-        draw = torch.tensor([place[1] for place in places], dtype=torch.int64)
-        pair = torch.tensor([place[2] for place in places], dtype=torch.int64).reshape(-1, 2)
+        rig = torch.tensor([place.rig for place in places], dtype=torch.int64)
+        draw = torch.tensor([place.draw for place in places], dtype=torch.int64)
+        pair = torch.tensor([place.pair for place in places], dtype=torch.int64).reshape(-1, 2)
         K = torch.stack([r.cameras.K for r in self.rigs])[rig]
         R = torch.stack([r.cameras.R for r in self.rigs])[rig]
         t = torch.stack([r.cameras.t for r in self.rigs])[rig]
         cameras = Cameras(select_views(K, pair), select_views(R, pair), select_views(t, pair))
-        seen = self._seen(places)
+        seen = self._gather(places)
         observations = PairObservations(
             index=torch.tensor(list(samples), dtype=torch.int64),
             rig=rig,
@@ -144,16 +157,16 @@ class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
         points = torch.stack([r.points for r in self.rigs])[rig]
         return Labelled(observations, PairTruth(cameras, points))
 
-    def _seen(self, places: Sequence[tuple[int, int, tuple[int, int]]]) -> _Seen:
+    def _gather(self, places: Sequence[Place]) -> _Seen:
         """Return what all views see at these places; the pairs of one draw are read once."""
-        drawn: dict[int, _Seen] = {}
-        for rig, draw, _ in places:
-            if draw not in drawn:
-                drawn[draw] = self._read(rig, draw)
         if not places:
             views, joints = self.recordings[0].key_points.shape[1:3]
             return _Seen.empty(0, views, self.settings.frames, joints)
-        each = [drawn[draw] for _, draw, _ in places]
+        drawn: dict[int, _Seen] = {}
+        for place in places:
+            if place.draw not in drawn:
+                drawn[place.draw] = self._read(place.rig, place.draw)
+        each = [drawn[place.draw] for place in places]
         return _Seen(
             key_points=np.stack([seen.key_points for seen in each]),
             confidence=np.stack([seen.confidence for seen in each]),
@@ -165,7 +178,7 @@ class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
         views, joints = self.recordings[0].key_points.shape[1:3]
         seen = _Seen.empty(views, self.settings.frames, joints)
         row = 0
-        for index, positions in self.frames_of(rig, draw):
+        for index, positions in self.locate_frames(rig, draw):
             recording = self.recordings[index]
             rows = slice(row, row + len(positions))
             seen.key_points[:, rows] = recording.key_points[positions].swapaxes(0, 1)

@@ -10,10 +10,11 @@ from ghpt.skeleton import BONES, JOINT, PELVIS
 _LEFT = JOINT["left_shoulder"]
 _RIGHT = JOINT["right_shoulder"]
 
+Points = Float[Tensor, "*B J 3"]
+Joints = Bool[Tensor, "*B J"]
 
-def centre_on_pelvis(
-    points: Float[Tensor, "*B J 3"], estimated: Bool[Tensor, "*B J"]
-) -> Float[Tensor, "*B J 3"]:
+
+def centre_on_pelvis(points: Points, estimated: Joints) -> Points:
     """Return the points with the pelvis at the origin, where missing joints are too.
 
     Where the pelvis is missing, the mean of the estimated joints takes its place.
@@ -27,9 +28,7 @@ def centre_on_pelvis(
     return torch.where(estimated[..., None], centred, 0.0)
 
 
-def torso_normal_to_z(
-    centred: Float[Tensor, "*B J 3"], estimated: Bool[Tensor, "*B J"]
-) -> Float[Tensor, "*B 3 3"]:
+def torso_normal_to_z(centred: Points, estimated: Joints) -> Float[Tensor, "*B 3 3"]:
     """Return the smallest rotation that brings the torso's normal to the z axis.
 
     The normal is that of the plane through both shoulders and the pelvis. The rotation is the
@@ -47,18 +46,14 @@ def torso_normal_to_z(
     return rotation_between(normal, z.expand_as(normal))
 
 
-def normalised_coordinates(
-    points: Float[Tensor, "*B J 3"], estimated: Bool[Tensor, "*B J"]
-) -> Float[Tensor, "*B J*3"]:
+def normalised_coordinates(points: Points, estimated: Joints) -> Float[Tensor, "*B J*3"]:
     """Return pelvis-centred, rotated coordinates in mm, flattened; 0 for missing joints."""
     centred = centre_on_pelvis(points, estimated)
     rotation = torso_normal_to_z(centred, estimated)
     return (centred @ rotation.mT).flatten(-2)
 
 
-def bone_lengths(
-    points: Float[Tensor, "*B J 3"], estimated: Bool[Tensor, "*B J"]
-) -> Float[Tensor, "*B L"]:
+def bone_lengths(points: Points, estimated: Joints) -> Float[Tensor, "*B L"]:
     """Return the lengths (mm) of the 16 bones; 0 where an end is missing."""
     start = [a for a, _ in BONES]
     end = [b for _, b in BONES]

@@ -31,9 +31,9 @@ def size_in_image(batch: PairObservations) -> Float[Tensor, " B"]:
 
     It is 0 where nobody is seen.
     """
-    K = batch.of_pair(batch.K)
-    pixels = batch.of_pair(batch.key_points).double()
-    valid = batch.of_pair(batch.valid)
+    K = batch.select_pair(batch.K)
+    pixels = batch.select_pair(batch.key_points).double()
+    valid = batch.select_pair(batch.valid)
     focal = (K[..., 0, 0] + K[..., 1, 1]).double() / 2
     size = person_scale(pixels, valid) / focal[..., None]
     size = torch.where(size > 0, size, torch.nan).flatten(1)

@@ -52,7 +52,7 @@ def evaluate_pairs(predictions: PairPredictions) -> dict[str, Any]:
     pairs = [tuple(views) for views in np.unique(measured.pair, axis=0).tolist()]
     selections = {}
     for name in names:
-        of_pairs = {pair_name(pair): _pair_numbers(measured.of(name, pair)) for pair in pairs}
+        of_pairs = {pair_name(pair): _pair_numbers(measured.select(name, pair)) for pair in pairs}
         means = {
             key: _mean([numbers[key] for numbers in of_pairs.values()])
             for key in (*ERRORS, "coverage")
@@ -112,30 +112,34 @@ def errors_of_pair(
     frames plots these.
     """
     measured = _measure(predictions, list(predictions.names))
-    return {name: measured.of(name, pair)[error].tolist() for name in predictions.names}
+    return {name: measured.select(name, pair)[error].tolist() for name in predictions.names}
 
 
 def camera_after(
     reference: Cameras, R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"]
 ) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"]]:
-    """World to target camera, of the relative pose after the reference camera (of each of B,
-    without a view axis).
+    """Return R and t from the world to the target camera of a relative pose.
+
+    The reference cameras have no view axis.
     """
-    return R @ reference.R, (R @ reference.t[..., None])[..., 0] + t
+    shifted = (R @ reference.t[..., None])[..., 0]
+    return R @ reference.R, shifted + t
 
 
 def _with_target(truth: Cameras, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"]) -> Cameras:
+    """Return the true reference cameras with the targets of these relative poses."""
     reference = truth.index((slice(None), 0))
     target_R, target_t = camera_after(reference, R, t)
-    return Cameras(
-        truth.K, torch.stack((reference.R, target_R), 1), torch.stack((reference.t, target_t), 1)
-    )
+    both_R = torch.stack((reference.R, target_R), 1)
+    both_t = torch.stack((reference.t, target_t), 1)
+    return Cameras(truth.K, both_R, both_t)
 
 
 def _mean_over_points(errors: Float[Tensor, "B P"], counted: Tensor) -> Float[Tensor, " B"]:
-    return torch.where(
-        counted.any(-1), (errors * counted).sum(-1) / counted.sum(-1).clamp_min(1), torch.inf
-    )
+    """Return the mean over the points that count, inf where none does."""
+    total = (errors * counted).sum(-1)
+    mean = total / counted.sum(-1).clamp_min(1)
+    return torch.where(counted.any(-1), mean, torch.inf)
 
 
 @dataclass(frozen=True)
@@ -147,7 +151,7 @@ class _Measured:
     pair: Int[np.ndarray, "N 2"]
     draw: Int[np.ndarray, " N"]
 
-    def of(self, name: str, pair: tuple[int, ...]) -> dict[str, Float[np.ndarray, " D"]]:
+    def select(self, name: str, pair: tuple[int, ...]) -> dict[str, Float[np.ndarray, " D"]]:
         """Return the errors under a name on a pair, draw by draw."""
         rows = (self.pair == pair).all(-1)
         return {error: values[rows] for error, values in self.errors[name].items()}
@@ -174,19 +178,23 @@ def _measure(predictions: PairPredictions, names: Sequence[str]) -> _Measured:
 def _pair_numbers(errors: Mapping[str, Float[np.ndarray, " D"]]) -> dict[str, Any]:
     """Return a pair's entry of metrics.json, from the errors of its draws."""
     median = {error: _finite(np.median(values)) for error, values in errors.items()}
-    measured = {error: errors[error][np.isfinite(errors[error])] for error in ERRORS}
-    numbers: dict[str, Any] = {error: median[error] for error in ERRORS}
-    numbers["coverage"] = float(np.isfinite(errors["E_R"]).mean())
-    numbers["mean"] = {
-        error: _finite(values.mean()) if len(values) else None for error, values in measured.items()
+    mean: dict[str, float | None] = {}
+    deviation: dict[str, float | None] = {}
+    for error in ERRORS:
+        values = errors[error]
+        measured = values[np.isfinite(values)]
+        mean[error] = _finite(measured.mean()) if len(measured) else None
+        deviation[error] = _finite(measured.std(ddof=1)) if len(measured) > 1 else None
+    alone = {
+        part: {error: median[f"{error} {part}"] for error in ("E_2D", "E_3D")} for part in ALONE
     }
-    numbers["deviation"] = {
-        error: _finite(values.std(ddof=1)) if len(values) > 1 else None
-        for error, values in measured.items()
+    return {
+        **{error: median[error] for error in ERRORS},
+        "coverage": float(np.isfinite(errors["E_R"]).mean()),
+        "mean": mean,
+        "deviation": deviation,
+        **alone,
     }
-    for part in ALONE:
-        numbers[part] = {error: median[f"{error} {part}"] for error in ("E_2D", "E_3D")}
-    return numbers
 
 
 def _finite(value: float) -> float | None:
