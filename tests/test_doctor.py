@@ -13,6 +13,7 @@ from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 
 ROOT = Path(__file__).resolve().parents[1]
+pytestmark = pytest.mark.usefixtures("little_data")
 
 
 def settings(*overrides: str) -> dict:
