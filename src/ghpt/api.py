@@ -1,0 +1,378 @@
+"""The public face: NumPy or torch arrays in, NumPy arrays out, with the defaults of the commands.
+
+Key points are pixels as a detector gives them, [T V J 2] for T frames, V views and J joints; NaN is
+a missing key point. Cameras are what `read_cameras` returns, or the three arrays K [V 3 3], R
+[V 3 3] and t [V 3] of ideal pinholes, world to camera, mm. Defaults are those of the packaged
+configuration: nothing here has numbers of its own.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int, Int8
+from torch import Tensor
+
+from ghpt.commands.overrides import Source, compose
+from ghpt.config import CONF, build, plain, settings
+from ghpt.data.people.detections import Detections
+from ghpt.data.people.persons import person_sequence
+from ghpt.data.points import KeyPoints
+from ghpt.errors import GhptDataError, check
+from ghpt.geometry.cameras import Cameras, CameraSet
+from ghpt.geometry.lens import undistort
+from ghpt.metrics.pose_error import Kind, joint_errors
+from ghpt.metrics.relative_pose import (
+    quaternion_error,
+    rotation_deg,
+    translation_deg,
+    translation_error,
+)
+from ghpt.observations import Observations, PoseEstimate, Truth
+from ghpt.reconstruction import About, Reconstruction, State, concatenate
+from ghpt.skeleton import JOINTS
+
+if TYPE_CHECKING:
+    from ghpt.commands.predict import PredictSettings
+    from ghpt.models.estimators.predictors import Classical, Learned
+
+Array = np.ndarray | Tensor
+CamerasLike = CameraSet | tuple[Array, Array, Array]
+"""Cameras of a file, or K, R and t of ideal pinholes."""
+Rows = Int[np.ndarray, " N"]
+_ARRAYS = "arrays"
+"""What errors call the input, and files its source."""
+
+
+@dataclass(frozen=True)
+class Poses:
+    """T frames of J joints, found in V views; NaN where a joint has no position."""
+
+    about: About
+    """The names of joints and views, the rate, and what made them."""
+    reconstruction: Reconstruction
+    """The same as tensors, with covariances; see `ghpt.reconstruction.Reconstruction`."""
+
+    def __len__(self) -> int:
+        return len(self.reconstruction)
+
+    @property
+    def points(self) -> Float[np.ndarray, "T J 3"]:
+        """World, mm, float64."""
+        return _with_nan(self.reconstruction.points, self.reconstruction.has_position)
+
+    @property
+    def error(self) -> Float[np.ndarray, "T J"]:
+        """Root mean square reprojection error over the views that made the joint, pixels."""
+        return _with_nan(self.reconstruction.error, self.reconstruction.has_position)
+
+    @property
+    def state(self) -> Int8[np.ndarray, "T J"]:
+        """Values of `ghpt.reconstruction.State`: 0 is observed, others say why there is nothing."""
+        return self.reconstruction.state.numpy()
+
+    @property
+    def views(self) -> Bool[np.ndarray, "T V J"]:
+        """The views that made each joint."""
+        return self.reconstruction.views.numpy()
+
+    @property
+    def frame(self) -> Int[np.ndarray, " T"]:
+        """The recording's own frame numbers."""
+        return self.reconstruction.frame.numpy()
+
+
+@dataclass(frozen=True)
+class RelativePoseErrors:
+    """Errors of N relative poses of cameras."""
+
+    rotation_deg: Float[np.ndarray, "*N"]
+    """Angle between the rotations, in [0, 180]."""
+    quaternion: Float[np.ndarray, "*N"]
+    """The paper's E_R, the distance of the unit quaternions."""
+    translation_mm: Float[np.ndarray, "*N"]
+    """The paper's E_t, the distance of the translations."""
+    translation_deg: Float[np.ndarray, "*N"]
+    """Angle between the directions of the translations, in [0, 180]."""
+
+
+def triangulate(key_points: Array, cameras: CamerasLike, confidence: Array | None = None) -> Poses:
+    """Return the points [T J 3] that key points [T V J 2] of any J joints show, robustly.
+
+    The estimator is predict.py's classical one, without what takes a known skeleton (the search for
+    exchanged sides). A missing or wrong key point costs its joint that view alone; a joint that
+    fewer than two views see, or that no two views agree on, is NaN, and ``state`` says why.
+    ``confidence`` [T V J] is in [0, 1]; a key point of confidence 0 is missing. Raises
+    GhptDataError for shapes that do not fit, and for cameras without extrinsics.
+    """
+    rig = as_camera_set(cameras)
+    points = _key_points(key_points, confidence, len(rig))
+    names = tuple(f"joint_{joint}" for joint in range(points.valid.shape[-1]))
+    defaults = _defaults()
+    name = defaults["triangulation"]
+    group = defaults["estimator"]["classical"] | {"flips": None}
+    baseline = build(defaults["baselines"][name], f"baselines.{name}")
+    predictor: Classical = build(group, "estimator.classical")(estimator=baseline)
+    observations = _observe(points, rig)
+
+    def read(rows: Rows) -> Observations:
+        return observations.rows(torch.from_numpy(rows))
+
+    part = _estimate(
+        predictor, read, len(points), Chunks(defaults["fitted_frames"], defaults["batch"])
+    )
+    return Poses(_about(name, names, rig.names, None), part)
+
+
+class Predictor:
+    """Predicts 3D poses as predict.py does: robustly, with exchanged sides undone.
+
+    Without a checkpoint the estimator is classical; with one that train.py wrote it is the trained
+    model. ``changes`` are settings of conf/predict.yaml, such as ``triangulation="linear"`` or
+    ``hypotheses=100``; ``trust`` names packages of your own whose classes the checkpoint uses.
+    Raises GhptCheckpointError and GhptConfigError.
+    """
+
+    def __init__(
+        self, checkpoint: str | Path | None = None, trust: Sequence[str] = (), **changes: Any
+    ) -> None:
+        from ghpt.commands.predict import build_estimator
+
+        path = None if checkpoint is None else str(checkpoint)
+        self.settings = default_settings(ckpt=path, trust=list(trust), **changes)
+        self.estimator = build_estimator(self.settings)
+
+    def __call__(
+        self,
+        key_points: Array | Detections,
+        cameras: CamerasLike,
+        confidence: Array | None = None,
+        rate_hz: float | None = None,
+    ) -> Poses:
+        """Return the poses of one person in millimetres, in the world of the cameras.
+
+        ``key_points`` are what `read_key_points` returns, or [T V 17 2] in the order of
+        `ghpt.skeleton.JOINTS`, with the views in the order of the cameras. Raises GhptDataError.
+        """
+        from ghpt.commands.inputs import resolve_unit
+
+        rig = as_camera_set(cameras)
+        people = as_detections(key_points, rig, confidence, rate_hz)
+        wanted = self.settings
+        sequence = person_sequence(people, rig, wanted.match, wanted.views, wanted.person)
+        sequence.cameras.check_calibrated(sequence.source)
+        sequence = resolve_unit(sequence, build(wanted.doctor, "doctor").consensus, ask=True)
+        chunks = Chunks(wanted.fitted_frames, wanted.batch)
+        part = _estimate(self.estimator.predictor, sequence.read, len(sequence), chunks)
+        names = sequence.cameras.names
+        about = _about(self.estimator.name, JOINTS, names, sequence.rate_hz)
+        x, y, z = sequence.origin.tolist()
+        return Poses(replace(about, origin=(x, y, z)), sequence.to_world(part))
+
+
+def write_poses(path: str | Path, poses: Poses | Array, rate_hz: float | None = None) -> None:
+    """Write poses into a file of the format that its suffix names.
+
+    Formats are npz, csv, parquet, trc, c3d, html and rrd (rerun). ``poses`` may be points [T J 3]
+    (mm; NaN is missing); 17 joints are named as `ghpt.skeleton.JOINTS`. ``rate_hz`` is of the
+    frames, which trc and c3d need. Raises GhptConfigError for an unknown suffix and for what the
+    format lacks, GhptDataError for what it cannot hold.
+    """
+    from ghpt.export import WRITERS
+
+    writers = {Path(writer.file).suffix: writer for writer in WRITERS.values()}
+    suffix = Path(path).suffix
+    check(suffix in writers, str(path), f"has the suffix {suffix!r}", f"Use {', '.join(writers)}.")
+    whole = poses if isinstance(poses, Poses) else _poses_of(poses)
+    about = whole.about if rate_hz is None else replace(whole.about, rate_hz=rate_hz)
+    writers[suffix].write(Path(path), about, lambda: iter([whole.reconstruction]))
+
+
+def mpjpe(estimate: Array, truth: Array, kind: Kind = "absolute") -> float:
+    """Return the mean per-joint position error of poses [*T 17 3], in their unit.
+
+    It is the mean over all joints that both have (NaN is missing), and NaN if there are none.
+    ``kind``: ``absolute`` in the world, ``relative`` to the pelvis, or ``aligned`` by the best
+    similarity of each frame.
+    """
+    points = _tensor(estimate)
+    true_points = _tensor(truth)
+    found = PoseEstimate(points.nan_to_num(0.0), torch.isfinite(points).all(-1))
+    known = Truth(true_points.nan_to_num(0.0), torch.isfinite(true_points).all(-1))
+    errors, counted = joint_errors(found, known, kind)
+    return float(errors.sum() / counted.sum())
+
+
+def relative_pose_errors(R: Array, t: Array, true_R: Array, true_t: Array) -> RelativePoseErrors:
+    """Return the errors of relative poses ``x_b = R x_a + t``: rotations [*N 3 3], mm [*N 3]."""
+    rotation = _tensor(R)
+    true_rotation = _tensor(true_R)
+    translation = _tensor(t)
+    true_translation = _tensor(true_t)
+    return RelativePoseErrors(
+        rotation_deg=rotation_deg(rotation, true_rotation).numpy(),
+        quaternion=quaternion_error(rotation, true_rotation).numpy(),
+        translation_mm=translation_error(translation, true_translation).numpy(),
+        translation_deg=translation_deg(translation, true_translation).numpy(),
+    )
+
+
+def as_camera_set(cameras: CamerasLike) -> CameraSet:
+    """Return cameras with names, lenses and extrinsics, as the rest of the project takes them."""
+    if isinstance(cameras, CameraSet):
+        return cameras
+    K, R, t = (_tensor(part) for part in cameras)
+    shapes = (K.shape[1:], R.shape[1:], t.shape[1:])
+    if shapes != ((3, 3), (3, 3), (3,)) or not len(K) == len(R) == len(t):
+        shown = ", ".join(str(list(part.shape)) for part in (K, R, t))
+        problem = f"K, R and t have the shapes {shown}"
+        raise GhptDataError("cameras", "", problem, "Give [V 3 3], [V 3 3] and [V 3].")
+    names = [f"cam_{view:02d}" for view in range(len(K))]
+    return CameraSet.from_cameras(names, Cameras(K, R, t), path="cameras")
+
+
+def as_detections(
+    key_points: Array | Detections,
+    cameras: CameraSet,
+    confidence: Array | None = None,
+    rate_hz: float | None = None,
+) -> Detections:
+    """Return key points of the 17 joints as one person's detections in the views of cameras."""
+    if isinstance(key_points, Detections):
+        return key_points if rate_hz is None else replace(key_points, rate_hz=rate_hz)
+    points = _key_points(key_points, confidence, len(cameras))
+    if points.valid.shape[-1] != len(JOINTS):
+        problem = f"there are {points.valid.shape[-1]} joints, not {len(JOINTS)}"
+        hint = "Give them in the order of ghpt.skeleton.JOINTS, NaN where there is none."
+        raise GhptDataError("key_points", "", problem, hint)
+    frame = np.arange(len(points))
+    return Detections.of_person(_ARRAYS, cameras.names, JOINTS, frame, points, rate_hz)
+
+
+@functools.cache
+def _defaults() -> dict[str, Any]:
+    """Return the packaged settings of predict.py."""
+    values: dict[str, Any] = plain(compose(Source(CONF, "predict"), ["output=''"]))
+    return values
+
+
+@dataclass(frozen=True)
+class Chunks:
+    """How the frames of a recording are taken."""
+
+    fitted_frames: int
+    """At most so many, evenly spread, give the recording's noise."""
+    batch: int
+    """Frames at a time."""
+
+
+def default_settings(**changes: Any) -> PredictSettings:
+    """Return the settings of conf/predict.yaml with some changed."""
+    from ghpt.commands.predict import PredictSettings
+
+    return settings(PredictSettings, _defaults() | changes)
+
+
+def _estimate(
+    predictor: Classical | Learned,
+    read: Callable[[Rows], Observations],
+    count: int,
+    chunks: Chunks,
+) -> Reconstruction:
+    """Return what the predictor makes of ``count`` frames."""
+    spread = np.linspace(0, count - 1, min(chunks.fitted_frames, count)).astype(np.int64)
+    fitted = predictor.fitted(read(np.unique(spread)))
+    parts = []
+    for start in range(0, count, chunks.batch):
+        rows = np.arange(start, min(start + chunks.batch, count))
+        parts.append(fitted(read(rows)))
+    return concatenate(parts)
+
+
+def _observe(points: KeyPoints, rig: CameraSet) -> Observations:
+    """Return observations of ideal pinholes, without what the lens cannot show."""
+    pixels = torch.from_numpy(points.pixels)
+    frames, views, joints, _ = pixels.shape
+    by_view = pixels.transpose(0, 1).reshape(views, frames * joints, 2)
+    ideal, possible = undistort(by_view, rig.K, rig.distortion)
+    shape = (views, frames, joints)
+    return Observations(
+        index=torch.arange(frames),
+        recording=torch.zeros(frames, dtype=torch.int64),
+        cameras=rig.cameras.to(torch.float64).expand(frames),
+        key_points=ideal.reshape(*shape, 2).transpose(0, 1).contiguous(),
+        confidence=torch.from_numpy(points.confidence),
+        valid=torch.from_numpy(points.valid) & possible.reshape(shape).transpose(0, 1),
+    )
+
+
+def _key_points(key_points: Array, confidence: Array | None, views: int) -> KeyPoints:
+    """Return key points and what is valid of them. Raises GhptDataError for a wrong shape."""
+    pixels = _tensor(key_points).numpy()
+    if pixels.ndim != 4 or pixels.shape[1] != views or pixels.shape[-1] != 2:
+        problem = f"has the shape {list(pixels.shape)}, for {views} cameras"
+        raise GhptDataError("key_points", "", problem, f"Give [T {views} J 2].")
+    valid = np.isfinite(pixels).all(-1)
+    if confidence is None:
+        sure = np.ones(valid.shape)
+    else:
+        sure = _tensor(confidence).numpy()
+        if sure.shape != valid.shape:
+            problem = f"has the shape {list(sure.shape)}"
+            raise GhptDataError("confidence", "", problem, f"Give {list(valid.shape)}.")
+    valid &= sure > 0
+    return KeyPoints(np.where(valid[..., None], pixels, 0.0), np.nan_to_num(sure), valid)
+
+
+def _poses_of(points: Array) -> Poses:
+    """Return points [T J 3] as poses of which no more is known."""
+    values = _tensor(points)
+    if values.ndim != 3 or values.shape[-1] != 3:
+        problem = f"has the shape {list(values.shape)}"
+        raise GhptDataError("poses", "", problem, "Give [T J 3].")
+    frames, joints, _ = values.shape
+    there = torch.isfinite(values).all(-1)
+    state = torch.where(there, int(State.OBSERVED), int(State.FEW_VIEWS)).to(torch.int8)
+    names = JOINTS if joints == len(JOINTS) else tuple(f"joint_{j}" for j in range(joints))
+    part = Reconstruction(
+        frame=torch.arange(frames),
+        points=torch.where(there[..., None], values, 0.0),
+        state=state,
+        error=torch.zeros(frames, joints),
+        views=torch.zeros(frames, 0, joints, dtype=torch.bool),
+        covariance=torch.zeros(frames, joints, 6),
+        score=torch.zeros(frames),
+        flipped=torch.zeros(frames, 0, dtype=torch.bool),
+    )
+    return Poses(_about("unknown", names, (), None), part)
+
+
+def _about(
+    estimator: str, joints: tuple[str, ...], views: tuple[str, ...], rate_hz: float | None
+) -> About:
+    return About(
+        name=_ARRAYS,
+        source=_ARRAYS,
+        estimator=estimator,
+        joints=joints,
+        camera_names=views,
+        rate_hz=rate_hz,
+        smoothed=False,
+        provenance={},
+    )
+
+
+def _tensor(values: Array) -> Tensor:
+    """Return an array as a float64 tensor on the CPU."""
+    return torch.as_tensor(values).detach().to("cpu", torch.float64)
+
+
+def _with_nan(values: Tensor, there: Bool[Tensor, "T J"]) -> np.ndarray:
+    mask = there.reshape(*there.shape, *[1] * (values.ndim - there.ndim))
+    return torch.where(mask, values, torch.nan).numpy()
