@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from ghpt.api import (
         Poses,
         Predictor,
+        calibrate_rig,
+        check_cameras,
         mpjpe,
         relative_pose_errors,
         triangulate,
@@ -25,6 +27,8 @@ __all__ = [
     "CameraSet",
     "Poses",
     "Predictor",
+    "calibrate_rig",
+    "check_cameras",
     "load_model",
     "mpjpe",
     "read_cameras",

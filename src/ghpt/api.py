@@ -39,6 +39,7 @@ from ghpt.reconstruction import About, Reconstruction, State, concatenate
 from ghpt.skeleton import JOINTS
 
 if TYPE_CHECKING:
+    from ghpt.calibration.findings import Finding
     from ghpt.commands.predict import PredictSettings
     from ghpt.models.estimators.predictors import Classical, Learned
 
@@ -114,7 +115,7 @@ def triangulate(key_points: Array, cameras: CamerasLike, confidence: Array | Non
     rig = as_camera_set(cameras)
     points = _key_points(key_points, confidence, len(rig))
     names = tuple(f"joint_{joint}" for joint in range(points.valid.shape[-1]))
-    defaults = _defaults()
+    defaults = _defaults("predict")
     name = defaults["triangulation"]
     group = defaults["estimator"]["classical"] | {"flips": None}
     baseline = build(defaults["baselines"][name], f"baselines.{name}")
@@ -176,6 +177,57 @@ class Predictor:
         return Poses(replace(about, origin=(x, y, z)), sequence.to_world(part))
 
 
+def calibrate_rig(
+    key_points: Array | Detections,
+    cameras: CamerasLike | Array,
+    height: float | None = None,
+    confidence: Array | None = None,
+    **changes: Any,
+) -> tuple[CameraSet, tuple[Finding, ...]]:
+    """Return the cameras that can be used, calibrated from the person in view, and what is wrong.
+
+    ``cameras`` have known lenses, or are the intrinsics K [V 3 3] alone; extrinsics that they have
+    only fix the world. ``height`` (mm) of the person gives the length; without it an average one is
+    taken, and a finding says so. ``changes`` are settings of conf/calibrate.yaml. Raises
+    GhptDataError where no rig can be found.
+    """
+    from ghpt.commands.calibrate import CalibrateSettings, Case, solve_rig
+
+    defaults = _defaults("calibrate")
+    scale = defaults["scale"] | {"height": height}
+    wanted = settings(CalibrateSettings, defaults | {"scale": scale} | changes)
+    rig = as_camera_set(cameras)
+    people = as_detections(key_points, rig, confidence)
+    sequence = person_sequence(people, rig, wanted.match, wanted.views, person=None)
+    solution = solve_rig(wanted, Case(sequence, "the given calibration", is_own=True))
+    findings = solution.findings
+    if not solution.usable:
+        problem = findings[0].text if findings else "no two cameras can be calibrated"
+        raise GhptDataError(people.path, "calibration", problem, "Record more, or other, motion.")
+    usable = sequence.cameras.select(solution.usable)
+    return usable.with_cameras(solution.rig.index(solution.usable)), findings
+
+
+def check_cameras(
+    key_points: Array | Detections, cameras: CamerasLike, confidence: Array | None = None
+) -> tuple[Finding, ...]:
+    """Return what is wrong with calibrated cameras, as the person in view shows it.
+
+    Each finding has a code, the cameras it is about and a text; there are none where nothing is
+    wrong. Raises GhptDataError for key points that cannot tell.
+    """
+    from ghpt.calibration.check.evidence import gather
+    from ghpt.calibration.check.setup import setup_of
+
+    check_of = build(_defaults("cameras")["camera_check"], "camera_check")
+    rig = as_camera_set(cameras)
+    people = as_detections(key_points, rig, confidence)
+    sequence = person_sequence(people, rig, person=None, check_sizes=False)
+    evidence = gather(sequence, check_of.frames, check_of.shift)
+    findings: tuple[Finding, ...] = check_of(evidence, setup_of(sequence.cameras)).findings
+    return findings
+
+
 def write_poses(path: str | Path, poses: Poses | Array, rate_hz: float | None = None) -> None:
     """Write poses into a file of the format that its suffix names.
 
@@ -223,10 +275,14 @@ def relative_pose_errors(R: Array, t: Array, true_R: Array, true_t: Array) -> Re
     )
 
 
-def as_camera_set(cameras: CamerasLike) -> CameraSet:
-    """Return cameras with names, lenses and extrinsics, as the rest of the project takes them."""
+def as_camera_set(cameras: CamerasLike | Array) -> CameraSet:
+    """Return named cameras; those of K alone have no extrinsics."""
     if isinstance(cameras, CameraSet):
         return cameras
+    if not isinstance(cameras, tuple):
+        K = _tensor(cameras)
+        unknown = (torch.eye(3).expand(K.shape), K.new_zeros(len(K), 3))
+        return replace(as_camera_set((K, *unknown)), R=None, t=None)
     K, R, t = (_tensor(part) for part in cameras)
     shapes = (K.shape[1:], R.shape[1:], t.shape[1:])
     if shapes != ((3, 3), (3, 3), (3,)) or not len(K) == len(R) == len(t):
@@ -256,9 +312,9 @@ def as_detections(
 
 
 @functools.cache
-def _defaults() -> dict[str, Any]:
-    """Return the packaged settings of predict.py."""
-    values: dict[str, Any] = plain(compose(Source(CONF, "predict"), ["output=''"]))
+def _defaults(command: str) -> dict[str, Any]:
+    """Return the packaged settings of a command."""
+    values: dict[str, Any] = plain(compose(Source(CONF, command), ["output=''"]))
     return values
 
 
@@ -276,7 +332,7 @@ def default_settings(**changes: Any) -> PredictSettings:
     """Return the settings of conf/predict.yaml with some changed."""
     from ghpt.commands.predict import PredictSettings
 
-    return settings(PredictSettings, _defaults() | changes)
+    return settings(PredictSettings, _defaults("predict") | changes)
 
 
 def _estimate(
