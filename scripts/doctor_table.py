@@ -23,7 +23,7 @@ from ghpt.calibration.check.examination import Doctor
 from ghpt.calibration.check.setup import as_filed
 from ghpt.commands.cameras import from_recording
 from ghpt.config import build, plain
-from ghpt.data.datasets.store import prepared
+from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.people.persons import person_sequence
@@ -47,7 +47,7 @@ def synthetic(
         for split in ("train", "validation", "test"):
             data = build(compose([f"data={name}", f"data.evaluate={split}"])["data"], "data")
             made = {"source": data.source, "split": split}
-            stored = prepared(
+            stored = prepare(
                 data.cache,
                 data.cache_key(split),
                 lambda data=data, split=split: data.generate(split),

@@ -20,9 +20,9 @@ from ghpt.commands.cameras import examine
 from ghpt.config import plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_pose2sim
-from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
-from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.cameras import project
 from ghpt.geometry.lens import distort
 from ghpt.report.rig_comparison import rig_difference
 from ghpt.skeleton import JOINT, JOINTS
@@ -56,7 +56,7 @@ def scene():
     truth with it.
     """
     rig = human36m_rig("S9")
-    truth = motion(0, "S9", "S9/Walking-1", "Walking", 400, 50.0)[::5]
+    truth = draw_motion(0, "S9", "S9/Walking-1", "Walking", 400, 50.0)[::5]
     pixels, _ = project(rig.cameras, torch.from_numpy(truth).double())
     seen_by_lens = distort(pixels.transpose(0, 1).flatten(1, 2), rig.cameras.K, rig.distortion)
     values = seen_by_lens.unflatten(1, truth.shape[:2]).transpose(0, 1).numpy()
@@ -78,8 +78,8 @@ def scene():
 def write(folder, scene, extrinsics: bool = True):
     rig, points, _ = scene
     if not extrinsics:
-        same = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
-        rig = replace(rig, cameras=Cameras(rig.cameras.K, *same))
+        R, t = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
+        rig = replace(rig, R=R, t=t)
     write_pose2sim(folder / "cameras.toml", rig, {})
     write_person(folder / "points.npz", points)
     return (

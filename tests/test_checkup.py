@@ -23,7 +23,7 @@ from ghpt.config import build, plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.people.persons import person_sequence
-from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import project
@@ -50,7 +50,7 @@ def case(
     person, about.
     """
     rig = panoptic_rig((10, 12, 16, 18, 22, 6)[:views])
-    walk = motion(3, "P", "P/Walking", "Walking", frames, 25.0)
+    walk = draw_motion(3, "P", "P/Walking", "Walking", frames, 25.0)
     points = torch.from_numpy(np.stack([walk[..., 0], -walk[..., 2], walk[..., 1]], axis=-1))
     pixels, depth = project(rig.cameras.index(None), points)
     bent = distort(pixels.transpose(0, 1).flatten(1, 2), rig.cameras.K, rig.distortion)

@@ -1,6 +1,5 @@
 """A name in a report or in the terminal is shown as it is, whatever it is made of."""
 
-import io
 from itertools import pairwise
 
 import numpy as np
@@ -8,31 +7,33 @@ import pytest
 import torch
 from markdown_it import MarkdownIt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from rich.console import Console
 
 from ghpt.commands.cameras import _print as print_checkup
 from ghpt.commands.cameras import report as checkup_report
-from ghpt.commands.prediction.report import prediction_report, print_prediction, print_verdict
+from ghpt.commands.prediction.report import (
+    report_document,
+    summary_document,
+    verdict_document,
+)
+from ghpt.commands.prediction.result import PredictionResult
+from ghpt.commands.prediction.statistics import (
+    BoneVariation,
+    Coverage,
+    EstimatorErrors,
+    Evaluation,
+    Quantiles,
+    ScaledErrors,
+    ViewErrors,
+)
+from ghpt.commands.prediction.verdict import Finding, Level, Verdict
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.scale import SEGMENTS
 from ghpt.report.calibration import calibration_report, print_calibration
-from ghpt.report.escape import Markdown, code, code_block, escaped, plain
+from ghpt.report.markdown import render_markdown
 from ghpt.report.rig_comparison import Similarity
 from ghpt.report.rig_figure import rig_figure
-from ghpt.report.tables import markdown
+from ghpt.report.terminal import print_document
 
-NAMES = (
-    "a|b<c>[red]",
-    "`x`",
-    "*a* _b_ __c__",
-    "[l](http://x)",
-    "~~a~~ &lt;",
-    "\\|",
-    "$a$",
-    "<b>",
-    "_",
-    "cam_01",
-)
 BAD = "a|b<c>[red]"
 
 
@@ -48,83 +49,36 @@ def rendered(text: str) -> list[tuple[str, str]]:
     return shown
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_a_name_is_shown_as_it_is_in_text_and_in_a_table(name):
-    assert rendered(f"# A {escaped(name)} b") == [("heading_open", f"A {name} b")]
-    assert rendered(f"- {code(name)}") == [("paragraph_open", name)]
-    cells = rendered(markdown(["view", name], [[name, "1"], ["b", "2"]]))
-    assert cells == [
-        ("th_open", "view"),
-        ("th_open", name),
-        ("td_open", name),
-        ("td_open", "1"),
-        ("td_open", "b"),
-        ("td_open", "2"),
-    ]
-
-
-def test_a_name_of_several_lines_stays_in_one():
-    assert rendered(f"- {escaped('a' + chr(10) + '# b' + chr(27) + '[31m')}") == [
-        ("paragraph_open", "a # b [31m")
-    ]
-    assert "\x1b" not in plain("a\x1b[31mb").plain
-
-
-def test_a_command_with_backticks_does_not_end_its_block():
-    assert MarkdownIt().parse(code_block("a\n```\n# b", "bash"))[0].content == "a\n```\n# b\n"
-
-
-def test_what_is_markdown_already_stays():
-    assert "| **a** |" in markdown([Markdown("**a**")], [])
-
-
-def test_the_terminal_shows_brackets_and_colons_as_they_are():
-    buffer = io.StringIO()
-    Console(file=buffer, width=80).print(plain("[red]a[/red] :smile: [/]"))
-    assert buffer.getvalue().strip() == "[red]a[/red] :smile: [/]"
-
-
-ERRORS = {"median": 1.0, "p90": 2.0}
 PROVENANCE = {"ghpt": "0", "commit": None, "seed": 0, "command": "python predict.py 'a`b'"}
 
 
-def prediction() -> dict:
-    each = {"views": {BAD: ERRORS}, **ERRORS}
-    found = {
-        "reprojection": each,
-        "held_out": each,
-        "placed": 1.0,
-        "segments": {"median": 0.1, "each": {}},
-    }
-    found["segments"]["each"] = dict.fromkeys(SEGMENTS, 0.1)
-    return {
-        "data": BAD,
-        "cameras": [BAD],
-        "estimator": "linear",
-        "estimator_text": BAD,
-        "frames": 3,
-        "smooth_hz": None,
-        "share": {"observed": 1.0, "filled": 0.0},
-        "swapped": {BAD: 2},
-        "observed": {BAD: 1.0},
-        "evaluation": {"frames": 3, "estimators": {"linear": found, "x": found}},
-        "provenance": PROVENANCE,
-        "stature_mm": 1700.0,
-        "verdict": {
-            "level": "look at this",
-            "undecidable": [BAD],
-            "findings": [
-                {
-                    "level": "look at this",
-                    "code": "moved",
-                    "text": f"{BAD} is off",
-                    "value": 0.1,
-                    "limit": 0.0,
-                    "command": f"python cameras.py {BAD}",
-                },
-            ],
-        },
-    }
+def prediction() -> PredictionResult:
+    errors = ViewErrors(1.0, 2.0, 3, {BAD: Quantiles(1.0, 2.0, 3)})
+    found = EstimatorErrors(
+        reprojection=errors,
+        held_out=errors,
+        segments=BoneVariation(0.1, dict.fromkeys(SEGMENTS, 0.1)),
+        placed=1.0,
+        scales=ScaledErrors(None, {}),
+    )
+    finding = Finding("moved", Level.LOOK, f"{BAD} is off", 0.1, 0.0, f"python cameras.py {BAD}")
+    return PredictionResult(
+        data=BAD,
+        source=BAD,
+        cameras=(BAD,),
+        estimator="linear",
+        estimator_text=BAD,
+        rate_hz=None,
+        fill_frames=None,
+        smooth_hz=None,
+        coverage=Coverage(3, {"observed": 1.0, "filled": 0.0}, {BAD: 1.0}, {BAD: 2}, 1700.0),
+        scales=ScaledErrors(None, {}),
+        unit_mm=1.0,
+        evaluation=Evaluation(3, {"linear": found, "x": found}),
+        formats=[],
+        provenance=PROVENANCE,
+        verdict=Verdict((finding,), (BAD,)),
+    )
 
 
 def calibration() -> dict:
@@ -165,7 +119,7 @@ def checkup() -> dict:
 @pytest.mark.parametrize(
     ("numbers", "report", "times"),
     [
-        (prediction, prediction_report, 8),
+        (prediction, lambda numbers: render_markdown(report_document(numbers)), 8),
         (calibration, calibration_report, 6),
         (checkup, checkup_report, 3),
     ],
@@ -178,8 +132,8 @@ def test_a_report_shows_names_as_they_are(numbers, report, times):
 @pytest.mark.parametrize(
     ("numbers", "show", "times"),
     [
-        (prediction, print_prediction, 4),
-        (lambda: prediction()["verdict"], print_verdict, 3),
+        (prediction, lambda result: print_document(summary_document(result)), 4),
+        (prediction, lambda result: print_document(verdict_document(result)), 3),
         (calibration, print_calibration, 6),
         (checkup, print_checkup, 3),
     ],

@@ -14,17 +14,17 @@ from typing import Any
 import pytest
 import torch
 
+import sections
 import toys
-from ghpt.commands.test import test
-from ghpt.commands.train import train
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.models.checkpoint import FIELD, load_model, read_checkpoint
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.registry import PARTS, build_registered, packages_to_trust
 from ghpt.paper.ablations.tables import ARTEFACTS
-from ghpt.paper.engine.setup import Setup, compose
+from ghpt.paper.engine.setup import compose
 from ghpt.paper.engine.tasks import with_dependencies
 from signing import save_signed
+from toys import train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 ABLATED = {
@@ -93,8 +93,8 @@ class Wide(PoseTriangulation):
         super().__init__(**settings)
         self.factor = factor
 
-    def describe(self, hypotheses):
-        return self.factor * super().describe(hypotheses)
+    def featurize(self, hypotheses):
+        return self.factor * super().featurize(hypotheses)
 
 
 def function(size, clip, slope):
@@ -116,15 +116,9 @@ def of_conf() -> dict[str, dict[str, Any]]:
 
 def of_the_ablations() -> dict[str, dict[str, Any]]:
     """The model of every training that reproduce.py changes something in."""
-    setup = Setup(
-        CONF,
-        {"human36m": None, "panoptic": None},
-        {"train": (), "test": ()},
-        {"ablation": ABLATED},
-        0,
-    )
+    small = sections.setup(ablation=ABLATED)
     tasks = with_dependencies(
-        itertools.chain.from_iterable(item.tasks(setup).values() for item in ARTEFACTS)
+        itertools.chain.from_iterable(item.tasks(small).values() for item in ARTEFACTS)
     )
     return {
         task.name: task.config["model"]
@@ -208,13 +202,13 @@ def test_a_model_of_one_s_own_trains_and_tests(tmp_path: Path, own: Path, name: 
         "hypotheses": None,
         "baselines": baselines,
     }
-    metrics = test(again | {"trust": ["mine.scorers"]}, tmp_path / "tested")
-    assert metrics["selections"]["weight"]["mpjpe_relative"] > 0
+    result = toys.run_test(again | {"trust": ["mine.scorers"]}, tmp_path / "tested")
+    assert result.metrics["selections"]["weight"]["mpjpe_relative"] > 0
     forget()
     with pytest.raises(
         GhptCheckpointError, match=r"needs classes of mine\.scorers.*'trust=\[mine\.scorers\]'"
     ):
-        test(again, tmp_path / "tested")
+        toys.run_test(again, tmp_path / "tested")
     assert not [name for name in sys.modules if name.split(".")[0] == "mine"]
 
 
@@ -270,6 +264,14 @@ def test_a_package_has_all_its_modules_trusted(
     path = checkpoint_of(loss={"_target_": "mine.losses.Expected"})
     model, _ = load_model(path, ["mine"])
     assert type(model.loss).__module__ == "mine.losses"
+
+
+def test_a_problem_of_one_s_own_is_derived_from_problem(
+    own: Path, checkpoint_of: Callable[..., Path]
+) -> None:
+    path = checkpoint_of(problem={"_target_": "mine.scorers.NoModule"})
+    with pytest.raises(GhptCheckpointError, match=r"is no ghpt\.models\.problem\.Problem"):
+        load_model(path, ["mine.scorers"])
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ from ghpt.calibration.check.units import UNITS_MM
 from ghpt.commands.app import Command
 from ghpt.commands.calibrate import people_note
 from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     find_recording,
     input_settings,
@@ -33,7 +34,6 @@ from ghpt.commands.inputs import (
     own_sequence,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
