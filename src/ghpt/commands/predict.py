@@ -292,15 +292,10 @@ def _with_flips(settings: PredictSettings, group: Target) -> dict[str, Any]:
 def open_sequence(settings: PredictSettings, doctor: Doctor) -> Sequence:
     """Return what is predicted: the user's own key points, or a recording of the data set."""
     if not settings.keypoints:
-        return data_sequence(settings)
+        return recording_sequence(settings)
     sequence = _files_sequence(settings)
     sequence.cameras.check_calibrated(sequence.source)
     return resolve_unit(sequence, doctor.consensus, ask=True)
-
-
-def data_sequence(settings: PredictSettings) -> Sequence:
-    """Return a recording of the data set."""
-    return recording_sequence(settings)
 
 
 def _files_sequence(settings: PredictSettings) -> Sequence:

@@ -65,16 +65,16 @@ def read_caliscope(path: Path) -> Detections:
     ports, view = np.unique(index[:, 1], return_inverse=True)
     if len(ports) > _MOST_PORTS:
         raise GhptDataError(path, "port", f"names {len(ports)} cameras", _WRITE)
-    place = (row * len(ports) + view) * _JOINTS + index[:, 2]
-    if len(np.unique(place)) != len(place):
+    cell = (row * len(ports) + view) * _JOINTS + index[:, 2]
+    if len(np.unique(cell)) != len(cell):
         raise GhptDataError(
             path, "point_id", "a point is there twice in a frame of a camera", _WRITE
         )
     shape = (len(frames), len(ports), _JOINTS)
     points = np.zeros((*shape, 2))
     valid = np.zeros(shape, np.bool_)
-    points.reshape(-1, 2)[place] = table[:, 3:5]
-    valid.reshape(-1)[place] = True
+    points.reshape(-1, 2)[cell] = table[:, 3:5]
+    valid.reshape(-1)[cell] = True
     views = tuple(f"cam_{port}" for port in ports)
     key_points = KeyPoints(points, valid.astype(np.float64), valid)
     return Detections.of_person(path, views, SKELETONS["mediapipe_33"], frames, key_points)
