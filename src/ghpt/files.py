@@ -37,7 +37,7 @@ _ABANDONED = 24 * 3600.0
 
 @runtime_checkable
 class Guard(Protocol):
-    """Decides what may happen to the files of a folder; see `ghpt.commands.outputs.OutputFolder`."""
+    """Decides what may happen to a folder's files; see `ghpt.commands.outputs.OutputFolder`."""
 
     def before_replace(self, path: Path, new: Path) -> None:
         """``new`` is about to take the place of ``path``. Raises GhptDataError if it must not."""
@@ -85,7 +85,7 @@ def _temporary(path: Path) -> Path:
 
 @contextmanager
 def errors_name(path: str | Path) -> Iterator[None]:
-    """Have an OSError of the block that names no file name this one, such as that the disk is full."""
+    """Have an OSError of the block that names no file name this one (the disk is full, say)."""
     try:
         yield
     except OSError as error:

@@ -323,7 +323,7 @@ def _records(config: Any, output: Path) -> Iterator[None]:
 
 
 def _folder_names(overrides: Sequence[Override]) -> list[str]:
-    """Return the setting by which a job's folder is named by what the sweep changes, and no more."""
+    """Return the setting by which a job's folder is named by what the sweep changes alone."""
     fixed = ",".join(
         str(o.key_or_group)
         for o in overrides

@@ -135,7 +135,7 @@ class OutputFolder:
             self._write()
 
     def finished(self, settings: Mapping[str, Any]) -> str | None:
-        """What a finished run with these settings and inputs said here, if its files are all there."""
+        """Return what a finished run with these settings and inputs said; None without one."""
         try:
             record = json.loads((self.path / STATE / _FINISHED).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -175,7 +175,10 @@ class OutputFolder:
             if not self._owns(name):
                 raise _foreign(path)
             if name in self.files.keeps:
-                hint = "Go on with resume=true, start anew with overwrite=true, or name another output."
+                hint = (
+                    "Go on with resume=true, start anew with overwrite=true, "
+                    "or name another output."
+                )
                 raise GhptDataError(path, "", "is there from an earlier run", hint)
         for name in self.files.growing:
             if (self.path / name).exists() and name not in self._growing and not self.overwrite:
@@ -241,7 +244,7 @@ class OutputFolder:
 
 
 class SweepFolder(Callback):
-    """Hydra's callback that takes a sweep's folder before Hydra writes ``multirun.yaml`` into it."""
+    """Hydra's callback that takes a sweep's folder before Hydra writes into it."""
 
     _taken: ClassVar[list[OutputFolder]] = []
 

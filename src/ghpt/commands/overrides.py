@@ -53,22 +53,23 @@ def check_overrides(source: Source, words: Sequence[str]) -> list[Override]:
     overrides = [_parse(word) for word in words]
     with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
-        first = _search_path(source, overrides)
+        search_path = _search_path(source, overrides)
         groups = {}
         for override in overrides:
             group = override.key_or_group
-            choices = _choices(loader, source, group, first)
+            choices = _choices(loader, source, group, search_path)
             if choices and not override.is_delete():
-                chosen = [_check_choice(group, value, choices) for value in _values(override)]
-                groups[group] = f"{override.get_key_element()}={chosen[0]}"
-        composed = hydra.compose(source.name, overrides=[*first, *groups.values()])
+                groups[group] = _first_choice(override, choices)
+        chosen = [*search_path, *groups.values()]
+        composed = hydra.compose(source.name, overrides=chosen)
     config = OmegaConf.to_container(composed)
     for override in overrides:
         key = override.key_or_group
         is_hydras = key.startswith("hydra") or "@" in key
         is_group = key in groups or (source.folder / key).is_dir()
         if not is_hydras and not is_group:
-            _check_key(config, key, added=override.is_add() or override.is_force_add())
+            added = override.is_add() or override.is_force_add()
+            _check_key(config, key, added)
     return overrides
 
 
@@ -121,13 +122,28 @@ def _values(override: Override) -> list[Any]:
     return [override.value()]
 
 
-def _check_choice(group: str, value: Any, existing: Sequence[str]) -> Any:
-    names = value if isinstance(value, list) else [value]
-    for name in names:
-        if name not in existing:
-            text = "null" if name is None else repr(name)
-            raise GhptConfigError(group, f"there is no {text}", suggest(str(name), existing))
-    return f"[{','.join(map(str, value))}]" if isinstance(value, list) else value
+def _first_choice(override: Override, existing: Sequence[str]) -> str:
+    """Return the override with the first of its values.
+
+    Raises GhptConfigError if one of them is no choice of the group.
+    """
+    values = _values(override)
+    for value in values:
+        names = value if isinstance(value, list) else [value]
+        for name in names:
+            _check_choice(override.key_or_group, name, existing)
+    first = values[0]
+    if isinstance(first, list):
+        names = [str(name) for name in first]
+        first = f"[{','.join(names)}]"
+    return f"{override.get_key_element()}={first}"
+
+
+def _check_choice(group: str, name: Any, existing: Sequence[str]) -> None:
+    if name not in existing:
+        text = "null" if name is None else repr(name)
+        hint = suggest(str(name), existing)
+        raise GhptConfigError(group, f"there is no {text}", hint)
 
 
 def _check_key(config: Any, key: str, added: bool) -> None:
