@@ -128,25 +128,23 @@ def atomic_write(
     temporary = _temporary(path)
     second = _temporary(path)
     try:
-        with open(
-            temporary, mode, **({} if "b" in mode else {"encoding": "utf-8", "newline": "\n"})
-        ) as handle:
+        with _open(temporary, mode) as handle:
             yield handle
             handle.flush()
             os.fsync(handle.fileno())
         if verify is not None:
             verify(temporary)
-        keep = previous is not None and path.exists()
-        if keep:
+        kept = previous if path.exists() else None
+        if kept is not None:
             _second_name(path, second)
         guard = _guard_of(path)
         if guard is not None:
             guard.before_replace(path, temporary)
-            if keep:
-                guard.before_replace(previous, second)
+            if kept is not None:
+                guard.before_replace(kept, second)
         os.replace(temporary, path)
-        if keep:
-            os.replace(second, previous)
+        if kept is not None:
+            os.replace(second, kept)
     except BaseException as error:
         for leftover in (temporary, second):
             with suppress(OSError):
@@ -155,6 +153,13 @@ def atomic_write(
             error.filename = str(path)
         raise
     _sync_folder(path.parent)
+
+
+def _open(path: Path, mode: str) -> IO[Any]:
+    """Open a file; text is UTF-8 with the same line ends on every system."""
+    if "b" in mode:
+        return open(path, mode)
+    return open(path, mode, encoding="utf-8", newline="\n")
 
 
 def remove(path: str | Path) -> None:

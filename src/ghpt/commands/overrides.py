@@ -3,7 +3,7 @@
 A mistake is named, with what exists, before anything heavy is imported.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,8 +99,11 @@ def _parse(word: str) -> Override:
 
 def _search_path(source: Source, overrides: Sequence[Override]) -> list[str]:
     """Return the override by which Hydra finds a user's own files too, if there are any."""
-    given = [o.value() for o in overrides if o.get_key_element() == _SEARCH_PATH]
-    places = [str(place) for place in given[-1]] if given else []
+    places: list[str] = []
+    for override in overrides:
+        value = override.value()
+        if override.get_key_element() == _SEARCH_PATH and isinstance(value, list):
+            places = [str(place) for place in value]
     if source.more is not None:
         places.append(f"file://{source.more}")
     quoted = ",".join(f"'{place}'" for place in places)
@@ -156,13 +159,13 @@ def _check_key(config: Any, key: str, added: bool) -> None:
             continue
         if added and depth:
             return  # whatever is built from it knows its settings
-        existing = node if isinstance(node, Mapping) else []
+        existing: Iterable[object] = node if isinstance(node, Mapping) else []
         above = ".".join(parts[:depth])
         problem = f"no such setting in {above}" if above else "no such setting"
         raise GhptConfigError(key, problem, _suggest_key(config, existing, part, parts[-1]))
 
 
-def _suggest_key(config: Any, existing: Mapping[str, Any] | list[Any], part: str, last: str) -> str:
+def _suggest_key(config: Any, existing: Iterable[object], part: str, last: str) -> str:
     """Suggest a key beside the missing ``part``, or one elsewhere whose last part is ``last``."""
     hint = suggest(part, existing)
     elsewhere = [path for path in _paths(config) if path.endswith(f".{last}")]
