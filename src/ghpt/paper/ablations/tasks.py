@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 
-from ghpt.paper.ablations.actions import PoolSetting
+from ghpt.paper.ablations.actions import PoolSetting, PoolsSettings
 from ghpt.paper.engine.artefact import Results, Spread
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
@@ -49,11 +49,9 @@ def evaluate_model(
         data[split] = whole["data"]
         files = whole.get("files", {})
         dependencies[split] = setup.prepared(BASE, split)
-    config = {"pools": [asdict(pool) for pool in pools], "seed": setup.seed, "splits": data}
-    if files:
-        config["files"] = files
+    config = PoolsSettings(data, list(pools), setup.seed, files)
     name = model.name.replace("train-pose", "ablation")
-    return Task(name, ACTION, config, dependencies, seconds=seconds)
+    return Task(name, ACTION, asdict(config), dependencies, seconds=seconds)
 
 
 def read_error(

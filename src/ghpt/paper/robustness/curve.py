@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from ghpt.config import settings
@@ -12,7 +12,13 @@ from ghpt.paper.engine.artefact import Number, Results, Spread
 from ghpt.paper.engine.settings import Robustness
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
-from ghpt.paper.robustness.actions import KINDS, LEARNED, CurveContent, LevelErrors
+from ghpt.paper.robustness.actions import (
+    KINDS,
+    LEARNED,
+    CurveContent,
+    CurveSettings,
+    LevelErrors,
+)
 
 ACTION = "ghpt.paper.robustness.actions.measure_curve"
 PERTURBATIONS = "ghpt.paper.robustness.perturbation"
@@ -72,13 +78,18 @@ def _measured(
     sizes = setup.sizes.robustness
     stride = f"data.stride={sizes.stride[data]}"
     whole = setup.composed("test", data, *setup.overrides.test, stride)
-    keys = ("data", "view_weights", "baselines", "seed", "files")
-    config = {key: whole[key] for key in keys if key in whole}
-    config["perturbations"] = list(perturbations)
+    config = CurveSettings(
+        data=whole["data"],
+        baselines=whole["baselines"],
+        view_weights=whole["view_weights"],
+        seed=setup.seed,
+        perturbations=list(perturbations),
+        files=whole.get("files", {}),
+    )
     dependencies = {"model": setup.trained(sizes.trained_on), "data": setup.prepared(data, "test")}
     seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
     name = f"robustness-{name}-seed{setup.seed}"
-    return Task(name, ACTION, config, dependencies, seconds=seconds)
+    return Task(name, ACTION, asdict(config), dependencies, seconds=seconds)
 
 
 @dataclass(frozen=True)
