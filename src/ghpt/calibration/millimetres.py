@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.calibration.diagnosis import Diagnosis
+from ghpt.calibration.findings import Finding
+from ghpt.calibration.mistakes import SCALE_ASSUMED, SCALE_UNKNOWN
 from ghpt.calibration.rig import RigEstimate
 from ghpt.data.formats.names import chosen_name
 from ghpt.errors import GhptConfigError, check
@@ -187,11 +188,10 @@ def _body_factor(estimate: RigEstimate, lengths: Sequence[float], measure: Measu
     return rough * rest if rest > 0 else rough
 
 
-def of_scale(scale: Mapping[str, Any]) -> tuple[Diagnosis, ...]:
-    """An error for a rig without a scale, a warning for an assumed one."""
+def scale_findings(scale: Mapping[str, Any]) -> tuple[Finding, ...]:
+    """Return an error for a rig without a scale, a warning for an assumed one."""
     if scale["factor"] is None:
-        return (Diagnosis("scale_unknown", "error", (), f"Scale {scale['text']}", 0.0),)
-    if scale["from"] != "assumed":
-        return ()
-    text = f"Scale {scale['text']}: give scale.height, scale.segments or scale.baseline"
-    return (Diagnosis("scale_assumed", "warning", (), text, 0.0),)
+        return (SCALE_UNKNOWN.finding(source=scale["text"]),)
+    if scale["from"] == "assumed":
+        return (SCALE_ASSUMED.finding(source=scale["text"]),)
+    return ()

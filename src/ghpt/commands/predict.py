@@ -33,7 +33,7 @@ from ghpt.commands.prediction.report import prediction_report, print_prediction,
 from ghpt.commands.prediction.run import predicted
 from ghpt.commands.prediction.statistics import Estimate, counts, estimate_of, evaluate
 from ghpt.commands.prediction.stored import frames_of_stored, open_stored
-from ghpt.commands.prediction.verdict import Level
+from ghpt.commands.prediction.verdict import Level, Measures
 from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
 from ghpt.data.formats.key_points import read_people
@@ -84,7 +84,7 @@ class Settings(InputSettings):
     estimator: dict[str, Any]
     view_weights: dict[str, Any]
     fitted_frames: int
-    doctor: dict[str, Any]
+    camera_check: dict[str, Any]
     verdict: dict[str, Any]
     strict: bool
     seed: int
@@ -129,10 +129,10 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     compared = {
         name: build(config["baselines"][name], f"baselines.{name}") for name in config["compare"]
     }
-    doctor = build(config["doctor"], "doctor")
+    camera_check = build(config["camera_check"], "camera_check")
     judge = build(config["verdict"], "verdict")
     frames = (
-        in_unit(from_files(config), doctor.consensus) if config["keypoints"] else _from_data(config)
+        in_unit(from_files(config), camera_check.consensus) if config["keypoints"] else _from_data(config)
     )
     hertz = None if config["smooth"] is None else float(config["smooth"])
     gaps = Gaps(
@@ -204,8 +204,10 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
         "formats": formats,
         "provenance": about.provenance,
     }
-    checkup = check_cameras(frames, doctor) if judge.asks(own["scales"]["views"]) else None
-    verdict = judge(numbers, checkup, unit, commands_on(config, output))
+    measures = Measures.from_numbers(numbers)
+    asks = camera_check.is_worthwhile(measures.view_errors)
+    mistakes = check_cameras(frames, camera_check) if asks else ()
+    verdict = judge(measures, mistakes, unit, commands_on(config, output))
     numbers["verdict"] = verdict.numbers()
     write_json(output / "prediction.json", numbers)
     with atomic_write(output / "report.md", "w") as handle:
@@ -215,7 +217,7 @@ def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
     _log.info("Written: %s and report.md in %s.", files, display_path(output))
     print_verdict(numbers["verdict"])
     if config["strict"] and verdict.level != Level.GOOD:
-        worst = max(verdict.findings, key=lambda finding: finding.level)
+        worst = verdict.findings[0]
         problem = f"{verdict.level.words}: {worst.text}"
         raise GhptDataError(frames.source, "verdict", problem, f"Next: {worst.command}")
     return numbers

@@ -81,7 +81,7 @@ def average_lengths() -> tuple[float, ...]:
     return tuple(length if name.split("_", 1)[-1] in LIMBS else 0.0 for name, length in lengths)
 
 
-def part_scales(
+def bone_scales(
     points: Float[Tensor, "*B M J 3"],
     estimated: Bool[Tensor, "*B M J"],
     lengths: Float[Tensor, " L"],
@@ -106,7 +106,7 @@ def body_scale(
     BONES; NaN or 0 where unknown) of that length over the median measured one; 0 where no known
     part was measured.
     """
-    return part_scales(points, estimated, lengths).nanmedian(-1).values.nan_to_num(0.0)
+    return bone_scales(points, estimated, lengths).nanmedian(-1).values.nan_to_num(0.0)
 
 
 def stature(
