@@ -2,10 +2,7 @@
 ``--help`` says more.
 """
 
-from pathlib import Path
-
-from ghpt.commands.app import run
-from ghpt.commands.calibrate import COMMAND
+from ghpt.commands.catalogue import run_by_name
 
 if __name__ == "__main__":
-    run(Path(__file__).parent / "conf", COMMAND)
+    run_by_name("calibrate")

@@ -2,14 +2,7 @@
 more.
 """
 
-import sys
-from pathlib import Path
-
-from ghpt.commands.app import run
-from ghpt.commands.reproduce import command, spread
-
-CONF = Path(__file__).parent / "conf"
+from ghpt.commands.catalogue import run_by_name
 
 if __name__ == "__main__":
-    sys.argv = spread(sys.argv)
-    run(CONF, command(CONF))
+    run_by_name("reproduce")

@@ -306,6 +306,8 @@ def _in_child(tests: list[str], work: Path, cached: bool) -> int:
         f"--basetemp={work / 'tests'}",
     ]
     options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]  # of plugins among the libraries
+    if "PYTEST_DISABLE_PLUGIN_AUTOLOAD" not in os.environ:  # shapes in the signatures kill mutants
+        options.append("--jaxtyping-packages=ghpt,beartype.beartype")
     return int(pytest.main([*options, *(f"tests/{test}" for test in tests)]))
 
 

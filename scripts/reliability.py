@@ -18,6 +18,8 @@ from ghpt.files import write_json
 from ghpt.provenance import provenance
 
 ROOT = Path(__file__).resolve().parents[1]
+SHAPES = "--jaxtyping-packages=ghpt,beartype.beartype"
+"""Has pytest check the shapes in the signatures."""
 
 
 def main() -> int:
@@ -33,7 +35,8 @@ def main() -> int:
             "GHPT_RELIABILITY": str(log),
             "GHPT_NIGHTLY": str(int(options.nightly)),
         }
-        command = [sys.executable, "-m", "pytest", str(ROOT / "tests" / "reliability")]
+        tests = str(ROOT / "tests" / "reliability")
+        command = [sys.executable, "-m", "pytest", SHAPES, tests]
         status = subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
         rows = [json.loads(line) for line in log.read_text().splitlines()] if log.exists() else []
     for row in sorted(rows, key=lambda r: r["row"]):

@@ -2,25 +2,87 @@
 
 import logging
 import os
+import shutil
 import signal
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+import yaml
 
+import children
+import toys
 from ghpt.commands.app import Command, run
+from ghpt.data.synthetic import recordings as synthetic
 
+ROOT = Path(__file__).resolve().parents[1]
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if WORKER:  # each of several test processes has its own core, and so have the commands that it runs
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
 
+FIRST = (
+    "test_docs.py",
+    "test_ddp.py",
+    "test_checkup.py",
+    "test_reproduce.py",
+    "test_geometry_battery.py",
+)
+"""The files that take longest: begun first, so that no test process waits for another's last."""
+CACHE = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
+SERVER = pytest.StashKey[children.Server]()
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Set up what all test processes share: a cache of prepared recordings, in place of the user's,
+    and the server of child processes.
+    """
+    if WORKER:
+        return
+    config.stash[CACHE] = tempfile.TemporaryDirectory(prefix="ghpt-cache-")
+    os.environ["GHPT_CACHE"] = config.stash[CACHE].name
+    if sys.platform == "linux":
+        config.stash[SERVER] = children.Server()
+
+
+def pytest_unconfigure(config: pytest.Config) -> None:
+    """Clear it away."""
+    if SERVER in config.stash:
+        config.stash[SERVER].close()
+    if CACHE in config.stash:
+        config.stash[CACHE].cleanup()
+
+
+@pytest.fixture(autouse=True)
+def own_children() -> Iterator[None]:
+    """Children that a test has left running end with it."""
+    yield
+    children.close_all()
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
+    """Have one of several test processes run all tests of a file, in the order of the files: what
+    the tests of a file share is then made once.
+    """
+    from xdist.scheduler import LoadFileScheduling
+
+    config.option.loadscopereorder = False
+    return LoadFileScheduling(config, log)
+
+
+def _place(item: pytest.Item) -> int:
+    return FIRST.index(item.path.name) if item.path.name in FIRST else len(FIRST)
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip on Windows what is marked ``posix``."""
+    """Put the files of ``FIRST`` first; skip on Windows what is marked ``posix``."""
+    items.sort(key=_place)
     if os.name != "nt":
         return
     for item in items:
@@ -41,19 +103,33 @@ def shared_data() -> Path:
     """The folder of real calibrations, motion and detections that developers have beside the
     project.
     """
-    folder = Path(__file__).resolve().parents[2] / "shared" / "data"
+    folder = ROOT.parent / "shared" / "data"
     if not folder.is_dir():
         pytest.skip(f"the developers' real data is not at {folder}")
     return folder
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Prepared recordings go to a folder of the test session, shared by its tests, never to the
-    user's cache.
+@pytest.fixture
+def little_data(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Synthetic data sets of one subject a split and some frames, in a cache of their own, which
+    all tests share.
     """
-    base = tmp_path_factory.getbasetemp()
-    monkeypatch.setenv("GHPT_CACHE", str((base.parent if WORKER else base) / "cache"))
+    frames = {"train": 16, "validation": 16, "test": 80}
+    subjects = {"train": ("S1",), "validation": ("S8",), "test": ("S9",)}
+    monkeypatch.setattr(synthetic, "HUMAN36M_FRAMES", frames)
+    monkeypatch.setattr(synthetic, "HUMAN36M_SUBJECTS", subjects)
+    monkeypatch.setattr(synthetic, "PANOPTIC_FRAMES", 400)
+    monkeypatch.setattr(synthetic, "PANOPTIC_SUBJECTS", ("P1",))
+    monkeypatch.setenv("GHPT_CACHE", os.path.join(os.environ["GHPT_CACHE"], "little"))
+
+
+@pytest.fixture(scope="session")
+def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The project's configuration with one more data set, ``toy``, which is made at once."""
+    folder = tmp_path_factory.mktemp("conf") / "conf"
+    shutil.copytree(ROOT / "conf", folder)
+    (folder / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
+    return folder
 
 
 @pytest.fixture

@@ -10,6 +10,8 @@ from typing import Any
 
 import torch
 
+from ghpt.models.checkpoint import FORMAT_VERSION
+
 TITLE = b"ghpt sha256 "
 
 
@@ -46,5 +48,6 @@ def text(value: str) -> bytes:
 def checkpoint_around(model: bytes) -> bytes:
     """The pickle of a checkpoint whose model's configuration is this pickle."""
     config = text("config") + b"}(" + text("model") + model + b"u"
-    ours = text("format_version") + b"K\x02" + text("provenance") + b"}" + config
+    version = b"K" + bytes([FORMAT_VERSION])
+    ours = text("format_version") + version + text("provenance") + b"}" + config
     return b"\x80\x02}(" + text("state_dict") + b"}" + text("ghpt") + b"}(" + ours + b"uu."

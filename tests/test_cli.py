@@ -5,7 +5,6 @@ goes on.
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -16,9 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import children
 import ghpt.commands.test as testing
 import toys
 from ghpt.commands.train import COMMAND, shell_override, train
@@ -34,15 +33,6 @@ SMALL = (
     "trainer.accelerator=cpu",
     "progress_bar=false",
 )
-
-
-@pytest.fixture(scope="module")
-def conf(tmp_path_factory):
-    """The project's own configuration with one more data set, which is made at once."""
-    folder = tmp_path_factory.mktemp("conf") / "conf"
-    shutil.copytree(ROOT / "conf", folder)
-    (folder / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
-    return folder
 
 
 @pytest.fixture
@@ -80,11 +70,11 @@ def test_train_then_test_as_typed(command, tmp_path):
         "train.log",
     ]
     assert re.search(
-        r"Validation on synthetic \(synthetic\) toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
+        r"Validation on synthetic toy.*\n  weight \d+\.\d mm, average .* mm, random .* mm\n",
         said,
     )
     assert said.replace("\n", "") in re.sub(
-        r".* INFO ghpt\.train: |\n", "", (output / "train.log").read_text()
+        r".* INFO ghpt\.commands\.train: |\n", "", (output / "train.log").read_text()
     )
     log = events(output)
     assert {"train/total", "train/entropy", "validation/weight", "final/weight"} <= set(
@@ -262,12 +252,10 @@ def test_the_trace_is_shown_to_who_asks_for_it(conf, tmp_path):
     words = [sys.executable, str(ROOT / "train.py"), f"output={tmp_path}", "data=cmu9"]
     quiet = subprocess.run(words, capture_output=True, text=True)
     assert (quiet.returncode, quiet.stderr.count("\n"), quiet.stdout) == (1, 1, "")
-    loud = subprocess.run(
-        words, capture_output=True, text=True, env=os.environ | {"HYDRA_FULL_ERROR": "1"}
-    )
-    assert loud.returncode == 1
-    assert "Traceback" in loud.stderr
-    assert "GhptConfigError: data: there is no 'cmu9'" in loud.stderr
+    loud = children.run(*words[1:], env={"HYDRA_FULL_ERROR": "1"})
+    assert loud.status == 1
+    assert "Traceback" in loud.errors
+    assert "GhptConfigError: data: there is no 'cmu9'" in loud.errors
 
 
 def test_values_are_typed_as_shell_and_hydra_take_them():
@@ -301,12 +289,7 @@ def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(
     tmp_path, uninterrupted, number, status
 ):
     script = ROOT / "tests" / "reliability" / "run_toy.py"
-    child = subprocess.Popen(
-        [sys.executable, str(script), str(tmp_path), json.dumps(STOPPED)],
-        text=True,
-        stderr=subprocess.PIPE,
-        env=os.environ | {"PYTHONPATH": str(ROOT / "tests"), "OMP_NUM_THREADS": "1"},
-    )
+    child = children.start(script, tmp_path, json.dumps(STOPPED))
     last = tmp_path / "last.ckpt"
     while not last.exists():
         assert child.poll() is None, "training ended before its first save"
@@ -409,7 +392,7 @@ def test_an_interrupt_while_the_data_are_prepared_leaves_nothing(tmp_path, monke
     def interrupted(self, split):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(toys.ToyData, "make", interrupted)
+    monkeypatch.setattr(toys.ToyData, "generate", interrupted)
     with restored(signal.SIGINT), pytest.raises(SystemExit) as stop:
         train(
             toys.TRAIN | {"data": toys.DATA | {"cache": str(tmp_path / "cache")}}, tmp_path / "run"

@@ -19,8 +19,7 @@ import ghpt.commands.test as testing
 from documented import PAGES, ROOT, Block, Command
 from ghpt.commands import calibrate, predict, train
 from ghpt.commands import cameras as doctor
-from ghpt.commands.overrides import check_overrides
-from ghpt.data.synthetic import recordings as synthetic
+from ghpt.commands.overrides import Source, check_overrides
 from ghpt.models import registry
 
 MAINS = {
@@ -66,19 +65,6 @@ class Accepted(Exception):
 def models(tmp_path_factory):
     """A folder in which the models of ``LAID_OUT`` will lie."""
     return tmp_path_factory.mktemp("models")
-
-
-@pytest.fixture
-def small(tmp_path_factory, monkeypatch):
-    """Little synthetic data, in a cache of its own, and a wide terminal."""
-    monkeypatch.setattr(synthetic, "HUMAN36M_FRAMES", {"train": 16, "validation": 16, "test": 80})
-    monkeypatch.setattr(
-        synthetic, "HUMAN36M_SUBJECTS", {"train": ("S1",), "validation": ("S8",), "test": ("S9",)}
-    )
-    monkeypatch.setattr(synthetic, "PANOPTIC_FRAMES", 400)
-    monkeypatch.setattr(synthetic, "PANOPTIC_SUBJECTS", ("P1",))
-    monkeypatch.setenv("GHPT_CACHE", str(tmp_path_factory.getbasetemp() / "small"))
-    monkeypatch.setenv("COLUMNS", "120")
 
 
 class Page:
@@ -220,7 +206,7 @@ def settings_of(command: Command, first: int = 2) -> list[str]:
 
 def composed(name: str, command: Command, first: int = 2) -> None:
     """A script whose words are settings of a configuration."""
-    check_overrides(ROOT / "conf", name, settings_of(command, first))
+    check_overrides(Source(ROOT / "conf", name), settings_of(command, first))
 
 
 SCRIPTS = {
@@ -279,15 +265,18 @@ def lay_out(runner: Page, models: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, typed, monkeypatch):
+def test_the_commands_and_the_code_of_a_page_run(
+    page, tmp_path, models, little_data, typed, monkeypatch
+):
+    monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(testing, "REPORTS", dict(testing.REPORTS))
     monkeypatch.setattr(registry, "PARTS", copy.deepcopy(registry.PARTS))
     runner = Page(tmp_path, typed, monkeypatch)
     for block in documented.blocks(page):
-        assert block.language or not re.search(r"^python ", block.text, re.MULTILINE), (
-            f"{page}:{block.line}: bash?"
-        )
+        if not block.language:
+            commands_in_it = re.findall(r"^python ", block.text, re.MULTILINE)
+            assert commands_in_it == [], f"{page}:{block.line}: bash?"
         if block.language in ("python", "yaml"):
             runner.execute(block)
         elif block.language == "bash":
@@ -297,7 +286,9 @@ def test_the_commands_and_the_code_of_a_page_run(page, tmp_path, models, small, 
             block.language == "console"
         ):  # of a cluster or several processes; other tests run their like
             for command in documented.commands_of(block):
-                check_overrides(runner.conf, Path(command.script).stem, settings_of(command))
+                check_overrides(
+                    Source(runner.conf, Path(command.script).stem), settings_of(command)
+                )
     for command in documented.inline_commands(page):
         attempt(runner, command, page, models)
     assert Path.cwd() == tmp_path
@@ -327,4 +318,4 @@ REPRODUCE = [
 @pytest.mark.parametrize("command", REPRODUCE, ids=lambda command: command.where)
 def test_the_settings_of_reproduce_exist(command):
     words = settings_of(command)
-    assert len(check_overrides(ROOT / "conf", "reproduce", words)) == len(words)
+    assert len(check_overrides(Source(ROOT / "conf", "reproduce"), words)) == len(words)

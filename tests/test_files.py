@@ -1,9 +1,8 @@
 import os
-import subprocess
-import sys
 
 import pytest
 
+import children
 from ghpt import files
 from ghpt.files import atomic_folder, atomic_write, sweep_temporaries
 
@@ -57,12 +56,10 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
 
 
 def test_only_what_dead_writers_left_is_swept(tmp_path):
-    child = subprocess.run(
-        [sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, text=True
-    )
-    dead = tmp_path / f".a.{files._HOST}-{int(child.stdout)}-00000000.tmp"
+    pid = int(children.output_of("-c", "import os; print(os.getpid())"))
+    dead = tmp_path / f".a.{files._HOST}-{pid}-00000000.tmp"
     alive = tmp_path / f".a.{files._HOST}-{os.getpid()}-00000000.tmp"
-    elsewhere = tmp_path / f".a.other-machine-{int(child.stdout)}-00000000.tmp"
+    elsewhere = tmp_path / f".a.other-machine-{pid}-00000000.tmp"
     other = tmp_path / ".a.tmp"
     for path in (dead, alive, elsewhere, other):
         path.write_text("x")

@@ -6,9 +6,7 @@ import json
 import os
 import re
 import shlex
-import shutil
 import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -17,14 +15,14 @@ import pytest
 import torch
 import yaml
 
+import children
 import ghpt.commands.jobs
-import toys
-from ghpt.commands.overrides import check_overrides
+from ghpt.commands.overrides import Source, check_overrides
 from ghpt.commands.train import COMMAND
 from ghpt.models.checkpoint import read_checkpoint
 
 ROOT = Path(__file__).resolve().parents[1]
-TOY = [sys.executable, str(ROOT / "tests" / "toy_sweep.py")]
+TOY = ROOT / "tests" / "toy_sweep.py"
 LOCAL = "hydra/launcher=submitit_local"
 SLURM = {  # stand-ins: an array's jobs run at once, on this machine
     "sbatch": """
@@ -51,18 +49,11 @@ def toy(tmp_path):
     }
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "toy.yaml").write_text(yaml.safe_dump(content))
-    environment = os.environ | {"TOY_CONF": str(tmp_path / "conf"), "PYTHON": sys.executable}
-    environment.pop("HYDRA_FULL_ERROR", None)
+    environment = {"TOY_CONF": str(tmp_path / "conf"), "PYTHON": sys.executable}
 
     def start(*words, path=""):
-        environment["PATH"] = f"{path}{os.pathsep}{os.environ['PATH']}"
-        return subprocess.Popen(
-            [*TOY, *words],
-            env=environment,
-            text=True,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-        )
+        paths = f"{path}{os.pathsep}{os.environ['PATH']}"
+        return children.start(TOY, *words, env={**environment, "PATH": paths})
 
     return start
 
@@ -218,18 +209,14 @@ def test_the_commands_of_the_page_about_clusters_are_understood():
     ]
     launchers = set()
     for _, script, *words in found:
-        overrides = check_overrides(
-            ROOT / "conf", script.removesuffix(".py"), [w for w in words if w != "-m"]
-        )
+        source = Source(ROOT / "conf", script.removesuffix(".py"))
+        overrides = check_overrides(source, [word for word in words if word != "-m"])
         launchers.add(ghpt.commands.jobs.chosen_launcher(overrides, compose_only=True))
     assert launchers == {"basic", "submitit_local", "submitit_slurm"}
 
 
 @pytest.mark.posix
-def test_trainings_of_a_local_pool_are_those_of_one_process(typed, tmp_path, monkeypatch):
-    conf = tmp_path / "conf"
-    shutil.copytree(ROOT / "conf", conf)
-    (conf / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
+def test_trainings_of_a_local_pool_are_those_of_one_process(typed, conf, tmp_path, monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(ROOT / "src"), str(ROOT / "tests")]))
     monkeypatch.setenv("OMP_NUM_THREADS", str(torch.get_num_threads()))
     small = (
@@ -237,7 +224,7 @@ def test_trainings_of_a_local_pool_are_those_of_one_process(typed, tmp_path, mon
         "model.hypotheses=5",
         "model.scorer.layers=[4]",
         "trainer.accelerator=cpu",
-        "seed=0,1",
+        "seed=1",
     )
     said = {}
     for launcher in ("basic", "submitit_local"):
@@ -252,13 +239,12 @@ def test_trainings_of_a_local_pool_are_those_of_one_process(typed, tmp_path, mon
         assert status == 0, errors
         said[launcher] = lines(text)[0]
     assert said["basic"] == said["submitit_local"]
-    for job in ("0_seed-0", "1_seed-1"):
-        one, other = (read_checkpoint(tmp_path / name / job / "best.ckpt") for name in said)
-        assert one["state_dict"].keys() == other["state_dict"].keys()
-        for key, value in one["state_dict"].items():
-            assert torch.equal(other["state_dict"][key], value), (job, key)
-        scores = [
-            next(v["best_model_score"] for k, v in c["callbacks"].items() if "ModelCheckpoint" in k)
-            for c in (one, other)
-        ]
-        assert scores[0] == scores[1]
+    one, other = (read_checkpoint(*(tmp_path / name).glob("0*/best.ckpt")) for name in said)
+    assert one["state_dict"].keys() == other["state_dict"].keys()
+    for key, value in one["state_dict"].items():
+        assert torch.equal(other["state_dict"][key], value), key
+    scores = [
+        next(v["best_model_score"] for k, v in c["callbacks"].items() if "ModelCheckpoint" in k)
+        for c in (one, other)
+    ]
+    assert scores[0] == scores[1]

@@ -5,7 +5,6 @@ go on.
 import multiprocessing
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
@@ -18,10 +17,8 @@ from unittest.mock import Mock
 import lightning as L
 import pytest
 import torch
-import yaml
 from torch.utils.data import get_worker_info
 
-import toys
 from ghpt.commands import lost
 from ghpt.commands.train import COMMAND
 from ghpt.data.datasets.frames import Frames
@@ -45,12 +42,10 @@ SMALL = (
 
 
 @pytest.fixture
-def training(typed, tmp_path):
+def training(typed, conf, tmp_path):
     """``training(*words)`` runs train.py in this process: (exit status, stdout, stderr)."""
-    shutil.copytree(ROOT / "conf", tmp_path / "conf")
-    (tmp_path / "conf" / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
     words = (*SMALL, f"output={tmp_path / 'run'}")
-    return lambda *more: typed(tmp_path / "conf", COMMAND, [*words, *more])
+    return lambda *more: typed(conf, COMMAND, [*words, *more])
 
 
 def in_step(monkeypatch, number, happens):

@@ -1,8 +1,6 @@
 """Testing streams: its memory does not grow with the number of frames."""
 
 import json
-import os
-import subprocess
 import sys
 import threading
 import time
@@ -10,26 +8,12 @@ from pathlib import Path
 
 import pytest
 
-STATUS = Path("/proc/self/status")
+import children
+import memory
+
 FRAMES = 2100
 """More than the report reads at a time, which is the most it ever holds."""
 BATCH = 250
-ENVIRONMENT = {
-    "PYTHONPATH": str(Path(__file__).parent),
-    "OMP_NUM_THREADS": "1",
-    # else what glibc keeps for later use differs from run to run by more than a leak
-    "MALLOC_ARENA_MAX": "1",
-    "MALLOC_MMAP_THRESHOLD_": "65536",
-}
-
-
-def private_memory() -> float:
-    """MiB that the process itself holds, without mapped files."""
-    return next(
-        int(line.split()[1]) / 1024
-        for line in STATUS.read_text(encoding="utf-8").splitlines()
-        if line.startswith("RssAnon")
-    )
 
 
 def child(folder: str, frames: int) -> None:
@@ -48,8 +32,9 @@ def child(folder: str, frames: int) -> None:
                 )
 
         def cache_key(self, split):
-            return super().key(split) | {"frames": frames}
+            return super().cache_key(split) | {"frames": frames}
 
+    memory.keep_no_freed_memory()
     toys.Longer = Longer
     data = toys.DATA | {
         "_target_": "toys.Longer",
@@ -68,7 +53,7 @@ def child(folder: str, frames: int) -> None:
 
     def watch() -> None:
         while True:
-            peak[0] = max(peak[0], private_memory())
+            peak[0] = max(peak[0], memory.private_memory())
             time.sleep(0.005)
 
     threading.Thread(target=watch, daemon=True).start()
@@ -76,7 +61,7 @@ def child(folder: str, frames: int) -> None:
     print(json.dumps({"peak": peak[0], "frames": metrics["frames"]}))
 
 
-@pytest.mark.skipif(not STATUS.is_file(), reason="needs Linux's /proc")
+@pytest.mark.skipif(not memory.STATUS.is_file(), reason="needs Linux's /proc")
 def test_testing_holds_one_batch_however_many_frames(tmp_path):
     import toys
     from ghpt.commands.train import train
@@ -84,11 +69,8 @@ def test_testing_holds_one_batch_however_many_frames(tmp_path):
     train(toys.TRAIN, tmp_path)
     peaks = []
     for times in (1, 6):
-        command = [sys.executable, __file__, str(tmp_path), str(times * FRAMES)]
-        run = subprocess.run(
-            command, env=os.environ | ENVIRONMENT, check=True, capture_output=True, timeout=300
-        )
-        result = json.loads(run.stdout.splitlines()[-1])
+        said = children.output_of(__file__, tmp_path, times * FRAMES)
+        result = json.loads(said.splitlines()[-1])
         assert result["frames"] == times * FRAMES
         peaks.append(result["peak"])
     # The nine selections' poses of all frames, if they were kept, would be 19 MiB more.

@@ -5,14 +5,12 @@ there.
 import hashlib
 import json
 import os
-import subprocess
-import sys
-import time
 from pathlib import Path
 
 import pytest
 import yaml
 
+import children
 import ghpt.commands.calibrate
 import ghpt.commands.cameras
 import ghpt.commands.test as testing
@@ -195,17 +193,12 @@ def test_b10_a_second_writer_is_refused_at_once_and_a_dead_ones_lock_is_taken_ov
         "with OutputFolder(Path(sys.argv[1]), Files()):\n"
         "    print('in', flush=True); time.sleep(600)\n"
     )
-    with subprocess.Popen(
-        [sys.executable, "-c", script, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    ) as child:
-        try:
-            assert child.stdout.readline() == "in\n"
-            start = time.monotonic()
-            with pytest.raises(GhptDataError, match="another ghpt command writes here"):
-                OutputFolder(tmp_path, Files()).__enter__()
-            assert time.monotonic() - start < 1  # it does not wait
-        finally:
-            child.kill()
+    child = children.start("-c", script, tmp_path)
+    assert child.stdout.readline() == "in\n"
+    with pytest.raises(GhptDataError, match="another ghpt command writes here"):
+        OutputFolder(tmp_path, Files()).__enter__()  # it does not wait
+    child.kill()
+    child.wait(children.LIMIT)
     with (
         OutputFolder(tmp_path, Files()),
         pytest.raises(GhptDataError, match="another ghpt command writes here"),
@@ -343,7 +336,7 @@ def test_a_prediction_does_not_overwrite_its_key_points(typed, tmp_path):
     assert contents(tmp_path).items() >= before.items()
 
 
-SWEEP = [sys.executable, str(ROOT / "tests" / "toy_sweep.py")]
+TOY_SWEEP = ROOT / "tests" / "toy_sweep.py"
 
 
 @pytest.fixture
@@ -358,14 +351,10 @@ def sweep(tmp_path):
     }
     (tmp_path / "conf").mkdir()
     (tmp_path / "conf" / "toy.yaml").write_text(yaml.safe_dump(content))
-    environment = os.environ | {"TOY_CONF": str(tmp_path / "conf")}
-    environment.pop("HYDRA_FULL_ERROR", None)
 
     def run(*words):
-        done = subprocess.run(
-            [*SWEEP, *words], env=environment, capture_output=True, text=True, timeout=300
-        )
-        return done.returncode, done.stdout + done.stderr
+        ended = children.run(TOY_SWEEP, *words, env={"TOY_CONF": str(tmp_path / "conf")})
+        return ended.status, ended.out + ended.errors
 
     return run
 

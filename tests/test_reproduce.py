@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from ghpt.commands import reproduce
-from ghpt.commands.reproduce import ARTEFACTS, chosen, spread
+from ghpt.commands.overrides import spread_seeds
+from ghpt.commands.reproduce import ARTEFACTS, chosen
 from ghpt.errors import GhptConfigError
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -35,12 +36,12 @@ PAPER = (
 
 
 @pytest.fixture
-def command(typed, tmp_path):
+def command(typed, little_data, tmp_path):
     def call(*words):
         flags = [word for word in words if word == "-m"]  # Hydra wants them first
         settings = [*SMALL, *(word for word in words if word not in flags)]
         folders = [f"output={tmp_path / 'report'}", f"tasks={tmp_path / 'tasks'}"]
-        return typed(CONF, reproduce.command(CONF), [*spread([*flags, *settings]), *folders])
+        return typed(CONF, reproduce.command(CONF), [*flags, *settings, *folders])
 
     return call
 
@@ -146,4 +147,4 @@ def test_every_table_and_figure_of_the_paper_is_an_item():
     ],
 )
 def test_a_sweep_spreads_its_seeds_over_jobs(typed_words, run):
-    assert spread(typed_words) == run
+    assert spread_seeds(typed_words) == run

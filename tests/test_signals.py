@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+import children
 import ghpt
 import ghpt.commands.test as testing
 import toys
@@ -117,8 +118,8 @@ def test_pycolmap_s_handler_of_sigterm_is_not_there():
     program = (
         "import os, signal\nfrom ghpt.colmap import pycolmap\nos.kill(os.getpid(), signal.SIGTERM)"
     )
-    ended = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert (ended.returncode, ended.stderr) == (-signal.SIGTERM, "")
+    ended = children.run("-c", program)
+    assert (ended.status, ended.errors) == (-signal.SIGTERM, "")
 
 
 def test_pycolmap_is_imported_in_one_place():
@@ -132,18 +133,29 @@ def test_pycolmap_is_imported_in_one_place():
     assert found == ["colmap.py"]
 
 
+def predict_to(folder, patch):
+    """Predict 250 frames in 5 shards into the folder."""
+    patch.setattr(sys, "argv", ["predict.py"])
+    patch.setattr(prediction, "_from_data", lambda _: frames_of(250))
+    origin_of = {"ghpt": "0", "commit": "", "command": ""}
+    patch.setattr(prediction, "provenance", lambda seed: origin_of | {"seed": seed})
+    settings = config("triangulation=linear", "shard_frames=50", "batch=25", "formats=[npz,csv]")
+    prediction.predict(settings, folder)
+
+
 @pytest.fixture
 def predict(tmp_path, monkeypatch):
-    """``predict(folder)`` predicts 500 frames in 5 shards into it."""
-    monkeypatch.setattr(sys, "argv", ["predict.py"])
-    monkeypatch.setattr(prediction, "_from_data", lambda _: frames_of(500))
-    settings = config("triangulation=linear", "shard_frames=100", "batch=50", "formats=[npz,csv]")
-    monkeypatch.setattr(
-        prediction,
-        "provenance",
-        lambda seed: {"ghpt": "0", "commit": "", "seed": seed, "command": ""},
-    )
-    return lambda folder: prediction.predict(settings, tmp_path / folder)
+    """``predict(folder)`` predicts into that folder of the test's."""
+    return lambda folder: predict_to(tmp_path / folder, monkeypatch)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The files of a prediction that nobody has stopped."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        predict_to(folder, patch)
+    return outputs(folder)
 
 
 def outputs(folder: Path) -> dict[str, bytes]:
@@ -165,7 +177,7 @@ are then.
 
 @pytest.mark.parametrize("where", WHERE)
 def test_a_stopped_prediction_goes_on_to_the_same_bytes(
-    predict, tmp_path, monkeypatch, caplog, where
+    predict, whole, tmp_path, monkeypatch, caplog, where
 ):
     owner, function, at, shards = WHERE[where]
     original, calls = getattr(owner, function), []
@@ -185,8 +197,7 @@ def test_a_stopped_prediction_goes_on_to_the_same_bytes(
     assert manifest.read_bytes().count(b"\n") == 1 + shards
     assert not list((tmp_path / "stopped").rglob("*.tmp"))
     predict("stopped")
-    predict("whole")
-    assert outputs(tmp_path / "stopped") == outputs(tmp_path / "whole")
+    assert outputs(tmp_path / "stopped") == whole
 
 
 def test_a_prediction_has_our_handler(predict, monkeypatch):

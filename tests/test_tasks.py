@@ -2,15 +2,15 @@
 happens.
 """
 
+import multiprocessing
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
+import children
 from ghpt.errors import GhptDataError
 from ghpt.paper.engine.pool import perform_all
 from ghpt.paper.engine.tasks import read_json, with_dependencies
@@ -58,7 +58,10 @@ def test_only_what_changed_is_done_again(diary, tmp_path):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_names_the_task_and_keeps_what_is_finished(diary, tmp_path, jobs):
+def test_an_error_names_the_task_and_keeps_what_is_finished(diary, tmp_path, monkeypatch, jobs):
+    if hasattr(os, "fork"):  # the test above has the pool start its processes as it does
+        monkeypatch.setattr(multiprocessing, "get_context", multiprocessing.get_context)
+        fork_the_pool()
     good = task(diary, 1)
     bad = task(diary, -1, good)  # after it: an error ends at once what is made beside it
     with pytest.raises(
@@ -82,11 +85,18 @@ def test_the_key_knows_config_needs_and_code(diary, monkeypatch):
 PROGRAM = """
 import sys
 from pathlib import Path
-from test_tasks import slow
+import test_tasks
 from ghpt.paper.engine.pool import perform_all
 if __name__ == "__main__":
-    perform_all(slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
+    test_tasks.fork_the_pool()
+    perform_all(test_tasks.slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
 """
+
+
+def fork_the_pool():
+    """Have the pool's processes be forks of this one, which import nothing anew."""
+    fork = multiprocessing.get_context("fork")
+    multiprocessing.get_context = lambda method: fork
 
 
 def slow(diary):
@@ -98,15 +108,12 @@ def slow(diary):
 def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_path, stop, status):
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
-    path = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(program), str(diary), str(tmp_path / "tasks")]
-    with subprocess.Popen(command, env=environment, stderr=subprocess.DEVNULL) as run:
-        until(lambda: {2, 3} <= set(numbers(diary)), 300)
-        run.send_signal(getattr(signal, stop))
-        assert run.wait(60) == status
+    run = children.start(program, diary, tmp_path / "tasks")
+    until(lambda: {2, 3} <= set(numbers(diary)))
+    run.send_signal(getattr(signal, stop))
+    assert run.wait(children.LIMIT) == status
     workers = {int(line.split()[1]) for line in diary.read_text().splitlines()}
-    until(lambda: not any(alive(worker) for worker in workers), 60)
+    until(lambda: not any(alive(worker) for worker in workers))
     first, *others = slow(diary)
     assert first.done(tmp_path / "tasks")
     assert not any(other.done(tmp_path / "tasks") for other in others)
@@ -125,8 +132,8 @@ def alive(process):
         return False
 
 
-def until(condition, seconds):
-    end = time.monotonic() + seconds
+def until(condition):
+    end = time.monotonic() + children.LIMIT
     while not condition():
         assert time.monotonic() < end, "it did not happen"
         time.sleep(0.1)

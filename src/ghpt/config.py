@@ -16,6 +16,7 @@ import inspect
 import math
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import (
     Any,
     Literal,
@@ -32,6 +33,11 @@ from omegaconf import OmegaConf
 from ghpt.errors import GhptConfigError
 
 S = TypeVar("S")
+_PACKAGE = Path(__file__).parent
+CONF = next(
+    folder for folder in (_PACKAGE / "conf", _PACKAGE.parents[1] / "conf") if folder.is_dir()
+)
+"""The folder of the project's own configuration: of the installed package, or of the clone."""
 Target = Mapping[str, Any]
 """A group of a configuration that has a ``_target_``: it stays plain, and `build` makes it."""
 Find = Callable[[Mapping[str, Any], str], Callable[..., Any]]

@@ -3,46 +3,41 @@
 import platform
 import subprocess
 import sys
+from importlib.metadata import version
 from pathlib import Path
 
-import lightning
-import numpy as np
-import torch
-
-import ghpt
+_PACKAGES = ("torch", "lightning", "numpy")
+"""Beside ghpt itself, what decides numbers. They are asked for their versions, not imported."""
 
 
 def provenance(seed: int) -> dict[str, str | int]:
-    """What is needed to make a result again, as plain data."""
+    """Return what is needed to make a result again, as plain data."""
+    command = [Path(sys.argv[0]).name, *sys.argv[1:]]
     return {
-        "ghpt": ghpt.__version__,
+        "ghpt": version("ghpt"),
         "commit": commit(),
         "seed": seed,
-        "command": " ".join([Path(sys.argv[0]).name, *sys.argv[1:]]),
+        "command": " ".join(command),
         "python": platform.python_version(),
-        "torch": str(torch.__version__),
-        "lightning": lightning.__version__,
-        "numpy": np.__version__,
+        **{package: version(package) for package in _PACKAGES},
     }
 
 
 def commit() -> str:
-    """The git commit of the source tree, with + if files differ from it; '' where there is none."""
-    folder = Path(__file__).parent
+    """Return the git commit of the source tree, with + if files differ from it; '' without one."""
     try:
-        options = {
-            "cwd": folder,
-            "capture_output": True,
-            "text": True,
-            "timeout": 10,
-            "check": True,
-        }
-        head = subprocess.run(["git", "rev-parse", "HEAD"], **options).stdout.strip()
+        head = _git("rev-parse", "HEAD")
         # A command that is stopped here kills git, whose lock would then stay in the user's
         # repository.
-        changed = subprocess.run(
-            ["git", "--no-optional-locks", "status", "--porcelain", "-uno"], **options
-        ).stdout.strip()
+        changed = _git("--no-optional-locks", "status", "--porcelain", "-uno")
     except (OSError, subprocess.SubprocessError):
         return ""
     return head + ("+" if changed else "")
+
+
+def _git(*words: str) -> str:
+    folder = Path(__file__).parent
+    done = subprocess.run(
+        ["git", *words], cwd=folder, capture_output=True, text=True, timeout=10, check=True
+    )
+    return done.stdout.strip()

@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 import pytest
 
+import sizes
+
 collect_ignore = []
 if not hasattr(os, "fork"):  # Windows: these kill forks, or limit their memory
     collect_ignore += [
@@ -24,8 +26,8 @@ elif not os.path.exists("/proc/self"):  # macOS: these read a process's memory t
 
 @pytest.fixture(scope="session")
 def nightly() -> bool:
-    """Whether to run the large sizes: GHPT_NIGHTLY=1."""
-    return os.environ.get("GHPT_NIGHTLY") == "1"
+    """Whether to run the large sizes; see sizes.py."""
+    return sizes.NIGHTLY
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -392,16 +392,16 @@ def part_of(found: Any, whole: Any) -> bool:
     rows, views = len(one["row"]), [other["views"].index(view) for view in one["views"]]
     kept = np.isin(other["view"], views) & np.isin(other["frame"][other["row"]], one["frame"])
     at = np.flatnonzero(kept)
-    valid = one["seen"]
+    valid = one["valid"]
     return rows <= len(at) and all(
         np.array_equal(one[name][valid], other[name][at[:rows]][valid])
         for name in ("key_points", "confidence")
     )
 
 
-def spoilt(row: str, whole: bytes, form: Format, numbers: range) -> Iterator[bytes]:
+def spoilt(row: str, whole: bytes, form: Format, numbers: Sequence[int]) -> Iterator[bytes]:
     """The files of a row: A1 mutates structure and bytes by turns, A2 bytes alone, A3 cuts the file
-    at every byte.
+    at the bytes of these numbers.
     """
     for number in numbers:
         chance = random.Random(number)
@@ -421,7 +421,9 @@ def late(*_: Any) -> None:
     raise Late
 
 
-def batch(row: str, form: Format, numbers: range, folder: Path, target: Path) -> dict[str, Any]:
+def batch(
+    row: str, form: Format, numbers: Sequence[int], folder: Path, target: Path
+) -> dict[str, Any]:
     """Reads one file after the other; what each gave, and by how much the memory grew."""
     whole, reference, outcomes, notes = target.read_bytes(), form.read(folder), Counter(), []
     signal.signal(signal.SIGPROF, late)
@@ -485,6 +487,14 @@ def forked(run: Callable[[], dict[str, Any]], seconds: float) -> dict[str, Any]:
         return json.load(answer)
 
 
+def cuts(size: int, count: int, seed: int) -> Sequence[int]:
+    """So many places of a file, or all that it has, the last 50 among them."""
+    if count >= size:
+        return range(size)
+    last = max(size - 50, 0)
+    return [*sorted(random.Random(seed).sample(range(last), count - 50)), *range(last, size)]
+
+
 def main(row: str, name: str, count: int, seed: int) -> dict[str, Any]:
     """All files of a format, in batches."""
     form, outcomes, notes, grown = FORMATS[name], Counter(), [], 0
@@ -493,9 +503,9 @@ def main(row: str, name: str, count: int, seed: int) -> dict[str, Any]:
         folder.mkdir()
         target = form.write(folder)
         whole = target.read_bytes()
-        last = len(whole) if row == "A3" else count
-        for start in range(0, last, BATCH):
-            numbers = range(seed + start, seed + min(start + BATCH, last))
+        chosen = cuts(len(whole), count, seed) if row == "A3" else range(seed, seed + count)
+        for start in range(0, len(chosen), BATCH):
+            numbers = chosen[start : start + BATCH]
             found = forked(
                 lambda numbers=numbers: batch(row, form, numbers, folder, target),
                 10 + SECONDS * BATCH / 4,
@@ -509,7 +519,7 @@ def main(row: str, name: str, count: int, seed: int) -> dict[str, Any]:
         "notes": notes,
         "grown_kib": grown,
         "file_kib": len(whole) / 1024,
-        "total": last,
+        "total": len(chosen),
     }
 
 

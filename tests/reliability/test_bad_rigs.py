@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+import sizes
 from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.relative_pose.scale import BodyHeight, average_lengths, body_scale
 from ghpt.skeleton import BONES, MIRROR
@@ -123,8 +124,9 @@ def test_d6_two_views_are_warned_of():
 
 
 @pytest.mark.parametrize("scene", ["h36m", "cmu3"])
-def test_d6_good_rigs_are_not_slandered(scene, nightly, record_row):
-    total, alarms = 100 if nightly else 4, []
+def test_d6_good_rigs_are_not_slandered(scene, record_row):
+    total = sizes.GOOD_RIGS
+    alarms = []
     for seed in range(total):
         estimate = people(scene, 40 + 20 * (seed % 3), 0.004 * (1 + seed % 4), seed).calibrate(
             CALIBRATE
@@ -177,11 +179,13 @@ def test_d6_a_wrong_unit_of_the_scale_is_warned_of():
     assert severities == {0.001: ["error"], 0.1: ["error"], 0.5: ["warning"], 1.0: []}
 
 
-def test_d6_no_success_with_a_wrong_scale(nightly, record_row):
+def test_d6_no_success_with_a_wrong_scale(record_row):
     """Short, noisy recordings of two to four views, scaled by the person: 5 % off only with a
     warning.
     """
-    total, silent, off = 300 if nightly else 16, [], 0
+    total = sizes.SCALED_RIGS
+    silent = []
+    off = 0
     for seed in range(total):
         scene = people("h36m", (3, 6, 12, 40)[seed % 4], 0.01 * (1 + seed % 3), seed)
         if seed % 2:

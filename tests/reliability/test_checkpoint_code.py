@@ -6,8 +6,8 @@ import os
 import pickle
 import sys
 import zipfile
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import torch
 import ghpt.config
 import ghpt.models.checkpoint
 import toys
+from auditing import watch
 from ghpt import files
 from ghpt.commands.train import train
 from ghpt.config import build, locate
@@ -35,35 +36,6 @@ WATCHED = (
     "code.__new__",
 )
 HARMLESS = ("os.listdir", "os.scandir", "os.walk", "os.fwalk", "os.getxattr", "os.listxattr")
-attempts: list[str] = []
-watching = False
-
-
-def _hook(event: str, arguments: tuple[Any, ...]) -> None:
-    if watching and event.startswith(WATCHED) and not event.startswith(HARMLESS):
-        attempts.append(f"{event} {arguments[:2]!r:.200}")
-    if (
-        watching
-        and event == "open"
-        and isinstance(arguments[1], str)
-        and set(arguments[1]) & set("wax+")
-    ):
-        attempts.append(f"open {arguments[:2]!r:.200}")
-
-
-sys.addaudithook(_hook)  # cannot be removed; does nothing while not watching
-
-
-@contextmanager
-def watch() -> Iterator[list[str]]:
-    """The attempts to reach the system within the block."""
-    global watching
-    attempts.clear()
-    watching = True
-    try:
-        yield attempts
-    finally:
-        watching = False
 
 
 class Call:
@@ -205,7 +177,7 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.models.callbacks.Progress": {},
         "ghpt.models.callbacks.LogHyperparameters": {"values": {}},
         "ghpt.report.logger.ForgivingTensorBoard": {"folder": {"_target_": "ghpt.files.Path"}},
-        "ghpt.errors.GhptConfigError": {"key": "a", "problem": "b", "mend": "c"},
+        "ghpt.errors.GhptConfigError": {"key": "a", "problem": "b", "hint": "c"},
         "ghpt.models.estimators.classical.Linear": {},
         "ghpt.data.datasets.pairs.PairSettings": {"frames": 8, "draws": 1, "points": 10},
         "torch.nn.Identity": {},
@@ -246,7 +218,10 @@ def test_a5_no_checkpoint_chooses_what_is_run(
         save_with(trained, path, problem=problem)
         lay_out(victim)
         before = content(victim)
-        with watch() as valid, pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: ") as caught:
+        with (
+            watch(WATCHED, HARMLESS) as valid,
+            pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: ") as caught,
+        ):
             load_model(path)
         assert "\n" not in str(caught.value)
         if not valid and content(victim) == before and "evil_module" not in sys.modules:
@@ -278,7 +253,7 @@ def test_every_payload_would_be_called_if_any_target_could_be_named(
         lay_out(victim)
         before = content(victim)
         called.clear()
-        with watch() as valid, suppress(Exception, SystemExit):
+        with watch(WATCHED, HARMLESS) as valid, suppress(Exception, SystemExit):
             load_model(path)
         wanted = problem if name.startswith("_target_") else {"_target_": "evil_module.Evil"}
         if locate(wanted, "") in called:
@@ -340,7 +315,10 @@ def test_a5_no_pickle_runs(tmp_path: Path, trained: Path, record_row: Callable[.
     refused, cases = [], pickles(trained, sentinel)
     for name, write in cases.items():
         write(path)
-        with watch() as valid, pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: "):
+        with (
+            watch(WATCHED, HARMLESS) as valid,
+            pytest.raises(GhptCheckpointError, match=r"evil\.ckpt: "),
+        ):
             load_model(path)
         if not valid and not sentinel.exists():
             refused.append(name)

@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 
+import sizes
 import toys
 from ghpt import files
 from ghpt.commands.train import resumable, train
@@ -103,10 +104,10 @@ def flipped(whole: bytes, bit: int) -> bytes:
 def test_a2_no_flipped_bit_is_read(
     tmp_path: Path, trained: Path, monkeypatch: pytest.MonkeyPatch, record_row: Callable[..., None]
 ) -> None:
-    """1,500 bits all over the file, and many of its end; nothing is unpickled."""
+    """Bits all over the file, and many of its end; nothing is unpickled."""
     whole, path = (trained / LAST).read_bytes(), tmp_path / LAST
     monkeypatch.setattr(torch, "load", lambda *_, **__: pytest.fail("it was unpickled"))
-    bits = random.Random(0).sample(range(8 * len(whole)), 1500)
+    bits = random.Random(0).sample(range(8 * len(whole)), sizes.FLIPPED_BITS)
     bits += range(8 * (len(whole) - 100), 8 * len(whole), 5)
     refused = 0
     for bit in bits:
@@ -287,7 +288,7 @@ def test_b6_the_previous_checkpoint_is_gone_on_from(
     path, chance, passed = stopped / LAST, random.Random(0), 0
     whole = path.read_bytes()
     assert resumable(stopped, config, model) == (path, "")
-    for _ in range(100):
+    for _ in range(sizes.DAMAGED_CHECKPOINTS):
         data = mutated(whole, chance)
         path.unlink(missing_ok=True)
         if data is not None:
@@ -298,9 +299,8 @@ def test_b6_the_previous_checkpoint_is_gone_on_from(
             r"last\.ckpt: .+\. Going on from previous\.ckpt, which holds training step 6\.$", said
         ), said
         passed += 1
-    record_row(
-        "B6", "100 damaged last checkpoints: each refused, the previous one taken", passed, 100
-    )
+    figure = f"{passed} damaged last checkpoints: each refused, the previous one taken"
+    record_row("B6", figure, passed, sizes.DAMAGED_CHECKPOINTS)
 
 
 @pytest.mark.parametrize("damage", ["bit", "empty", "gone"])

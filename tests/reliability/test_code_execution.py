@@ -8,9 +8,7 @@ import codecs
 import copyreg
 import io
 import pickle
-import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ import numpy as np
 import pytest
 
 import real_layout as layout
+from auditing import watch
 from ghpt.data.datasets.labels import read_labels
 from ghpt.data.formats.validate import read_npy, read_npz
 from ghpt.errors import GhptDataError
@@ -38,34 +37,6 @@ WATCHED = (
     "shutil.",
     "pickle.find_class",
 )
-attempts: list[str] = []
-watching = False
-
-
-def _hook(event: str, arguments: tuple[Any, ...]) -> None:
-    if watching and event.startswith(WATCHED):
-        attempts.append(f"{event} {arguments[:2]!r:.200}")
-    if (
-        watching
-        and event == "open"
-        and isinstance(arguments[1], str)
-        and set(arguments[1]) & set("wax+")
-    ):
-        attempts.append(f"open {arguments[:2]!r:.200}")
-
-
-sys.addaudithook(_hook)  # cannot be removed; does nothing while not watching
-
-
-@contextmanager
-def watch() -> Iterator[list[str]]:
-    global watching
-    attempts.clear()
-    watching = True
-    try:
-        yield attempts
-    finally:
-        watching = False
 
 
 class Call:
@@ -159,7 +130,7 @@ def test_labels_run_nothing(tmp_path: Path, record_row: Callable[..., None]) -> 
     for name, pickled in cases.items():
         file.write_bytes(header + pickled)
         with (
-            watch() as valid,
+            watch(WATCHED) as valid,
             pytest.raises(GhptDataError, match=r"is not a labels file|is missing") as caught,
         ):
             read_labels(file)
@@ -182,7 +153,7 @@ def test_the_payloads_do_run_when_they_are_let(tmp_path: Path) -> None:
     ran = []
     for name, pickled in payloads(sentinel).items():
         try:
-            with watch() as valid:
+            with watch(WATCHED) as valid:
                 pickle.loads(pickled)
         except Exception:
             pass
@@ -211,7 +182,7 @@ def test_arrays_of_objects_run_nothing(
     )
     with pytest.raises(GhptDataError):
         read()  # what Python imports at the first use is not the file's doing
-    with watch() as valid, pytest.raises(GhptDataError, match="Python objects"):
+    with watch(WATCHED) as valid, pytest.raises(GhptDataError, match="Python objects"):
         read()
     assert not sentinel.exists()
     assert not valid

@@ -2,15 +2,13 @@
 
 import copy
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+import children
 import toys
 from ghpt.commands.test import test as run_test
 from ghpt.commands.train import train
@@ -34,21 +32,14 @@ def arrays(folder):
 
 
 def test_c1_the_same_command_twice(tmp_path, record_row):
-    """Fresh processes, another working folder, another hash seed."""
+    """Other processes, working folders, caches and hash seeds, one of them forked."""
     results = []
-    for number, hash_seed in enumerate(("0", "12345")):
+    for number, is_forked in enumerate((True, False)):
         folder, cwd = tmp_path / f"run{number}", tmp_path / f"cwd{number}"
         cwd.mkdir()
-        environment = os.environ | {
-            "PYTHONPATH": str(SCRIPT.parents[1]),
-            "PYTHONHASHSEED": hash_seed,
-            "OMP_NUM_THREADS": "1",
-            "GHPT_CACHE": str(tmp_path / f"cache{number}"),
-        }
-        command = [sys.executable, str(SCRIPT), str(folder), json.dumps({"test": True})]
-        subprocess.run(
-            command, cwd=cwd, env=environment, check=True, capture_output=True, timeout=300
-        )
+        environment = {"PYTHONHASHSEED": "12345", "GHPT_CACHE": str(tmp_path / f"cache{number}")}
+        words = (SCRIPT, folder, json.dumps({"test": True}))
+        children.output_of(*words, env=environment, cwd=cwd, is_forked=is_forked)
         results.append((read_checkpoint(folder / "last.ckpt")["state_dict"], arrays(folder)))
     (weights, first), (again, second) = results
     same = sum(torch.equal(v, again[k]) for k, v in weights.items())
@@ -85,7 +76,7 @@ def predictions_of(checkpoint, folder, threads, **data):
 
 def test_c4_batch_size_threads_and_workers_do_not_matter(tmp_path, checkpoint, record_row):
     reference = predictions_of(checkpoint, tmp_path / "reference", 1, batch_size=16)
-    runs = [(1, 1, 0), (7, 1, 0), (64, 2, 0), (4096, 1, 0), (16, 2, 2)]
+    runs = [(1, 1, 0), (4096, 2, 0), (7, 2, 2)]
     worst, differing = 0.0, 0
     for batch_size, threads, workers in runs:
         folder = tmp_path / f"{batch_size}-{threads}-{workers}"

@@ -9,11 +9,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-import yaml
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 import ghpt.commands.test as testing
-import toys
 from ghpt.commands import predict as prediction
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.commands.train import COMMAND
@@ -55,14 +53,6 @@ def contents(folder: Path) -> dict[str, bytes]:
         for path in sorted(folder.glob("*"))
         if path.suffix[1:] in names and not path.name.startswith(".")
     }
-
-
-@pytest.fixture(scope="module")
-def conf(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("conf") / "conf"
-    shutil.copytree(ROOT / "conf", folder)
-    (folder / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
-    return folder
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+import sizes
 from degenerate import (
     DEGENERATE,
     ONE_BAD_VIEW,
@@ -43,8 +44,11 @@ def random_lens(rng, frames, views, count):
     return torch.from_numpy(rng.uniform(-size, size, (frames, views, count)))
 
 
-def test_d1_exact_key_points_through_any_lens_give_the_truth(nightly, record_row):
-    rigs, worst, missing, good = 10_000 if nightly else 1_000, 0.0, 0, 0
+def test_d1_exact_key_points_through_any_lens_give_the_truth(record_row):
+    rigs = sizes.LENSES
+    worst = 0.0
+    missing = 0
+    good = 0
     rng = np.random.default_rng(0)
     for seed in range(25):
         views, scale = int(rng.integers(2, 17)), 10.0 ** rng.uniform(-4.5, 1.5)
@@ -149,8 +153,8 @@ def test_d2_subsets_refuse_degenerate_frames_and_spoil_no_other(record_row):
 
 
 @pytest.mark.parametrize("name", BASELINES)
-def test_d2_classical_estimators_invent_nothing_and_spoil_no_other(name, nightly, record_row):
-    frames = 1000 if nightly else 60
+def test_d2_classical_estimators_invent_nothing_and_spoil_no_other(name, record_row):
+    frames = sizes.ESTIMATED_FRAMES
     large = cut(random_scene(0, frames, 4), 3).noisy(2, 0)
     valid = torch.ones(large.key_points.shape[:-1], dtype=torch.bool)
     good = BASELINES[name](large.batch())
@@ -198,7 +202,10 @@ noisy_scene = cache(lambda seed, views: cut(random_scene(seed, 2, views), 5).noi
 
 
 @settings(
-    max_examples=500, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck)
+    max_examples=sizes.BROKEN_NUMBERS,
+    deadline=None,
+    derandomize=True,
+    suppress_health_check=list(HealthCheck),
 )
 @given(
     slot=st.sampled_from(list(SIZES)),
@@ -286,7 +293,7 @@ def everything(scene, valid):
 
 
 @pytest.mark.parametrize("views", [3, 7, 31])
-def test_c4_a_frame_s_geometry_is_the_same_in_any_batch_on_any_threads(views, nightly, record_row):
+def test_c4_a_frame_s_geometry_is_the_same_in_any_batch_on_any_threads(views, record_row):
     scene = random_scene(views, 64, views).noisy(2, 0)
     valid = (
         torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.8
@@ -298,8 +305,8 @@ def test_c4_a_frame_s_geometry_is_the_same_in_any_batch_on_any_threads(views, ni
         whole = everything(scene, valid)
         for threads, size, frames in (
             (2, 64, 64),
-            (1, 1, 64 if nightly else 3),
-            (2, 7, 64 if nightly else 21),
+            (1, 1, sizes.BATCHED_FRAMES),
+            (2, 7, min(7 * sizes.BATCHED_FRAMES, 64)),
         ):
             torch.set_num_threads(threads)
             for start in range(0, frames, size):

@@ -5,11 +5,12 @@ Each file is read in a child process with a limit of memory and a timer (``hosti
 """
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+import children
+import sizes
 
 WORKER = Path(__file__).with_name("hostile.py")
 FORMATS = (
@@ -28,10 +29,7 @@ FORMATS = (
 
 
 def measured(row, formats, count, seed):
-    command = [sys.executable, str(WORKER), row, ",".join(formats), str(count), str(seed)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=7200)
-    assert done.returncode == 0, done.stderr[-2000:]
-    return json.loads(done.stdout)
+    return json.loads(children.output_of(WORKER, row, ",".join(formats), count, seed))
 
 
 def of_all(found, *outcomes):
@@ -39,8 +37,8 @@ def of_all(found, *outcomes):
 
 
 @pytest.mark.parametrize("formats", [FORMATS[:4], FORMATS[4:8], FORMATS[8:]], ids="-".join)
-def test_a_mutated_file_is_read_or_named(formats, nightly, record_row):
-    found = measured("A1", formats, 20_000 if nightly else 500, 0)
+def test_a_mutated_file_is_read_or_named(formats, record_row):
+    found = measured("A1", formats, sizes.MUTATED_FILES, 0)
     for name, form in found.items():
         bad = {kind: n for kind, n in form["outcomes"].items() if kind in ("crash", "hang", "leak")}
         total = sum(form["outcomes"].values())
@@ -58,8 +56,8 @@ def test_a_mutated_file_is_read_or_named(formats, nightly, record_row):
         assert form["grown_kib"] <= 64 * 1024 + 8 * form["file_kib"]
 
 
-def test_our_own_key_points_never_come_back_different(nightly, record_row):
-    found = measured("A2", ("npz",), 20_000 if nightly else 1000, 7)
+def test_our_own_key_points_never_come_back_different(record_row):
+    found = measured("A2", ("npz",), sizes.MUTATED_NPZ, 7)
     total, bad = found["npz"]["total"], of_all(found, "different", "part", "leak", "hang", "crash")
     record_row("A2", "own npz: 0 read with other values", total - bad, total)
     assert not bad, found["npz"]["notes"]
@@ -68,10 +66,10 @@ def test_our_own_key_points_never_come_back_different(nightly, record_row):
 
 @pytest.mark.parametrize("formats", [FORMATS[:4], FORMATS[4:]], ids="-".join)
 def test_a_file_that_ends_early_is_named(formats, record_row):
-    """Cut at every byte. Tables and texts that end between two lines are shorter recordings or rigs
+    """Cut at bytes all over the file, every one at night. Tables and texts that end between two lines are shorter recordings or rigs
     without poses; nothing that is read is any other than in the whole file.
     """
-    found = measured("A3", formats, 0, 0)
+    found = measured("A3", formats, sizes.CUT_FILES, 0)
     for name, form in found.items():
         accepted = form["outcomes"].get("part", 0) if name in ("caliscope", "toml", "yaml") else 0
         spaces = (

@@ -2,13 +2,9 @@
 loses no logged step.
 """
 
-import ctypes
-import gc
 import json
 import multiprocessing
 import os
-import signal
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -16,21 +12,20 @@ from pathlib import Path
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-STATUS = Path("/proc/self/status")
-TESTS = Path(__file__).resolve().parents[1]
+import children
+import memory
+import sizes
 
 
 def held() -> dict[str, float]:
     """MiB of private memory, open files, threads and processes; what glibc keeps of freed memory is
     given back.
     """
-    gc.collect()
-    ctypes.CDLL(None).malloc_trim(0)
-    lines = dict(line.split(":", 1) for line in STATUS.read_text(encoding="utf-8").splitlines())
+    memory.trim()
     return {
-        "memory": int(lines["RssAnon"].split()[0]) / 1024,
+        "memory": memory.private_memory(),
         "files": len(os.listdir("/proc/self/fd")),
-        "threads": int(lines["Threads"]),
+        "threads": memory.threads(),
         "children": len(multiprocessing.active_children()),
     }
 
@@ -53,6 +48,7 @@ def child(folder: str, steps: int) -> None:
                     flush=True,
                 )
 
+    memory.keep_no_freed_memory()
     training.progress = lambda config: [Probe()]
     data = toys.DATA | {"batch_size": 1, "workers": 1}
     model = toys.MODEL | {"hypotheses": 4, "scorer": toys.MODEL["scorer"] | {"layers": [4]}}
@@ -65,23 +61,13 @@ def gone(pid: int) -> bool:
     return not status.exists() or "State:\tZ" in status.read_text(encoding="utf-8")
 
 
-@pytest.mark.skipif(not STATUS.is_file(), reason="needs Linux's /proc")
-def test_e3_and_b8_a_long_training(tmp_path, nightly, record_row):
-    steps = 20_000 if nightly else 600
-    path = os.pathsep.join([str(TESTS), os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {
-        "PYTHONPATH": path,
-        "OMP_NUM_THREADS": "1",
-        "PYTHONWARNINGS": "ignore",
-        "MALLOC_ARENA_MAX": "1",
-        "MALLOC_MMAP_THRESHOLD_": "65536",
-    }
-    command = [sys.executable, __file__, str(tmp_path), str(steps)]
-    with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
-    ) as run:
-        start, end = (json.loads(run.stdout.readline()) for _ in range(2))
-        run.send_signal(signal.SIGKILL)
+@pytest.mark.skipif(not memory.STATUS.is_file(), reason="needs Linux's /proc")
+def test_e3_and_b8_a_long_training(tmp_path, record_row):
+    steps = sizes.TRAINING_STEPS
+    run = children.start(__file__, tmp_path, steps)
+    start, end = (json.loads(run.stdout.readline()) for _ in range(2))
+    run.kill()
+    run.wait(children.LIMIT)
     deadline = time.monotonic() + 60
     while not all(gone(pid) for pid in end["workers"]):
         assert time.monotonic() < deadline, "orphans"

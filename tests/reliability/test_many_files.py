@@ -3,11 +3,12 @@ content needs.
 """
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
+
+import children
+import sizes
 
 READ = """
 import resource, sys, time
@@ -40,15 +41,14 @@ def recording(folder: Path, frames: int, padding: int) -> int:
 
 
 def measured(folder: Path) -> tuple[float, float, int, int]:
-    done = subprocess.run(
-        [sys.executable, "-c", READ, str(folder)], capture_output=True, text=True, check=True
-    )
-    seconds, grown, people, size = map(float, done.stdout.split())
+    said = children.output_of("-c", READ, folder)
+    seconds, grown, people, size = map(float, said.split())
     return seconds, grown / 1024, int(people), int(size)
 
 
 def test_time_and_memory_grow_with_the_files(tmp_path, nightly, record_row):
-    frames, padding = (50_000, 3000) if nightly else (1000, 100)
+    frames = sizes.MANY_FILES
+    padding = 3000 if nightly else 100
     total = [recording(tmp_path / str(n), n * frames, padding) for n in (1, 2)]
     found = [
         min((measured(tmp_path / str(n)) for _ in range(1 if nightly else 2)), key=lambda f: f[0])

@@ -1,14 +1,13 @@
 """C2 and C3: one process and several give the same numbers, with missing joints and uneven shares."""
 
 import json
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+
+import children
 
 SCRIPT = Path(__file__).with_name("run_toy.py")
 
@@ -24,10 +23,7 @@ def run(folder, processes, samples, **changes):
         "model": {"optimizer": {"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.1}},
         **changes,
     }
-    environment = os.environ | {"PYTHONPATH": str(SCRIPT.parents[1]), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(SCRIPT), str(folder), json.dumps(wanted)]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-3000:]
+    children.output_of(SCRIPT, folder, json.dumps(wanted))
     return torch.load(folder / "last.ckpt", weights_only=True)
 
 

@@ -4,15 +4,14 @@ import errno
 import json
 import os
 import random
-import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
 import pytest
 import torch
 
+import children
+import sizes
 from ghpt import files
 from ghpt.files import sweep_temporaries
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO, read_checkpoint
@@ -22,64 +21,46 @@ SCRIPT = Path(__file__).with_name("run_toy.py")
 SAVER = """
 import os, sys, torch
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO
-for line in sys.stdin:  # one fork for each kill: torch is imported once
-    child = os.fork()
-    if child:
-        os.waitpid(child, 0)
-        os.write(1, b"killed\\n")
-        continue
-    os.write(1, f"pid {os.getpid()}\\n".encode())  # whole lines, whatever the buffering: a kill must not cut one
-    for number in range(int(line), 10**9):
-        state = {"x": torch.full((6_000_000,), float(number)), "y": torch.tensor(number)}
-        checkpoint = {"state_dict": state, FIELD: {"format_version": FORMAT_VERSION}}
-        AtomicCheckpointIO().save_checkpoint(checkpoint, sys.argv[1])
-        os.write(1, f"saved {number}\\n".encode())
+for number in range(int(sys.argv[2]), 10**9):
+    state = {"x": torch.full((6_000_000,), float(number)), "y": torch.tensor(number)}
+    checkpoint = {"state_dict": state, FIELD: {"format_version": FORMAT_VERSION}}
+    AtomicCheckpointIO().save_checkpoint(checkpoint, sys.argv[1])
+    os.write(1, f"{number}\\n".encode())  # a whole line: a kill must not cut one
 """
 
 
-def kill_while_saving(saver, number, delay):
-    """Let the saver save on and on, kill it ``delay`` seconds after its first save; the last number
-    it saved.
+def kill_while_saving(path, number, delay):
+    """Save on and on from this number in a child, and kill it ``delay`` seconds after its first
+    save. Returns the last number that it saved.
     """
-    print(number, file=saver.stdin, flush=True)
-    pid = int(saver.stdout.readline().split()[1])
+    saver = children.start("-c", SAVER, path, number)
     saved = saver.stdout.readline()
     time.sleep(delay)
-    os.kill(pid, signal.SIGKILL)
-    while (line := saver.stdout.readline()) != "killed\n":
-        saved = line
-    return int(saved.split()[1])
+    saver.kill()
+    return int([saved, *saver.stdout.readlines()][-1])
 
 
-def test_b1_kill_while_saving(tmp_path, nightly, record_row):
+def test_b1_kill_while_saving(tmp_path, monkeypatch, record_row):
     """24 MB checkpoints, saved without a pause, the system's temporary folder on another file
     system.
     """
-    other = Path("/dev/shm") if Path("/dev/shm").is_dir() else tmp_path
-    environment = os.environ | {"TMPDIR": str(other), "OMP_NUM_THREADS": "1"}
-    path, kills, number = tmp_path / "last.ckpt", 300 if nightly else 20, 0
-    command = [sys.executable, "-c", SAVER, str(path)]
+    if Path("/dev/shm").is_dir():
+        monkeypatch.setenv("TMPDIR", "/dev/shm")
+    path = tmp_path / "last.ckpt"
+    kills = sizes.KILLED_SAVES
+    number = 0
     rng = random.Random(0)
     bad = left_over = 0
-    with subprocess.Popen(
-        command,
-        env=environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        bufsize=1,
-    ) as saver:
-        for _ in range(kills):
-            saved = kill_while_saving(saver, number, rng.uniform(0, 0.2))
-            try:
-                state = read_checkpoint(path)["state_dict"]
-                bad += not (state["y"] >= saved and (state["x"] == state["y"]).all())
-            except ValueError:
-                bad += 1
-            sweep_temporaries(tmp_path)
-            left_over += len(list(tmp_path.iterdir())) - 1
-            number = saved + 1
-        saver.stdin.close()
+    for _ in range(kills):
+        saved = kill_while_saving(path, number, rng.uniform(0, 0.2))
+        try:
+            state = read_checkpoint(path)["state_dict"]
+            bad += not (state["y"] >= saved and (state["x"] == state["y"]).all())
+        except ValueError:
+            bad += 1
+        sweep_temporaries(tmp_path)
+        left_over += len(list(tmp_path.iterdir())) - 1
+        number = saved + 1
     record_row(
         "B1",
         f"{kills} kills while saving: {bad} unreadable or lost, {left_over} left over",
@@ -89,22 +70,18 @@ def test_b1_kill_while_saving(tmp_path, nightly, record_row):
     assert (bad, left_over) == (0, 0)
 
 
-def test_b1_and_b2_kill_training_and_resume(tmp_path, nightly, record_row):
+def test_b1_and_b2_kill_training_and_resume(tmp_path, record_row):
     """A real training run, killed, resumed by the same command, ends with the same weights."""
     changes = {"trainer": {"max_epochs": 20}, "train": {"save_every": 2}}
-    environment = os.environ | {"PYTHONPATH": str(SCRIPT.parents[1]), "OMP_NUM_THREADS": "1"}
     rng = random.Random(1)
 
     def start(folder, resume):
         wanted = {**changes, "train": changes["train"] | {"resume": resume}}
-        command = [sys.executable, str(SCRIPT), str(folder), json.dumps(wanted)]
-        return subprocess.Popen(
-            command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
+        return children.start(SCRIPT, folder, json.dumps(wanted))
 
     assert start(tmp_path / "whole", False).wait(timeout=300) == 0
     expected = read_checkpoint(tmp_path / "whole" / "last.ckpt")["state_dict"]
-    runs = 10 if nightly else 2
+    runs = sizes.KILLED_TRAININGS
     same = 0
     for number in range(runs):
         folder = tmp_path / str(number)

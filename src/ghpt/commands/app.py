@@ -1,7 +1,10 @@
 """What all commands share: compose the configuration, run, and say errors in one line."""
 
+import argparse
 import logging
 import os
+import re
+import string
 import sys
 import warnings
 from collections.abc import Callable, Iterator, Sequence
@@ -15,11 +18,15 @@ from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
+import __main__
+import ghpt
+from ghpt.commands.catalogue import load
 from ghpt.commands.jobs import (
     Job,
+    Program,
     awaited,
     chosen_launcher,
     first_of_several_ends,
@@ -28,7 +35,7 @@ from ghpt.commands.jobs import (
     take_signals,
 )
 from ghpt.commands.outputs import Files, OutputFolder, SweepFolder
-from ghpt.commands.overrides import check_overrides
+from ghpt.commands.overrides import Source, check_overrides, compose, spread_seeds
 from ghpt.config import plain
 from ghpt.config import settings as typed_settings
 from ghpt.errors import GhptConfigError, GhptError, one_line, out_of_memory
@@ -38,12 +45,20 @@ from ghpt.signals import stopped_by_signals
 S = TypeVar("S")
 R = TypeVar("R")
 USERS_ERRORS = (GhptError, HydraException, OmegaConfBaseException, OSError)
-"""What a user can cause and mend: said in one line. Anything else is a fault of the program, with
-its trace.
+"""What a user can cause and correct: said in one line. Anything else is a fault of the program,
+with its trace.
 """
 _FULL = "HYDRA_FULL_ERROR"
 _CONFIGURATION = ".hydra"
 """Where Hydra's users look for a run's configuration, within its output folder."""
+_IRRELEVANT = (
+    r".*treespec, LeafSpec.* is deprecated",
+    r".*does not have many workers",  # reading is memory-mapped
+    r"torch\.distributed\.nn\.functional\.all_gather is deprecated",
+    r"It is recommended to use `self\.log\('validation/.*sync_dist=True",  # they are
+    r"Checkpoint directory .* exists and is not empty",
+)
+"""Lightning's warnings that its users can neither use nor act on."""
 _log = logging.getLogger(__name__)
 
 
@@ -71,47 +86,21 @@ class Command(Generic[S, R]):
 
 
 @stopped_by_signals()
-def run(conf: Path, command: Command[Any, Any]) -> None:
-    """Compose ``<conf>/<command.name>.yaml`` with the command line and call ``command.task``.
+def run(conf: Path, command: Command[Any, Any] | str) -> None:
+    """Compose ``<conf>/<command.name>.yaml`` with ``sys.argv`` and call ``command.task``.
 
-    The output folder is locked and guarded meanwhile, see `ghpt.commands.outputs`. A user's error
-    ends the program with one line, ``error: ...``, and exit status 1; ``HYDRA_FULL_ERROR=1`` shows
-    the trace. In a sweep the other jobs run on, here or in submitit's processes, and the summary of
-    each is printed; a job that finished in an earlier run of the sweep is not done again.
+    ``command`` is one of the project's by its name, which is then imported when its job runs: help
+    and mistakes are answered without. The output folder is locked and guarded meanwhile, see
+    `ghpt.commands.outputs`. A user's error ends the program with one line, ``error: ...``, and exit
+    status 1; ``HYDRA_FULL_ERROR=1`` shows the trace. In a sweep the other jobs run on, here or in
+    submitit's processes, and the summary of each is printed; a job that finished in an earlier run
+    of the sweep is not done again.
     """
     trace = os.environ.get(_FULL) == "1"
     os.environ[_FULL] = "1"  # Hydra then lets errors through, to be said here
-    script = os.path.abspath(sys.argv[0])
     ended: list[Job[Any, Any]] = []
     try:
-        arguments = get_args_parser().parse_args()
-        sweep = bool(arguments.multirun)
-        launcher = "basic"
-        if not (arguments.help or arguments.hydra_help or arguments.info):
-            overrides = check_overrides(conf.resolve(), command.name, arguments.overrides)
-            launcher = chosen_launcher(overrides, compose_only=bool(arguments.cfg))
-            sys.argv += _folder_names(overrides) if sweep else []
-        job = _Job(command, script, os.getpid(), sweep, trace, ended)
-        program = hydra.main(
-            version_base="1.3", config_path=str(conf.resolve()), config_name=command.name
-        )(job)
-        with SweepFolder.released():
-            try:
-                with awaited(ended) if launcher != "basic" else nullcontext():
-                    program()
-            finally:
-                if sweep and ended:
-                    print(
-                        "\n".join(
-                            [
-                                "",
-                                "Jobs of the sweep:",
-                                *(f"  {job.name}: {job.said}" for job in ended),
-                            ]
-                        )
-                    )
-            if sweep and ended and command.after is not None:
-                command.after(ended)
+        _run(conf.resolve(), command, trace, ended)
     except BrokenPipeError:  # whoever read what is printed has had enough, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
@@ -128,18 +117,111 @@ def run(conf: Path, command: Command[Any, Any]) -> None:
         sys.exit(1)
 
 
+def _run(
+    conf: Path, command: Command[Any, Any] | str, trace: bool, ended: list[Job[Any, Any]]
+) -> None:
+    """Do what the command line asks for; jobs that end are added to ``ended``."""
+    name = command if isinstance(command, str) else command.name
+    if name == "reproduce":
+        sys.argv[1:] = spread_seeds(sys.argv[1:])
+    if "--version" in sys.argv:
+        print(f"ghpt {ghpt.__version__}")
+        return
+    arguments = get_args_parser().parse_args()
+    source = _source(conf, name, arguments)
+    sweep = bool(arguments.multirun)
+    job = _Job(command, source.folder, _program(), os.getpid(), sweep, trace, ended)
+    start = hydra.main(version_base="1.3", config_path=str(source.folder), config_name=source.name)(
+        job
+    )
+    if arguments.hydra_help or arguments.info or arguments.shell_completion:
+        _answer(start)
+        return
+    overrides = check_overrides(source, arguments.overrides)
+    if arguments.help:
+        print(_help(source, arguments.overrides))
+        return
+    launcher = chosen_launcher(overrides, compose_only=bool(arguments.cfg))
+    if sweep:
+        sys.argv += _folder_names(overrides)
+    with SweepFolder.released():
+        try:
+            with awaited(ended) if launcher != "basic" else nullcontext():
+                start()
+        finally:
+            if sweep and ended:
+                lines = [f"  {job.name}: {job.said}" for job in ended]
+                print("\n".join(["", "Jobs of the sweep:", *lines]))
+        if sweep and ended:
+            after = job.loaded().after
+            if after is not None:
+                after(ended)
+
+
+def _source(conf: Path, name: str, arguments: argparse.Namespace) -> Source:
+    """Return where the configuration is, which the options of Hydra may say."""
+    if arguments.config_path is not None:
+        conf = Path(arguments.config_path).resolve()
+        sys.argv += ["--config-path", str(conf)]  # Hydra takes it as relative to this file
+    more = None if arguments.config_dir is None else Path(arguments.config_dir).resolve()
+    for folder in (conf, more):
+        if folder is not None and not folder.is_dir():
+            problem = "there is no such folder of configurations"
+            raise GhptConfigError(str(folder), problem, "Check the option --config-*.")
+    return Source(conf, arguments.config_name or name, more)
+
+
+def _program() -> Program:
+    """Return how this process was started, so that others can be started alike."""
+    module = getattr(__main__.__spec__, "name", "")
+    if module.startswith("ghpt."):
+        return Program(sys.argv[0], module)
+    return Program(os.path.abspath(sys.argv[0]), None)
+
+
+def _answer(start: Callable[[], object]) -> None:
+    """Let Hydra answer what its options ask. Raises GhptConfigError for options that do not fit."""
+    try:
+        start()
+    except ValueError as error:
+        if isinstance(error, USERS_ERRORS):
+            raise
+        raise GhptConfigError("options", one_line(error), "--hydra-help says more.") from None
+
+
+def _help(source: Source, words: Sequence[str]) -> str:
+    """Return a command's help, which its yaml holds, with the configuration.
+
+    Hydra's own help takes seconds to list the groups of every plugin.
+    """
+    config = compose(source, words, with_hydra=True)
+    template = string.Template(config.hydra.help.template)
+    with open_dict(config):
+        del config["hydra"]
+    text = template.safe_substitute(CONFIG=OmegaConf.to_yaml(config))
+    if sys.argv[0].startswith("ghpt "):
+        text = re.sub(r"python (\w+)\.py", r"ghpt \1", text)
+    return text
+
+
 @dataclass(frozen=True)
 class _Job:
-    """What Hydra calls for each job: the task, with its errors and end. Also in another process,
-    where it is a copy.
+    """What Hydra calls for each job: the task, with its errors and end.
+
+    In another process it is a copy.
     """
 
-    command: Command[Any, Any]
-    script: str
+    command: Command[Any, Any] | str
+    conf: Path
+    program: Program
     process: int
     sweep: bool
     trace: bool
     ended: list[Job[Any, Any]]
+
+    def loaded(self) -> Command[Any, Any]:
+        """Return the command, imported if it is given by its name."""
+        return load(self.command, self.conf) if isinstance(self.command, str) else self.command
 
     def __call__(self, config: Any) -> Job[Any, Any]:
         elsewhere = os.getpid() != self.process
@@ -156,18 +238,20 @@ class _Job:
                 values = plain(config)
                 if self.sweep and values.get("resume") is False and not values.get("overwrite"):
                     values["resume"] = "auto"
-                settings = self._settings(values)
-                folder = stack.enter_context(self._folder(output, settings, values))
+                command = self.loaded()
+                settings = _settings_of(command, values)
+                files = command.files(settings)
+                folder = stack.enter_context(_output_folder(output, files, values))
                 before = folder.finished(values) if folder is not None and self.sweep else None
                 if before is not None and not values.get("overwrite"):
                     said = f"{before} (finished before)"
                     failed = False
                 else:
-                    stack.enter_context(self._records(config, output))
+                    stack.enter_context(_records(config, output))
                     stack.enter_context(self._as_command(values))
                     with stopped_by_signals():
-                        result = self.command.task(settings, output)
-                    said = self.command.summary(result) if self.sweep else ""
+                        result = command.task(settings, output)
+                    said = command.summary(result) if self.sweep else ""
                     failed = False
                     if folder is not None:
                         folder.finish(values, said)
@@ -189,73 +273,68 @@ class _Job:
                 self.ended.append(Job(output.name, settings, result, said, failed))
         return self.ended[-1]
 
-    def _settings(self, values: dict[str, Any]) -> Any:
-        if self.command.settings is dict:
-            return values
-        return typed_settings(self.command.settings, values)
-
-    def _folder(
-        self, output: Path, settings: Any, values: dict[str, Any]
-    ) -> AbstractContextManager[OutputFolder | None]:
-        """The output folder, locked and guarded; None in a training's other processes."""
-        if not is_first_process():
-            return nullcontext()
-        files = self.command.files(settings)
-        configuration = tuple(
-            f"{_CONFIGURATION}/{name}" for name in ("config.yaml", "hydra.yaml", "overrides.yaml")
-        )
-        log = f"{HydraConfig.get().job.name}.log"
-        files = replace(
-            files, writes=(*files.writes, *configuration), growing=(*files.growing, log)
-        )
-        return OutputFolder(output, files, bool(values.get("overwrite")))
-
-    @contextmanager
-    def _records(self, config: Any, output: Path) -> Iterator[None]:
-        """The job's configuration is written, and within the block its log."""
-        hydra_config = HydraConfig.get()
-        if is_first_process():
-            contents = {
-                "config": config,
-                "hydra": {"hydra": hydra_config},
-                "overrides": hydra_config.overrides.task,
-            }
-            for name, content in contents.items():
-                with atomic_write(output / _CONFIGURATION / f"{name}.yaml", "w") as handle:
-                    handle.write(OmegaConf.to_yaml(content))
-        handler = logging.FileHandler(output / f"{hydra_config.job.name}.log", encoding="utf-8")
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        logging.root.addHandler(handler)
-        try:
-            yield
-        finally:
-            logging.root.removeHandler(handler)
-            handler.close()
-
     def _as_command(self, values: dict[str, Any]) -> AbstractContextManager[None]:
         if not self.sweep:
             return nullcontext()
-        return own_command(self.script, ["resume=auto"] if values.get("resume") == "auto" else [])
+        more = ["resume=auto"] if values.get("resume") == "auto" else []
+        return own_command(self.program, more)
+
+
+def _settings_of(command: Command[Any, Any], values: dict[str, Any]) -> Any:
+    if command.settings is dict:
+        return values
+    return typed_settings(command.settings, values)
+
+
+def _output_folder(
+    output: Path, files: Files, values: dict[str, Any]
+) -> AbstractContextManager[OutputFolder | None]:
+    """Return the output folder, locked and guarded; None in a training's other processes."""
+    if not is_first_process():
+        return nullcontext()
+    names = ("config.yaml", "hydra.yaml", "overrides.yaml")
+    configuration = tuple(f"{_CONFIGURATION}/{name}" for name in names)
+    log = f"{HydraConfig.get().job.name}.log"
+    files = replace(files, writes=(*files.writes, *configuration), growing=(*files.growing, log))
+    return OutputFolder(output, files, bool(values.get("overwrite")))
+
+
+@contextmanager
+def _records(config: Any, output: Path) -> Iterator[None]:
+    """Write the job's configuration, and within the block its log."""
+    hydra_config = HydraConfig.get()
+    if is_first_process():
+        contents = {
+            "config": config,
+            "hydra": {"hydra": hydra_config},
+            "overrides": hydra_config.overrides.task,
+        }
+        for name, content in contents.items():
+            with atomic_write(output / _CONFIGURATION / f"{name}.yaml", "w") as handle:
+                handle.write(OmegaConf.to_yaml(content))
+    handler = logging.FileHandler(output / f"{hydra_config.job.name}.log", encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.root.addHandler(handler)
+    try:
+        yield
+    finally:
+        logging.root.removeHandler(handler)
+        handler.close()
 
 
 def _folder_names(overrides: Sequence[Override]) -> list[str]:
-    """The setting by which a job's folder is named by what the sweep changes, and by nothing else."""
+    """Return the setting by which a job's folder is named by what the sweep changes, and no more."""
     fixed = ",".join(
-        o.key_or_group for o in overrides if not o.is_sweep_override() or "/" in o.input_line
+        str(o.key_or_group)
+        for o in overrides
+        if not o.is_sweep_override() or "/" in (o.input_line or "")
     )
     return [f"hydra.job.config.override_dirname.exclude_keys=[{fixed}]"]
 
 
 def _quieten() -> None:
-    """Leave out what Lightning says that its users can neither use nor mend."""
+    """Leave out what Lightning says that its users can neither use nor act on."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
-    warnings.filterwarnings("ignore", r".*treespec, LeafSpec.* is deprecated")
-    warnings.filterwarnings("ignore", r".*does not have many workers")  # reading is memory-mapped
-    warnings.filterwarnings(
-        "ignore", r"torch\.distributed\.nn\.functional\.all_gather is deprecated"
-    )
-    warnings.filterwarnings(
-        "ignore", r"It is recommended to use `self\.log\('validation/.*sync_dist=True"
-    )  # they are
-    warnings.filterwarnings("ignore", r"Checkpoint directory .* exists and is not empty")
+    for message in _IRRELEVANT:
+        warnings.filterwarnings("ignore", message)

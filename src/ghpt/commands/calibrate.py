@@ -18,6 +18,7 @@ from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.millimetres import in_millimetres, of_scale, read_scale
 from ghpt.calibration.rig import RigEstimate
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.frames import MEASURED, frames_of_views
@@ -293,3 +294,7 @@ def _through(case: Case, views: list[int], cameras: Cameras) -> Recording:
 
 
 COMMAND = Command(name="calibrate", settings=dict, task=calibrate, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("calibrate")

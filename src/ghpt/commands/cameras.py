@@ -23,6 +23,7 @@ from ghpt.calibration.check.mending import MENDED, write_mended
 from ghpt.calibration.check.setup import Setup, as_filed
 from ghpt.calibration.check.units import UNITS_MM
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.calibrate import people_note
 from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
 from ghpt.commands.outputs import Files, check_apart, input_paths
@@ -268,3 +269,7 @@ def _stature(numbers: dict[str, Any]) -> str:
 
 
 COMMAND = Command(name="cameras", settings=dict, task=examine, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("cameras")

@@ -31,10 +31,23 @@ _RANKS = ("RANK", "LOCAL_RANK", "NODE_RANK", "SLURM_PROCID", "JSM_NAMESPACE_RANK
 """The variables by which launchers number a run's processes, as Lightning reads them."""
 _PATIENCE = 10.0
 """Seconds that interrupted jobs have to save their state."""
+_AT_MOST = 60.0
+"""Seconds in which the first of several processes comes to the error that another one has met, on a
+slow machine."""
 
 
 S = TypeVar("S")
 R = TypeVar("R")
+
+
+@dataclass(frozen=True)
+class Program:
+    """How a process of a command is started."""
+
+    path: str
+    """The first word of its command line."""
+    module: str | None
+    """The module that Python runs (``python -m``); None: the script ``path``."""
 
 
 @dataclass(frozen=True)
@@ -184,28 +197,29 @@ def take_signals() -> None:
 
 
 @contextmanager
-def own_command(script: str, added: Sequence[str] = ()) -> Iterator[None]:
-    """Within the block, the running job of a sweep is a command of its own to Lightning, with
-    ``added`` words.
+def own_command(program: Program, added: Sequence[str] = ()) -> Iterator[None]:
+    """Within the block, the running job of a sweep is a command of its own to Lightning.
 
     Lightning starts a training's other processes with this process's command, which is the whole
     sweep's; and leaves its variables behind, with which the next job would believe to have been
-    started by the one before.
+    started by the one before. ``added`` are further words of the command.
     """
     hydra = HydraConfig.get()
-    before = list(sys.argv), __main__.__spec__, dict(os.environ)
+    arguments = list(sys.argv)
+    spec = __main__.__spec__
+    environment = set(os.environ)
     with read_write(hydra), open_dict(hydra):
         hydra.run.dir = hydra.runtime.output_dir
     settings = [word for word in hydra.overrides.task if not word.startswith("output=")]
-    sys.argv[:], __main__.__spec__ = (
-        [script, *settings, *added, f"output='{hydra.runtime.output_dir}'"],
-        None,
-    )
+    output = f"output='{hydra.runtime.output_dir}'"
+    sys.argv[:] = [program.path, *settings, *added, output]
+    __main__.__spec__ = None if program.module is None else find_spec(program.module)
     try:
         yield
     finally:
-        sys.argv[:], __main__.__spec__ = before[:2]
-        for name in set(os.environ) - set(before[2]):
+        sys.argv[:] = arguments
+        __main__.__spec__ = spec
+        for name in set(os.environ) - environment:
             del os.environ[name]
         distributed = sys.modules.get("torch.distributed")
         if distributed and distributed.is_available() and distributed.is_initialized():
@@ -225,7 +239,7 @@ def first_of_several_ends() -> bool:
     """
     if os.environ.get("LOCAL_RANK", "0") == "0":
         return False
-    end = time.monotonic() + _PATIENCE / 2
+    end = time.monotonic() + _AT_MOST
     while os.getppid() == _PARENT and time.monotonic() < end:
         time.sleep(0.05)
     return os.getppid() != _PARENT

@@ -20,8 +20,8 @@ from lightning.pytorch.utilities.exceptions import SIGTERMException
 from ghpt.errors import GhptConfigError
 from ghpt.signals import stop, stopped_by_signals
 
-_WAIT = 5.0
-"""Seconds in which a process that others wait for is seen to have ended."""
+_WAIT = 30.0
+"""Seconds in which a process that others wait for is seen to have ended, on a slow machine."""
 _DEAD_WORKER = re.compile(r"DataLoader worker \(pid")
 _DEAD_PEER = re.compile(r"gloo|NCCL|[Cc]onnection (closed|reset) by peer")
 _WHY = "the system does so where memory is short"

@@ -1,12 +1,16 @@
-"""The words of a command line, checked before Hydra composes them: a mistake is named, with what
-exists.
+"""The words of a command line, checked before Hydra composes them.
+
+A mistake is named, with what exists, before anything heavy is imported.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import hydra
+from hydra.core.config_loader import ConfigLoader
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -15,33 +19,73 @@ from omegaconf import OmegaConf
 from ghpt.config import suggest
 from ghpt.errors import GhptConfigError
 
+_SEARCH_PATH = "hydra.searchpath"
+_SWEEP = {"-m", "--multirun"}
 
-def check_overrides(conf: Path, config_name: str, words: Sequence[str]) -> list[Override]:
-    """The parsed overrides. Raises GhptConfigError, saying what exists, for a setting or a choice
-    that does not.
+
+@dataclass(frozen=True)
+class Source:
+    """Where a command's configuration comes from."""
+
+    folder: Path
+    """The folder of the yaml files."""
+    name: str
+    """The name of the first of them, without .yaml."""
+    more: Path | None = None
+    """A folder of a user's own files, which go before those in ``folder``."""
+
+
+def compose(source: Source, words: Sequence[str], with_hydra: bool = False) -> Any:
+    """Return the DictConfig that the words of a command line make of the yaml files."""
+    overrides = [_parse(word) for word in words]
+    with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
+        search_path = _search_path(source, overrides)
+        return hydra.compose(
+            source.name, overrides=[*words, *search_path], return_hydra_config=with_hydra
+        )
+
+
+def check_overrides(source: Source, words: Sequence[str]) -> list[Override]:
+    """Return the parsed overrides of a command line.
+
+    Raises GhptConfigError, saying what exists, for a setting or a choice that does not.
     """
     overrides = [_parse(word) for word in words]
-    groups = {}
-    for override in overrides:
-        if (conf / override.key_or_group).is_dir() and not override.is_delete():
-            chosen = [
-                _check_choice(conf, override.key_or_group, value) for value in _values(override)
-            ]
-            groups[override.key_or_group] = f"{override.get_key_element()}={chosen[0]}"
-    with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-        config: Any = OmegaConf.to_container(
-            hydra.compose(config_name, overrides=list(groups.values()))
-        )
+    with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
+        loader = GlobalHydra.instance().config_loader()
+        first = _search_path(source, overrides)
+        groups = {}
+        for override in overrides:
+            group = override.key_or_group
+            choices = _choices(loader, source, group, first)
+            if choices and not override.is_delete():
+                chosen = [_check_choice(group, value, choices) for value in _values(override)]
+                groups[group] = f"{override.get_key_element()}={chosen[0]}"
+        composed = hydra.compose(source.name, overrides=[*first, *groups.values()])
+    config = OmegaConf.to_container(composed)
     for override in overrides:
         key = override.key_or_group
-        if (
-            key not in groups
-            and not key.startswith("hydra")
-            and "@" not in key
-            and not (conf / key).is_dir()
-        ):
+        is_hydras = key.startswith("hydra") or "@" in key
+        is_group = key in groups or (source.folder / key).is_dir()
+        if not is_hydras and not is_group:
             _check_key(config, key, added=override.is_add() or override.is_force_add())
     return overrides
+
+
+def spread_seeds(words: Sequence[str]) -> list[str]:
+    """Return the words of ``reproduce``; in a sweep ``seeds=5`` becomes ``seed=0,1,2,3,4``.
+
+    Every seed is then a job.
+    """
+    values = dict(word.split("=", 1) for word in words if "=" in word)
+    count = values.get("seeds", "")
+    first = values.get("seed", "0")
+    are_numbers = count.isdecimal() and first.isdecimal()
+    if not _SWEEP & set(words) or not are_numbers or int(count) <= 1:
+        return list(words)
+    seeds = range(int(first), int(first) + int(count))
+    others = [word for word in words if not word.startswith(("seeds=", "seed="))]
+    return [*others, "seed=" + ",".join(map(str, seeds))]
 
 
 def _parse(word: str) -> Override:
@@ -52,39 +96,69 @@ def _parse(word: str) -> Override:
         raise GhptConfigError(word, "is not of the form key=value", hint) from None
 
 
+def _search_path(source: Source, overrides: Sequence[Override]) -> list[str]:
+    """Return the override by which Hydra finds a user's own files too, if there are any."""
+    given = [o.value() for o in overrides if o.get_key_element() == _SEARCH_PATH]
+    places = [str(place) for place in given[-1]] if given else []
+    if source.more is not None:
+        places.append(f"file://{source.more}")
+    quoted = ",".join(f"'{place}'" for place in places)
+    return [f"{_SEARCH_PATH}=[{quoted}]"] if places else []
+
+
+def _choices(loader: ConfigLoader, source: Source, group: str, search_path: list[str]) -> list[str]:
+    """Return what a group of the configuration offers; nothing for what is no group of ours."""
+    if group.startswith("hydra/"):
+        return []
+    names = loader.get_group_options(group, config_name=source.name, overrides=search_path)
+    return sorted(name for name in names if not name.startswith("_"))
+
+
 def _values(override: Override) -> list[Any]:
-    """The values that a sweep takes in turn, or the only one."""
-    value = override.value()
-    return list(override.sweep_string_iterator()) if override.is_sweep_override() else [value]
+    """Return the values that a sweep takes in turn, or the only one."""
+    if override.is_sweep_override():
+        return list(override.sweep_string_iterator())
+    return [override.value()]
 
 
-def _check_choice(conf: Path, group: str, value: Any) -> Any:
-    existing = sorted(path.stem for path in (conf / group).glob("[!_]*.yaml"))
-    for name in value if isinstance(value, list) else [value]:
+def _check_choice(group: str, value: Any, existing: Sequence[str]) -> Any:
+    names = value if isinstance(value, list) else [value]
+    for name in names:
         if name not in existing:
-            shown = "null" if name is None else repr(name)
-            raise GhptConfigError(group, f"there is no {shown}", suggest(str(name), existing))
-    return value if not isinstance(value, list) else f"[{','.join(map(str, value))}]"
+            text = "null" if name is None else repr(name)
+            raise GhptConfigError(group, f"there is no {text}", suggest(str(name), existing))
+    return f"[{','.join(map(str, value))}]" if isinstance(value, list) else value
 
 
-def _check_key(config: dict[str, Any], key: str, added: bool) -> None:
-    node: Any = config
+def _check_key(config: Any, key: str, added: bool) -> None:
+    """Raise GhptConfigError if a composed configuration has no such key."""
+    node = config
     parts = key.split(".")
     for depth, part in enumerate(parts):
-        if not isinstance(node, dict) or part not in node:
-            if added and depth:
-                return  # whatever is built from it knows its settings
-            above = ".".join(parts[:depth])
-            hint = suggest(part, node if isinstance(node, dict) else [])
-            elsewhere = [path for path in _paths(config) if path.endswith(f".{parts[-1]}")]
-            if elsewhere and "Did you mean" not in hint:
-                hint = f"Did you mean {elsewhere[0]!r}? {hint}"
-            raise GhptConfigError(key, f"no such setting{f' in {above}' if above else ''}", hint)
-        node = node[part]
+        if isinstance(node, Mapping) and part in node:
+            node = node[part]
+            continue
+        if added and depth:
+            return  # whatever is built from it knows its settings
+        existing = node if isinstance(node, Mapping) else []
+        above = ".".join(parts[:depth])
+        problem = f"no such setting in {above}" if above else "no such setting"
+        raise GhptConfigError(key, problem, _suggest_key(config, existing, part, parts[-1]))
 
 
-def _paths(node: dict[str, Any], above: str = "") -> Iterator[str]:
+def _suggest_key(config: Any, existing: Mapping[str, Any] | list[Any], part: str, last: str) -> str:
+    """Suggest a key beside the missing ``part``, or one elsewhere whose last part is ``last``."""
+    hint = suggest(part, existing)
+    elsewhere = [path for path in _paths(config) if path.endswith(f".{last}")]
+    if not elsewhere or "Did you mean" in hint:
+        return hint
+    return f"Did you mean {elsewhere[0]!r}? {hint}"
+
+
+def _paths(node: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    """Yield the dotted keys of a configuration."""
     for key, value in node.items():
-        yield f"{above}{key}"
-        if isinstance(value, dict):
-            yield from _paths(value, f"{above}{key}.")
+        path = f"{above}{key}"
+        yield path
+        if isinstance(value, Mapping):
+            yield from _paths(value, f"{path}.")

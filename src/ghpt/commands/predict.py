@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Int
 
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.calibrate import from_data
 from ghpt.commands.inputs import InputSettings, own_cameras
 from ghpt.commands.outputs import Files, check_apart, input_paths
@@ -365,3 +366,7 @@ def _check(config: dict[str, Any]) -> None:
 
 
 COMMAND = Command(name="predict", settings=dict, task=predict, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("predict")

@@ -15,6 +15,7 @@ from typing import Any, TypedDict
 import yaml
 
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.jobs import Job
 from ghpt.commands.outputs import Files
 from ghpt.commands.train import display_path
@@ -125,21 +126,6 @@ def gather(jobs: Sequence[Job[dict[str, Any], dict[str, Any]]], conf: Path) -> N
     )
     with_all = {"only": only, "seed": seeds[0], "seeds": len(seeds)}
     _reproduce(configs[0] | with_all, seeds, Path(configs[0]["output"]), conf)
-
-
-def spread(command: Sequence[str]) -> list[str]:
-    """The words of a command line: in a sweep ``seeds=5`` becomes ``seed=0,1,2,3,4``, a job for
-    each.
-    """
-    words = dict(word.split("=", 1) for word in command if "=" in word)
-    number = words.get("seeds", "")
-    first = words.get("seed", "0")
-    if not {"-m", "--multirun"} & set(command) or not (
-        number.isdecimal() and first.isdecimal() and int(number) > 1
-    ):
-        return list(command)
-    others = [word for word in command if not word.startswith(("seeds=", "seed="))]
-    return [*others, "seed=" + ",".join(str(int(first) + i) for i in range(int(number)))]
 
 
 def seeds_of(config: dict[str, Any]) -> list[int]:
@@ -275,3 +261,7 @@ def command(conf: Path) -> Command:
     return Command(
         name="reproduce", settings=dict, task=task, summary=summary, files=files, after=after
     )
+
+
+if __name__ == "__main__":
+    run_by_name("reproduce")

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NotRequired, TypedDict
 
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.lost import told
 from ghpt.commands.outputs import Files, input_paths
 from ghpt.commands.train import display_path, make_trainer, progress
@@ -137,3 +138,7 @@ test.__test__ = False  # not one for pytest
 
 
 COMMAND = Command(name="test", settings=dict, task=test, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("test")

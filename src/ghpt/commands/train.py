@@ -11,6 +11,7 @@ import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from ghpt.commands.app import Command
+from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.lost import OwnSignals, told
 from ghpt.commands.outputs import Files, input_paths
 from ghpt.config import build, check_arguments, check_plain, check_type
@@ -306,3 +307,7 @@ def _say_stopped(last: Path, step: int | None) -> None:
 
 
 COMMAND = Command(name="train", settings=dict, task=train, summary=summary, files=files)
+
+
+if __name__ == "__main__":
+    run_by_name("train")
