@@ -26,6 +26,7 @@ from ghpt.config import build, plain
 from ghpt.data.datasets.store import prepared
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.people.persons import person_sequence
 from ghpt.report.tables import markdown
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -66,15 +67,11 @@ def real(doctor: Doctor, folder: Path) -> Iterator[tuple[str, Case]]:
         ("pose2sim", "pose2sim_single/pose", "pose2sim_single/Calib_qualisys.toml"),
         ("caliscope", "caliscope/xy_HOLISTIC.csv", "caliscope/camera_array.toml"),
     ):
-        found = gather(
-            read_key_points(folder / points),
-            read_cameras(folder / cameras),
-            {},
-            None,
-            doctor.frames,
-            doctor.shift,
-        )
-        yield name, (found[0], as_filed(found[1]))
+        people = read_key_points(folder / points)
+        file = read_cameras(folder / cameras)
+        sequence = person_sequence(people, file, person=None, check_sizes=False)
+        evidence = gather(sequence, doctor.frames, doctor.shift)
+        yield name, (evidence, as_filed(sequence.cameras))
 
 
 def main() -> None:

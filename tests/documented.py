@@ -15,13 +15,13 @@ import numpy as np
 import torch
 
 from ghpt.data.formats.camera_writers import write_opencv, write_pose2sim
-from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import walk, write_people
 from real_layout import write_human36m_layout
+from single_person import SinglePerson, write_person
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
@@ -115,7 +115,7 @@ def workplace(folder: Path) -> Path:
     for name in ("pose", "walk", "run"):
         write_openpose(folder / name, rig, pixels)
     valid = np.ones(pixels.shape[:-1], bool)
-    given = KeyPoints(
+    given = SinglePerson(
         "",
         rig.names,
         JOINTS,
@@ -124,9 +124,8 @@ def workplace(folder: Path) -> Path:
         valid.astype(float),
         valid,
         50.0,
-        (0,) * len(rig),
     )
-    write_key_points(folder / "points.npz", given)
+    write_person(folder / "points.npz", given)
     same = Cameras(rig.cameras.K, rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3))
     write_pose2sim(folder / "intrinsics.toml", replace(rig, cameras=same), {})
     for name in ("Calib.toml", "Calib_qualisys.toml"):

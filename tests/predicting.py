@@ -3,31 +3,42 @@
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import hydra
 import numpy as np
 import torch
 from torch import Tensor
 
-from ghpt.commands.prediction.frames import Frames, Seen
-from ghpt.config import plain
+from ghpt.commands.predict import PredictSettings, predict
+from ghpt.config import plain, settings
 from ghpt.data.formats.camera_writers import write_pose2sim
+from ghpt.data.people.sequence import Sequence
+from ghpt.data.points import KeyPoints
 from ghpt.data.synthetic.recordings import motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, CameraSet, project
-from ghpt.skeleton import JOINTS
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 QUICK = ("trainer.accelerator=cpu", "progress_bar=false", "evaluated_frames=4", "verdict.clean=1.0")
 """The camera check, which takes seconds, is not asked: tests/test_verdict.py asks it."""
 
 
-def config(*words: str) -> dict:
+def config(*words: str) -> PredictSettings:
     """conf/predict.yaml with these overrides, as predict.py gets it."""
     with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return plain(hydra.compose("predict", overrides=[*QUICK, *map(str, words)]))
+        composed = hydra.compose("predict", overrides=[*QUICK, *map(str, words)])
+        return settings(PredictSettings, plain(composed))
+
+
+def numbers_of(settings: PredictSettings, output: Path) -> dict[str, Any]:
+    """Predict, and return what prediction.json holds."""
+    result = predict(settings, output)
+    assert result is not None
+    return result.plain()
 
 
 @cache
@@ -36,27 +47,34 @@ def walk(frames: int = 200) -> Tensor:
     return torch.from_numpy(motion(0, "S9", "S9/Walking-1", "Walking", frames, 50.0)).double()
 
 
-def frames_of(count: int, noise: float = 1.0, gaps: float = 0.1) -> Frames:
-    """A walk repeated ``count`` frames long, before Human3.6M's cameras; made as it is read."""
-    rig = human36m_rig("S9")
-    pixels = project(rig.cameras, walk())[0].numpy()
+@dataclass(frozen=True)
+class EndlessWalk:
+    """The key points of a walk that goes on and on, made as they are read."""
 
-    def read(rows: np.ndarray) -> Seen:
-        shape = (len(rows), len(rig), len(JOINTS))
+    pixels: np.ndarray
+    noise: float
+    gaps: float
+
+    def undistorted(self, rows: np.ndarray) -> KeyPoints:
+        shape = (len(rows), *self.pixels.shape[1:3])
         # a stream of its own for each frame, so that a frame is the same however it is read
-        phase = (
-            rows[:, None, None] * 7919 + np.arange(shape[1] * shape[2]).reshape(shape[1:]) * 104729
-        ) % 65521
-        random = phase / 65521
-        values = pixels[rows % len(pixels)] + noise * np.sin(40 * random)[..., None]
-        valid = random >= gaps
-        return (
-            np.where(valid[..., None], values, 0).astype(np.float32),
-            valid.astype(np.float32),
-            valid,
-        )
+        cell = np.arange(shape[1] * shape[2]).reshape(shape[1:])
+        random = (rows[:, None, None] * 7919 + cell * 104729) % 65521 / 65521
+        values = self.pixels[rows % len(self.pixels)]
+        values = values + self.noise * np.sin(40 * random)[..., None]
+        valid = random >= self.gaps
+        pixels = np.where(valid[..., None], values, 0).astype(np.float32)
+        return KeyPoints(pixels, valid.astype(np.float32), valid)
 
-    return Frames("walk", "synthetic", rig.names, rig.cameras, np.arange(count), 50.0, read)
+    detected = undistorted
+
+
+def sequence_of(count: int, noise: float = 1.0, gaps: float = 0.1) -> Sequence:
+    """A walk repeated ``count`` frames long, before Human3.6M's cameras; made as it is read."""
+    rig = human36m_rig("S9").without_distortion()
+    pixels = project(rig.cameras, walk())[0].numpy()
+    points = EndlessWalk(pixels, noise, gaps)
+    return Sequence("walk", "synthetic", rig, np.arange(count), 50.0, points)
 
 
 def cameras_file(folder: Path) -> Path:

@@ -7,7 +7,7 @@ import pytest
 
 from ghpt.commands.predict import COMMAND
 from ghpt.commands.prediction import gaps as module
-from ghpt.commands.prediction.gaps import Gaps, after
+from ghpt.commands.prediction.gaps import Gaps, apply_gaps
 from ghpt.commands.prediction.shards import Shards
 from ghpt.export.stream import part
 from ghpt.files import allocate
@@ -113,7 +113,7 @@ def shards(tmp_path):
 def test_a_disk_that_is_full_while_gaps_are_filled_names_the_folder(tmp_path, shards, small_files):
     out = tmp_path / "out"
     out.mkdir()
-    with pytest.raises(OSError, match="out'") as caught, after(FILL, shards, 17, out):
+    with pytest.raises(OSError, match="out'") as caught, apply_gaps(FILL, shards, 17, out):
         pass
     assert caught.value.filename == str(out)
     assert list(out.iterdir()) == []
@@ -128,7 +128,7 @@ def test_paths_are_allocated_before_anything_is_written_to_them(tmp_path, shards
 
     monkeypatch.setattr(module, "allocate", measured)
     monkeypatch.setattr(shards, "chunks", lambda: iter(()))
-    with after(FILL, shards, 17, tmp_path):
+    with apply_gaps(FILL, shards, 17, tmp_path):
         pass
     assert [size for size, _ in sizes] == [90 * 17 * 3 * 8, 90 * 17]
     assert all(blocks >= size for size, blocks in sizes)

@@ -10,12 +10,17 @@ import numpy as np
 import pytest
 import yaml
 
-from ghpt.data.formats.key_points import read_people
+from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.people.association import associate
-from ghpt.data.people.people import Detections, KeyPoints, as_people
+from ghpt.data.people.detections import Detections
+from ghpt.data.people.persons import (
+    person_sequence,
+    select_person,
+    undistort_detections,
+)
 from ghpt.data.people.tracks import tracks
-from ghpt.data.people.views import undistort_and_match, who
+from ghpt.data.points import KeyPoints
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import motion
 from ghpt.data.synthetic.rigs import human36m_rig
@@ -70,13 +75,23 @@ def scene(detector: Detector, rig: CameraSet, seed: int = 1) -> tuple[Detections
         owner.append(np.full(len(row), person))
     row, view, points, sure, valid = (np.concatenate(part) for part in zip(*parts, strict=True))
     order = np.lexsort((rng.random(len(row)), row, view))
-    arrays = (
-        x[order]
-        for x in (row, view, np.full(len(row), -1), points.astype(float), sure.astype(float), valid)
+    people = Detections(
+        path="pose",
+        views=rig.names,
+        joints=SKELETONS["human36m"],
+        frame=np.arange(FRAMES),
+        row=row[order],
+        view=view[order],
+        identity=np.full(len(row), -1),
+        points=KeyPoints(points.astype(float), sure.astype(float), valid)[order],
+        rate_hz=50.0,
     )
-    return Detections(
-        "pose", rig.names, SKELETONS["human36m"], np.arange(FRAMES), *arrays, 50.0
-    ), np.concatenate(owner)[order]
+    return people, np.concatenate(owner)[order]
+
+
+def person_of(people: Detections, cameras: CameraSet, at, person: int = 0) -> np.ndarray:
+    ideal = undistort_detections(people, cameras, at)
+    return select_person(people, cameras, at, ideal, person)
 
 
 @pytest.mark.parametrize(("views", "seed"), [(4, 1), (4, 2), (3, 1)])
@@ -85,7 +100,7 @@ def test_each_of_two_people_is_followed_in_all_views(views, seed, detector):
     rig = rig_of(views)
     people, owner = scene(detector, rig, seed)
     assert ((people.counts() > 1).sum(1) >= 2).mean() > 0.5
-    followed = [who(people, camera_file(rig), range(views), person) for person in (0, 1)]
+    followed = [person_of(people, camera_file(rig), range(views), person) for person in (0, 1)]
     labels = [np.where(chosen >= 0, owner[chosen], -1) for chosen in followed]
     assert {np.bincount(label[label >= 0]).argmax() for label in labels} == {0, 1}
     for label in labels:
@@ -103,10 +118,10 @@ def test_the_order_of_the_detections_does_not_matter(detector):
     people, _ = scene(detector, rig)
     order = np.random.default_rng(5).permutation(len(people.row))
     order = order[np.argsort(people.view[order] * FRAMES + people.row[order], kind="stable")]
-    fields = ("row", "view", "identity", "key_points", "confidence", "valid")
+    fields = ("row", "view", "identity", "points")
     other = replace(people, **{name: getattr(people, name)[order] for name in fields})
-    one, again = (undistort_and_match(p, camera_file(rig)) for p in (people, other))
-    np.testing.assert_array_equal(one.key_points, again.key_points)
+    one, again = (person_sequence(p, camera_file(rig)).undistorted() for p in (people, other))
+    np.testing.assert_array_equal(one.pixels, again.pixels)
     np.testing.assert_array_equal(one.valid, again.valid)
 
 
@@ -114,22 +129,22 @@ def test_millimetres_or_metres_do_not_matter(detector):
     rig = rig_of(3)
     people, _ = scene(detector, rig)
     cameras = replace(rig.cameras, t=rig.cameras.t / 1000)
-    small = who(
+    small = person_of(
         people,
         camera_file(CameraSet.from_cameras(rig.names, cameras, rig.distortion, rig.size)),
         range(3),
     )
-    np.testing.assert_array_equal(small, who(people, camera_file(rig), range(3)))
+    np.testing.assert_array_equal(small, person_of(people, camera_file(rig), range(3)))
 
 
 def test_without_extrinsics_each_view_follows_its_own(detector, caplog):
     """As it does, with a warning, where the extrinsics are another rig's."""
     rig = rig_of(4)
     people, _ = scene(detector, rig)
-    alone = who(people, camera_file(rig, calibrated=False), range(4))
+    alone = person_of(people, camera_file(rig, calibrated=False), range(4))
     turned = replace(rig.cameras, R=rig.cameras.R.mT.contiguous())
     with caplog.at_level(logging.WARNING):
-        wrong = who(
+        wrong = person_of(
             people,
             camera_file(CameraSet.from_cameras(rig.names, turned, rig.distortion, rig.size)),
             range(4),
@@ -137,20 +152,18 @@ def test_without_extrinsics_each_view_follows_its_own(detector, caplog):
     assert "the views agree on nobody: check the extrinsics" in caplog.text
     np.testing.assert_array_equal(alone, wrong)
     with pytest.raises(GhptDataError, match="there is no person 1: 1 can be told apart"):
-        who(people, camera_file(rig, calibrated=False), range(4), 1)
+        person_of(people, camera_file(rig, calibrated=False), range(4), 1)
 
 
 def test_whoever_is_alone_is_taken_as_they_are(detector):
     rig = rig_of(4)
     people, owner = scene(detector, rig)
-    points = people.pick(people.of(np.flatnonzero(owner == 0)))
-    assert isinstance(points, KeyPoints)
-    alone = as_people(points)
-    one, other = (
-        undistort_and_match(alone, camera_file(rig)),
-        undistort_and_match(points, camera_file(rig)),
-    )
-    np.testing.assert_array_equal(one.key_points, other.key_points)
+    chosen = people.first_of(np.flatnonzero(owner == 0))
+    points = people.points.take(chosen)
+    alone = Detections.of_person("", people.views, people.joints, people.frame, points)
+    one = person_sequence(alone, camera_file(rig)).undistorted()
+    other = undistort_detections(people, camera_file(rig), range(4)).take(chosen)
+    np.testing.assert_array_equal(one.pixels, other.pixels)
 
 
 def test_identities_in_the_files_are_taken_as_they_are(tmp_path):
@@ -170,20 +183,20 @@ def test_identities_in_the_files_are_taken_as_they_are(tmp_path):
                 for n in there
             ]
             (tmp_path / view / f"{frame}.json").write_text(json.dumps({"people": listed}))
-    people = read_people(tmp_path, "body_25b")
+    people = read_key_points(tmp_path, "body_25b")
     cameras = camera_file(
         CameraSet.from_cameras(("a", "b"), rig_of(2).cameras, rig_of(2).distortion, rig_of(2).size)
     )
     for person, number in enumerate((7, 3)):
-        points = people.pick(who(people, cameras, (0, 1), person))
+        points = people.points.take(person_of(people, cameras, (0, 1), person))
         there = np.array([number == 7 or frame != 2 for frame in range(4)])
         assert (points.valid.any(-1) == there[:, None]).all()
         expected = np.broadcast_to(
             (bodies[number][:, 0] + np.arange(4)[:, None])[:, None], (4, 2, 25)
         )
-        np.testing.assert_allclose(points.key_points[..., 0][there], expected[there])
+        np.testing.assert_allclose(points.pixels[..., 0][there], expected[there])
     with pytest.raises(GhptDataError, match="there is no person 2: 2 can be told apart"):
-        who(people, cameras, (0, 1), 2)
+        person_of(people, cameras, (0, 1), 2)
 
 
 def test_nobody_is_no_error():
@@ -219,9 +232,9 @@ def test_the_real_recording_keeps_its_person(shared_data):
     from ghpt.data.formats.camera_files import read_cameras
 
     folder = shared_data / "pose2sim_single"
-    people = read_people(folder / "pose")
+    people = read_key_points(folder / "pose")
     cameras = read_cameras(folder / "Calib_qualisys.toml")
-    chosen = who(people, cameras, range(4))
+    chosen = person_of(people, cameras, range(4))
     assert (chosen >= 0).all()
-    other = who(people, cameras, range(4), 1)
+    other = person_of(people, cameras, range(4), 1)
     assert (other[:, 2:] < 0).all()

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
+from single_person import read_person
 
 RNG = np.random.default_rng(0)
 PIXELS = RNG.uniform(100, 900, (6, 3, 17, 2)).astype(np.float32)
@@ -29,7 +29,7 @@ def test_the_crop_is_undone(tmp_path):
     (layout(tmp_path) / "all_cameras.json").write_text(json.dumps(["c", "a", "b"]))
     np.save(tmp_path / "all_frames.npy", np.arange(6) * 5)
     for path in (tmp_path, tmp_path / "all_2d_preds.npy"):
-        found = read_key_points(path)
+        found = read_person(path)
         assert (found.views, found.joints) == (("c", "a", "b"), SKELETONS["human36m"])
         assert found.frame.tolist() == [0, 5, 10, 15, 20, 25]
         assert not found.valid[2, 1].any()
@@ -40,12 +40,12 @@ def test_the_crop_is_undone(tmp_path):
 def test_chunks_follow_one_another_by_number(tmp_path):
     for number, frames in ((0, slice(0, 2)), (1, slice(2, 3)), (2, slice(3, 6))):
         layout(tmp_path, frames, number)
-    found = read_key_points(tmp_path)
+    found = read_person(tmp_path)
     assert found.views == ("cam_0", "cam_1", "cam_2")
     np.testing.assert_allclose(found.key_points[found.valid], PIXELS[found.valid], atol=1e-3)
     (tmp_path / "all_2d_preds1.npy").unlink()
     with pytest.raises(GhptDataError, match=r"all_2d_preds1\.npy: there is no such file"):
-        read_key_points(tmp_path)
+        read_person(tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -64,7 +64,7 @@ def test_chunks_follow_one_another_by_number(tmp_path):
 )
 def test_bad_arrays_are_named(change, says, tmp_path):
     with pytest.raises(GhptDataError, match=says):
-        read_key_points(layout(tmp_path, **change))
+        read_person(layout(tmp_path, **change))
 
 
 def test_predictions_without_boxes_are_refused(tmp_path):
@@ -72,4 +72,4 @@ def test_predictions_without_boxes_are_refused(tmp_path):
     with pytest.raises(
         GhptDataError, match=r"all_bboxes\.npy: there is no such file.*pixels of a crop"
     ):
-        read_key_points(tmp_path)
+        read_person(tmp_path)

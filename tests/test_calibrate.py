@@ -17,18 +17,17 @@ import torch
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.commands.calibrate import COMMAND, people_note
 from ghpt.commands.cameras import examine
-from ghpt.commands.predict import predict
 from ghpt.config import plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_pose2sim
-from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.synthetic.recordings import motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.lens import distort
 from ghpt.report.rig_comparison import rig_difference
 from ghpt.skeleton import JOINT, JOINTS
-from predicting import config
+from predicting import config, numbers_of
+from single_person import SinglePerson, write_person
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUTS = {
@@ -63,7 +62,7 @@ def scene():
     values = seen_by_lens.unflatten(1, truth.shape[:2]).transpose(0, 1).numpy()
     values = values + np.random.default_rng(0).normal(0, 2, values.shape)
     shape = values.shape[:-1]
-    points = KeyPoints(
+    points = SinglePerson(
         "",
         tuple(f"cam{i}_json" for i in range(4)),
         JOINTS,
@@ -72,7 +71,6 @@ def scene():
         np.ones(shape),
         np.ones(shape, bool),
         10.0,
-        (0,) * 4,
     )
     return replace(rig, names=tuple(f"cam_{i:02d}" for i in range(len(rig)))), points, truth
 
@@ -83,7 +81,7 @@ def write(folder, scene, extrinsics: bool = True):
         same = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
         rig = replace(rig, cameras=Cameras(rig.cameras.K, *same))
     write_pose2sim(folder / "cameras.toml", rig, {})
-    write_key_points(folder / "points.npz", points)
+    write_person(folder / "points.npz", points)
     return (
         f"keypoints={folder / 'points.npz'}",
         f"cameras={folder / 'cameras.toml'}",
@@ -143,7 +141,7 @@ def test_a_height_comes_back_from_every_command(command, scene, tmp_path):
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
         checked = examine(plain(hydra.compose("cameras", [keypoints, again])), tmp_path)
     assert checked["stature_mm"] == pytest.approx(1750, rel=0.01)
-    predicted = predict(
+    predicted = numbers_of(
         config(keypoints, again, "evaluated_frames=80", "formats=[npz]"), tmp_path / "out"
     )
     assert predicted["stature_mm"] == pytest.approx(1750, rel=0.01)
@@ -254,11 +252,13 @@ def test_without_a_usable_rig_there_is_none(command, scene, tmp_path):
 
 
 def test_the_followed_person_is_mentioned(scene):
-    points = replace(scene[1], views=("a", "b", "c", "d"), several=(3, 0, 0, 0))
-    (note,) = people_note(points)
+    one = replace(scene[1], views=("a", "b", "c", "d")).detections
+    twice = np.sort(np.r_[np.arange(len(one)), :3])  # the first view's come first
+    fields = {name: getattr(one, name)[twice] for name in ("row", "view", "identity", "points")}
+    (note,) = people_note(replace(one, **fields))
     assert isinstance(note, Diagnosis)
     assert "3 frames of a;" in note.text
-    assert people_note(replace(points, several=(0,) * 4)) == ()
+    assert people_note(one) == ()
 
 
 def test_the_real_recording_is_explained_better_than_by_its_own_calibration(

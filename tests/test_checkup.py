@@ -21,7 +21,8 @@ from ghpt.calibration.check.resection import resect
 from ghpt.calibration.check.setup import Look, Setup, as_filed
 from ghpt.config import build, plain
 from ghpt.data.formats.camera_files import read_cameras
-from ghpt.data.formats.key_points import KeyPoints, read_key_points
+from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.people.persons import person_sequence
 from ghpt.data.synthetic.recordings import motion
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
@@ -29,6 +30,7 @@ from ghpt.geometry.cameras import project
 from ghpt.geometry.lens import distort
 from ghpt.skeleton import JOINTS
 from rigs_with_people import people
+from single_person import SinglePerson
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -231,37 +233,29 @@ def test_bad_settings_are_named(changed, key):
 def test_real_rigs(shared_data):
     """Pose2Sim's third camera is off, and not in time; caliscope's rig is good."""
     folder, whole = shared_data / "pose2sim_single", doctor(frames=64, shift=20)
-    found = gather(
-        read_key_points(folder / "pose"),
-        read_cameras(folder / "Calib_qualisys.toml"),
-        {},
-        None,
-        64,
-        20,
-    )
-    checkup = whole(found[0], as_filed(found[1]))
+    checkup = recording_check(whole, folder / "pose", folder / "Calib_qualisys.toml")
     assert [(finding.code, finding.cameras) for finding in checkup.findings] == [
         ("moved", ("cam03",))
     ]
     assert checkup.findings[0].before_px > 35
     assert checkup.findings[0].after_px < 20
     folder = shared_data / "caliscope"
-    found = gather(
-        read_key_points(folder / "xy_HOLISTIC.csv"),
-        read_cameras(folder / "camera_array.toml"),
-        {},
-        None,
-        64,
-        20,
-    )
-    assert whole(found[0], as_filed(found[1])).findings == ()
+    checkup = recording_check(whole, folder / "xy_HOLISTIC.csv", folder / "camera_array.toml")
+    assert checkup.findings == ()
+
+
+def recording_check(doctor, points, cameras):
+    """What the doctor says of real key points and cameras."""
+    people, file = read_key_points(points), read_cameras(cameras)
+    sequence = person_sequence(people, file, person=None, check_sizes=False)
+    return doctor(gather(sequence, doctor.frames, doctor.shift), as_filed(sequence.cameras))
 
 
 def test_cameras_without_extrinsics_are_refused():
     rig, crowd = human36m_rig("S8"), people(frames=30)
     file = replace(rig, path="intrinsics", R=None, t=None)
     values = crowd.key_points.numpy()
-    points = KeyPoints(
+    person = SinglePerson(
         "",
         rig.names,
         JOINTS,
@@ -270,7 +264,6 @@ def test_cameras_without_extrinsics_are_refused():
         np.ones(values.shape[:-1]),
         crowd.valid.numpy(),
         None,
-        (0,) * 4,
     )
     with pytest.raises(GhptDataError, match="extrinsics"):
-        gather(points, file, {}, None, 24, 5)
+        gather(person_sequence(person.detections, file), 24, 5)

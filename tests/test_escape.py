@@ -14,7 +14,7 @@ from ghpt.commands.cameras import _print as print_checkup
 from ghpt.commands.cameras import report as checkup_report
 from ghpt.commands.prediction.report import prediction_report, print_prediction, print_verdict
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.relative_pose.scale import SEGMENTS
+from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.report.calibration import calibration_report, print_calibration
 from ghpt.report.escape import Markdown, code, code_block, escaped, plain
 from ghpt.report.rig_comparison import Similarity
@@ -96,7 +96,7 @@ def prediction() -> dict:
         "placed": 1.0,
         "segments": {"median": 0.1, "each": {}},
     }
-    found["segments"]["each"] = dict.fromkeys(SEGMENTS, 0.1)
+    found["segments"]["each"] = dict.fromkeys(BONE_NAMES, 0.1)
     return {
         "data": BAD,
         "cameras": [BAD],

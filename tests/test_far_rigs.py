@@ -14,10 +14,11 @@ import pytest
 import torch
 
 from ghpt.commands.predict import predict
-from ghpt.commands.prediction.frames import Frames
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.data.formats.stored_npz import add_member
+from ghpt.data.people.sequence import KeyPointArrays, Sequence
+from ghpt.data.points import KeyPoints
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.export import WRITERS, Evidence, Scene, read_reconstruction
@@ -25,7 +26,7 @@ from ghpt.geometry.cameras import CameraSet
 from ghpt.observations import Recording
 from ghpt.report.rig_files import write_poses
 from ghpt.skeleton import MIRROR
-from predicting import config, walk
+from predicting import config, numbers_of, walk
 from reconstructions import about, in_parts, random_reconstruction
 from test_predict import PIXELS, checkpoint, points_file
 
@@ -137,7 +138,7 @@ def learned(folder: Path, name: str) -> tuple[dict, np.ndarray]:
     write_pose2sim(folder / "rig.toml", moved_rig(OFFSETS[name]), {})
     given = [f"keypoints={noisy_points(folder)}", f"cameras={folder / 'rig.toml'}"]
     words = [f"ckpt={checkpoint(folder, 'pose')}", "formats=[npz]", "compare=[linear,m_estimator]"]
-    numbers = predict(config(*given, *words), folder / "out")
+    numbers = numbers_of(config(*given, *words), folder / "out")
     return numbers, in_npz(folder / "out") - OFFSETS[name]
 
 
@@ -169,23 +170,26 @@ def test_the_comparison_of_estimators_does_not_depend_on_it_either(near_and_far)
         assert far[name]["segments"]["median"] == pytest.approx(variation, abs=1e-6)
 
 
-def frames_at(distance: float) -> Frames:
+def sequence_at(distance: float) -> Sequence:
     """A rig whose centre is so far along z, mm, and which shows nothing."""
     rig = human36m_rig("S9").cameras
     middle = rig.centre.nanmedian(0).values
     there = rig.relative_to(middle - torch.tensor([0.0, 0.0, distance]))
-    return Frames("", "", ("a", "b", "c", "d"), there, np.arange(1), None, lambda rows: ())
+    cameras = CameraSet.from_cameras(("a", "b", "c", "d"), there)
+    nothing = KeyPoints(np.zeros((1, 4, 17, 2)), np.zeros((1, 4, 17)), np.zeros((1, 4, 17), bool))
+    return Sequence("", "", cameras, np.arange(1), None, KeyPointArrays(nothing, nothing))
 
 
 def test_a_rig_within_100_m_stays_where_it_is_to_the_bit():
-    frames = frames_at(99.9 * METRE)
-    assert frames.origin.tolist() == [0, 0, 0]
-    assert torch.equal(frames.cameras.relative_to(frames.origin).t, frames.cameras.t)
+    sequence = sequence_at(99.9 * METRE)
+    cameras = sequence.cameras.cameras
+    assert sequence.origin.tolist() == [0, 0, 0]
+    assert torch.equal(cameras.relative_to(sequence.origin).t, cameras.t)
 
 
 @pytest.mark.parametrize("sign", [1, -1])
 def test_one_farther_away_is_worked_on_near_its_centre_to_the_metre(sign):
-    assert frames_at(sign * 100.6 * METRE).origin.tolist() == [0, 0, sign * 101 * METRE]
+    assert sequence_at(sign * 100.6 * METRE).origin.tolist() == [0, 0, sign * 101 * METRE]
 
 
 def test_the_zero_of_single_precision_is_said_where_it_is_not_the_world_s(tmp_path, caplog):

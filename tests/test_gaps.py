@@ -10,12 +10,18 @@ import torch
 from scipy.interpolate import PchipInterpolator
 from scipy.signal import butter, sosfiltfilt
 
-from ghpt.commands.prediction.gaps import Gaps, after, frame_step, gap_frames, runs
+from ghpt.commands.prediction.gaps import (
+    Gaps,
+    apply_gaps,
+    frame_step,
+    gap_frames,
+    unbroken_runs,
+)
 from ghpt.commands.prediction.shards import Shards
 from ghpt.errors import GhptConfigError
 from ghpt.export.stream import part
 from ghpt.reconstruction import State
-from predicting import frames_of
+from predicting import sequence_of
 from reconstructions import random_reconstruction
 
 S, F, M = int(State.OBSERVED), int(State.FILLED), int(State.FEW_VIEWS)
@@ -109,9 +115,9 @@ def test_runs_do_not_touch_each_other():
 
 def test_runs_end_where_a_number_is_left_out():
     placed = np.array([1, 1, 0, 1, 1, 1], bool)
-    found = runs(np.array([0, 1, 2, 3, 5, 6]), placed, 1)
+    found = unbroken_runs(np.array([0, 1, 2, 3, 5, 6]), placed, 1)
     assert [run.tolist() for run in found] == [[0, 1], [3], [4, 5]]
-    assert runs(np.arange(3), np.zeros(3, bool), 1) == []
+    assert unbroken_runs(np.arange(3), np.zeros(3, bool), 1) == []
 
 
 @pytest.mark.parametrize(
@@ -123,7 +129,7 @@ def test_the_borders_between_shards_do_not_show(tmp_path, gaps, size):
     shards = Shards(tmp_path, "key", 90, size)
     for shard in shards.missing():
         shards.write(shard, part(whole, shards.rows(shard).start, shards.rows(shard).stop))
-    with after(gaps, shards, 17, tmp_path) as chunks:
+    with apply_gaps(gaps, shards, 17, tmp_path) as chunks:
         found = [list(chunks()), list(chunks())]
     shards.close()
     points = torch.cat([chunk.points for chunk in found[0]])
@@ -150,7 +156,7 @@ def test_the_borders_between_shards_do_not_show(tmp_path, gaps, size):
 def test_without_a_request_nothing_is_done(tmp_path):
     assert Gaps(None, "pchip", None, None).nothing
     assert gap_frames(None, 50.0) is None
-    assert len(frames_of(3)) == 3
+    assert len(sequence_of(3)) == 3
 
 
 @pytest.mark.parametrize(
@@ -241,7 +247,7 @@ def test_the_step_is_the_usual_distance(frame, step):
 
 def test_runs_of_every_tenth_frame_end_where_one_is_left_out():
     frame = np.array([0, 10, 20, 40, 50])
-    found = runs(frame, np.ones(5, bool), 10)
+    found = unbroken_runs(frame, np.ones(5, bool), 10)
     assert [run.tolist() for run in found] == [[0, 1, 2], [3, 4]]
 
 
@@ -292,7 +298,7 @@ def test_either_request_is_something_and_none_takes_no_file(tmp_path, monkeypatc
     assert not smoothing(5.0).nothing
     shards = Shards(tmp_path, "key", 90, 40)
     monkeypatch.setattr("ghpt.commands.prediction.gaps.allocate", None)
-    with after(Gaps(None, "linear", None, None), shards, 17, tmp_path) as chunks:
+    with apply_gaps(Gaps(None, "linear", None, None), shards, 17, tmp_path) as chunks:
         assert chunks == shards.chunks
     shards.close()
 
@@ -304,7 +310,7 @@ def test_far_from_the_zero_paths_keep_their_digits(tmp_path, gaps):
     shards = Shards(tmp_path, "key", 30, 12)
     for shard in shards.missing():
         shards.write(shard, part(far, shards.rows(shard).start, shards.rows(shard).stop))
-    with after(gaps, shards, 17, tmp_path) as chunks:
+    with apply_gaps(gaps, shards, 17, tmp_path) as chunks:
         found = torch.cat([chunk.points for chunk in chunks()])
     shards.close()
     for joint in range(17):

@@ -14,9 +14,10 @@ import pytest
 
 from ghpt.data.datasets import panoptic
 from ghpt.data.datasets.panoptic import COCO19
-from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS, canonical, joints17
+from ghpt.data.points import KeyPoints
 from ghpt.skeleton import BONES, JOINTS, MIRROR, SIX_JOINTS, SYMMETRIC_PARTS
+from single_person import read_person
 
 DOCUMENTED = {
     "human36m": """
@@ -245,8 +246,9 @@ def test_each_of_the_17_joints_comes_from_its_documented_places(name):
     """Points at random, so that no two means are alike."""
     points = np.random.default_rng(0).uniform(0, 1000, (1, 1, len(SKELETONS[name]), 2))
     one = np.ones(points.shape[:3])
-    found, _, valid = joints17("x", SKELETONS[name], points, one, one > 0)
-    assert valid.all()
+    mapped = joints17("x", SKELETONS[name], KeyPoints(points, one, one > 0))
+    found = mapped.pixels
+    assert mapped.valid.all()
     for joint, places in enumerate(SOURCES[name]):
         expected = points[0, 0, places].mean(0)
         np.testing.assert_allclose(found[0, 0, joint], expected, rtol=1e-6, err_msg=JOINTS[joint])
@@ -352,7 +354,7 @@ RECORDINGS = {"body_25b": "pose2sim_single/pose", "mediapipe_33": "pose2sim_blaz
 @pytest.mark.parametrize("name", RECORDINGS)
 def test_a_real_standing_person_is_in_order_from_head_to_foot(name, shared_data):
     """In the images of every view, whose y points down."""
-    found = read_key_points(shared_data / RECORDINGS[name])
+    found = read_person(shared_data / RECORDINGS[name])
     assert found.joints == SKELETONS[name]
     place = {word: index for index, word in documented(name)}
     for view in range(4):
@@ -382,7 +384,7 @@ def real_people(name: str, data) -> np.ndarray:
     if name == "coco_19":
         with np.load(data / "panoptic" / "171026_pose3_joints19.npz") as stored:
             return stored["poses"][::50]
-    found = read_key_points(data / RECORDINGS[name])
+    found = read_person(data / RECORDINGS[name])
     points = np.where(found.valid[..., None], found.key_points, np.nan)
     return points.reshape(-1, *points.shape[2:])
 

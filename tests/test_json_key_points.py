@@ -7,9 +7,10 @@ import json
 import numpy as np
 import pytest
 
-from ghpt.data.formats.key_points import FORMATS, read_key_points, read_people
+from ghpt.data.formats.key_points import FORMATS, read_key_points
 from ghpt.data.formats.skeletons import SKELETONS, canonical
 from ghpt.errors import GhptDataError
+from single_person import read_person
 
 RNG = np.random.default_rng(0)
 BODY = RNG.uniform(0, 400, (17, 3)).round(3) * [1, 1, 1 / 400]
@@ -57,7 +58,7 @@ def write(path, content):
 def test_coco_results_with_a_file_for_each_camera(tmp_path):
     write(tmp_path / "cam1.json", [result(7), result(5, 10), result(5, 500)])
     write(tmp_path / "cam2.json", [result("frame_000005.jpg", 20), result("frame_000009.jpg", 30)])
-    found = read_people(tmp_path)
+    found = read_key_points(tmp_path)
     assert found.views == ("cam1", "cam2")
     assert found.joints == COCO
     assert found.frame.tolist() == [5, 7, 9]
@@ -74,7 +75,7 @@ def test_one_coco_file_whose_images_name_the_views(form, tmp_path):
     images = [(view, frame) for view in ("left", "right") for frame in (3, 4, 12)]
     listed = [result(form.format(view=view, frame=frame), frame) for view, frame in images]
     write(tmp_path / "results.json", listed)
-    found = read_people(tmp_path / "results.json")
+    found = read_key_points(tmp_path / "results.json")
     assert found.views == ("left", "right")
     assert found.frame.tolist() == [3, 4, 12]
     assert (found.counts() == 1).all()
@@ -82,7 +83,7 @@ def test_one_coco_file_whose_images_name_the_views(form, tmp_path):
     listed = [result(i, frame) for i, (_, frame) in enumerate(images)]
     numbered = [{"id": i, "file_name": name} for i, name in enumerate(names)]
     write(tmp_path / "results.json", {"images": numbered, "annotations": listed})
-    again = read_people(tmp_path / "results.json")
+    again = read_key_points(tmp_path / "results.json")
     assert again.views == ("left", "right")
     assert again.frame.tolist() == [2, 3, 4, 12]  # an image without anybody is a frame
     np.testing.assert_array_equal(again.key_points, found.key_points)
@@ -109,14 +110,14 @@ def test_one_coco_file_whose_images_name_the_views(form, tmp_path):
 def test_bad_coco_results_are_named(content, says, tmp_path):
     write(tmp_path / "cam1.json", content)
     with pytest.raises(GhptDataError, match=says):
-        read_people(tmp_path, format="coco")
+        read_key_points(tmp_path, format="coco")
 
 
 @pytest.mark.parametrize("meta", [True, False])
 def test_mmpose_s_files_of_each_camera(meta, tmp_path):
     write(tmp_path / "results_cam1.json", mmpose([(1, [0.0, 300.0]), (2, []), (3, [2.0])], meta))
     write(tmp_path / "results_cam2.json", mmpose([(1, [0.0]), (2, [1.0]), (4, [3.0])], meta))
-    found = read_people(tmp_path, None if meta else "coco_17", rate_hz=50)
+    found = read_key_points(tmp_path, None if meta else "coco_17", rate_hz=50)
     assert (found.views, found.joints, found.rate_hz) == (("cam1", "cam2"), COCO, 50)
     assert found.frame.tolist() == [1, 2, 3, 4]
     assert found.counts().tolist() == [[2, 1], [0, 1], [1, 0], [0, 1]]
@@ -127,7 +128,7 @@ def test_the_joints_are_those_that_mmpose_names(tmp_path):
     names = [name.replace("_", " ").title() for name in COCO]
     order = RNG.permutation(17)
     write(tmp_path / "a.json", mmpose([(1, [0.0])], names=[names[i] for i in order]))
-    assert read_people(tmp_path).joints == tuple(COCO[i] for i in order)
+    assert read_key_points(tmp_path).joints == tuple(COCO[i] for i in order)
     h36m = [
         "root",
         "right_hip",
@@ -148,13 +149,13 @@ def test_the_joints_are_those_that_mmpose_names(tmp_path):
         "right_wrist",
     ]
     write(tmp_path / "a.json", mmpose([(1, [0.0])], names=h36m))
-    assert set(read_people(tmp_path).joints) == set(SKELETONS["human36m"])
+    assert set(read_key_points(tmp_path).joints) == set(SKELETONS["human36m"])
     write(tmp_path / "a.json", mmpose([(1, [0.0])], names=[f"paw {i}" for i in range(17)]))
     with pytest.raises(
         GhptDataError, match=r"joints: lack right_ankle.*Name the joints as in human36m, coco_17"
     ):
-        read_people(tmp_path)
-    assert read_people(tmp_path, "coco_17").joints == COCO
+        read_key_points(tmp_path)
+    assert read_key_points(tmp_path, "coco_17").joints == COCO
 
 
 @pytest.mark.parametrize(
@@ -184,14 +185,14 @@ def test_bad_mmpose_files_are_named(change, says, tmp_path):
     change = {"instance_info": change} if isinstance(change, list) else change
     write(tmp_path / "a.json", mmpose([(1, [0.0])]) | change)
     with pytest.raises(GhptDataError, match=says):
-        read_key_points(tmp_path, format="mmpose")
+        read_person(tmp_path, format="mmpose")
 
 
 def test_views_of_different_joints_are_refused(tmp_path):
     write(tmp_path / "a.json", mmpose([(1, [0.0])]))
     write(tmp_path / "b.json", mmpose([(1, [0.0])], names=COCO[::-1]))
     with pytest.raises(GhptDataError, match=r"b\.json: meta_info: names other joints than a\.json"):
-        read_people(tmp_path)
+        read_key_points(tmp_path)
 
 
 def test_joints_are_found_in_other_spellings():
@@ -204,6 +205,6 @@ def test_joints_are_found_in_other_spellings():
 def test_a_format_is_chosen_by_name(tmp_path):
     write(tmp_path / "a.json", mmpose([(1, [0.0])]))
     with pytest.raises(GhptDataError, match=f"there is no format 'c3d'.*{', '.join(FORMATS)}"):
-        read_people(tmp_path, format="c3d")
+        read_key_points(tmp_path, format="c3d")
     with pytest.raises(GhptDataError, match="annotations: is not a list of objects"):
-        read_people(tmp_path, format="coco")
+        read_key_points(tmp_path, format="coco")

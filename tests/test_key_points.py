@@ -10,14 +10,16 @@ import pytest
 import torch
 
 from damage import damage
-from ghpt.commands.prediction.stored import open_stored
-from ghpt.data.formats.key_points import KeyPoints, read_key_points, read_people, write_key_points
+from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS
-from ghpt.data.people.views import matched, normal, undistort_and_match
+from ghpt.data.people.matching import match_views, normalise_name
+from ghpt.data.people.persons import person_sequence
+from ghpt.data.people.stored import open_stored
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet, project
 from ghpt.geometry.lens import distort
 from scenes import random_scene
+from single_person import SinglePerson, read_person, write_person
 
 
 def camera_file(names, other=None, lens: float = 0.0) -> CameraSet:
@@ -29,13 +31,13 @@ def camera_file(names, other=None, lens: float = 0.0) -> CameraSet:
     return CameraSet(tuple(names), K, distortion, other_names=tuple(other or ()), path="Calib.toml")
 
 
-def key_points(views=("a", "b"), frames: int = 5, joints=SKELETONS["coco_17"]) -> KeyPoints:
+def key_points(views=("a", "b"), frames: int = 5, joints=SKELETONS["coco_17"]) -> SinglePerson:
     rng = np.random.default_rng(0)
     shape = (frames, len(views), len(joints))
     valid = rng.random(shape) < 0.8
     valid[0] = True
     values = np.where(valid[..., None], rng.uniform(0, 1000, (*shape, 2)), 0)
-    return KeyPoints(
+    return SinglePerson(
         "pose",
         tuple(views),
         tuple(joints),
@@ -44,33 +46,38 @@ def key_points(views=("a", "b"), frames: int = 5, joints=SKELETONS["coco_17"]) -
         np.where(valid, rng.random(shape), 0),
         valid,
         60.0,
-        (0,) * len(views),
     )
+
+
+def pairs(where, views, cameras, match, wanted) -> list[tuple[int, int]]:
+    """The (view, camera) pairs that are matched."""
+    at, ordered = match_views(where, views, cameras, match, wanted)
+    return list(zip(at, map(cameras.names.index, ordered.names), strict=True))
 
 
 def test_our_npz_comes_back_as_it_was(tmp_path):
     points = key_points()
-    write_key_points(tmp_path / "points.npz", points)
-    found = read_key_points(tmp_path / "points.npz")
+    write_person(tmp_path / "points.npz", points)
+    found = read_person(tmp_path / "points.npz")
     for name, value in vars(replace(points, path=str(tmp_path / "points.npz"))).items():
         assert np.array_equal(getattr(found, name), value), name
-    assert read_key_points(tmp_path / "points.npz", rate_hz=30).rate_hz == 30
+    assert read_person(tmp_path / "points.npz", rate_hz=30).rate_hz == 30
 
 
 @pytest.mark.parametrize("rate", [0.0, -50.0, np.inf, -np.inf, 1e6, 1e-9])
 def test_a_rate_that_no_camera_has_is_refused(rate, tmp_path):
     """In the file, as a setting, and in a file that is read in parts."""
     path = tmp_path / "points.npz"
-    write_key_points(path, key_points())
+    write_person(path, key_points())
     with pytest.raises(
         GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"
     ):
-        read_people(path, rate_hz=rate)
-    write_key_points(path, replace(key_points(), rate_hz=rate))
+        read_key_points(path, rate_hz=rate)
+    write_person(path, replace(key_points(), rate_hz=rate))
     with pytest.raises(
         GhptDataError, match=r"points\.npz: rate_hz: is .* frames per second\. Give"
     ):
-        read_people(path)
+        read_key_points(path)
     with np.load(path) as arrays:
         np.savez(path, **arrays)
     with pytest.raises(
@@ -85,8 +92,8 @@ def test_a_rate_that_no_camera_has_is_refused(rate, tmp_path):
 
 def test_a_rate_that_is_not_a_number_is_unknown(tmp_path):
     path = tmp_path / "points.npz"
-    write_key_points(path, replace(key_points(), rate_hz=np.nan))
-    assert read_people(path).rate_hz is None
+    write_person(path, replace(key_points(), rate_hz=np.nan))
+    assert read_key_points(path).rate_hz is None
     with np.load(path) as arrays:
         np.savez(path, **arrays)
     assert open_stored(path, None, None).rate_hz is None
@@ -101,7 +108,7 @@ def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):
         views=np.array(["a", "b"]),
         skeleton=np.array("COCO-17"),
     )
-    found = read_key_points(tmp_path / "p.npz")
+    found = read_person(tmp_path / "p.npz")
     np.testing.assert_array_equal(found.valid, points.valid)
     assert np.isfinite(found.key_points).all()
     assert found.joints == SKELETONS["coco_17"]
@@ -132,22 +139,18 @@ def test_the_least_npz_is_key_points_views_and_a_skeleton(tmp_path):
 )
 def test_a_bad_npz_is_named(change, says, tmp_path):
     points = key_points()
-    arrays = {
-        name: np.array(value)
-        for name, value in vars(points).items()
-        if name not in ("path", "several")
-    }
+    arrays = {name: np.array(value) for name, value in vars(points).items() if name != "path"}
     arrays = {name: value for name, value in (arrays | change).items() if value is not None}
     np.savez(tmp_path / "p.npz", **arrays)
     with pytest.raises(GhptDataError, match=says):
-        read_key_points(tmp_path / "p.npz")
+        read_person(tmp_path / "p.npz")
 
 
 def test_a_cut_npz_is_named(tmp_path):
-    write_key_points(tmp_path / "p.npz", key_points())
+    write_person(tmp_path / "p.npz", key_points())
     (tmp_path / "p.npz").write_bytes((tmp_path / "p.npz").read_bytes()[:-30])
     with pytest.raises(GhptDataError, match="not a whole npz"):
-        read_key_points(tmp_path / "p.npz")
+        read_person(tmp_path / "p.npz")
 
 
 @pytest.mark.parametrize(
@@ -167,7 +170,7 @@ def test_a_cut_npz_is_named(tmp_path):
     ],
 )
 def test_views_find_their_cameras_by_name(views, names, other, expected):
-    assert matched("pose", views, camera_file(names, other), {}, None) == expected
+    assert pairs("pose", views, camera_file(names, other), {}, None) == expected
 
 
 @pytest.mark.parametrize(
@@ -185,25 +188,26 @@ def test_views_find_their_cameras_by_name(views, names, other, expected):
 )
 def test_what_is_not_one_to_one_is_refused_with_both_sides(views, names, says):
     with pytest.raises(GhptDataError, match=says):
-        matched("pose", views, camera_file(names), {}, None)
+        match_views("pose", views, camera_file(names), {}, None)
 
 
 def test_the_user_says_which_is_which_and_which_to_use():
     cameras = camera_file(["front", "back", "top"])
-    pairs = matched("pose", ["1", "2", "top"], cameras, {"1": "back", "2": "front"}, None)
-    assert pairs == [(1, 0), (0, 1), (2, 2)]
-    assert matched("pose", ["front", "top", "x"], cameras, {}, ["top", "front"]) == [(0, 0), (1, 2)]
+    found = pairs("pose", ["1", "2", "top"], cameras, {"1": "back", "2": "front"}, None)
+    assert found == [(1, 0), (0, 1), (2, 2)]
+    assert pairs("pose", ["front", "top", "x"], cameras, {}, ["top", "front"]) == [(0, 0), (1, 2)]
     for wrong in ({"3": "back"}, {"1": "side"}):
         with pytest.raises(
             GhptDataError, match=r"match says .*, of which one is not there \(views: 1, 2, top;"
         ):
-            matched("pose", ["1", "2", "top"], cameras, wrong, None)
+            match_views("pose", ["1", "2", "top"], cameras, wrong, None)
     with pytest.raises(GhptDataError, match="there is no view back with a camera"):
-        matched("pose", ["front", "top"], cameras, {}, ["top", "back"])
+        match_views("pose", ["front", "top"], cameras, {}, ["top", "back"])
 
 
 def test_zeros_inside_a_number_stay():
-    assert normal("cam_100") == "cam100" != normal("cam10") == normal("CAM-010_json")
+    assert normalise_name("cam_100") == "cam100"
+    assert normalise_name("cam10") == normalise_name("CAM-010_json") == "cam10"
 
 
 def test_the_lens_is_undone_before_means_are_taken():
@@ -221,18 +225,19 @@ def test_the_lens_is_undone_before_means_are_taken():
         key_points=seen_by_lens.numpy()[None],
         valid=np.ones((1, 2, 17), bool),
     )
-    views = undistort_and_match(points, cameras)
+    sequence = person_sequence(points.detections, cameras)
+    found = sequence.undistorted()
     mean = pixels[0, :, [joints.index("left_shoulder"), joints.index("right_shoulder")]].mean(1)
-    np.testing.assert_allclose(views.key_points[0, :, 8], mean, atol=1e-3)
-    assert views.valid.all()
-    assert len(views.recording("x", scene.cameras.index(0))) == 1
+    np.testing.assert_allclose(found.pixels[0, :, 8], mean, atol=1e-3)
+    assert found.valid.all()
+    assert len(sequence) == 1
 
 
 def test_a_damaged_npz_is_read_or_named(tmp_path):
     """Whatever byte is lost, and wherever the file ends."""
     path = tmp_path / "p.npz"
-    write_key_points(path, key_points(frames=2))
-    assert damage(path, read_key_points, 150) == {"read", "named"}
+    write_person(path, key_points(frames=2))
+    assert damage(path, read_person, 150) == {"read", "named"}
 
 
 def test_a_damaged_json_is_read_or_named(tmp_path):
@@ -244,7 +249,7 @@ def test_a_damaged_json_is_read_or_named(tmp_path):
         content = {"people": [{"pose_keypoints_2d": body.ravel().tolist()}]}
         (tmp_path / view / "x_000000000001.json").write_text(json.dumps(content))
     assert damage(
-        tmp_path / "a" / "x_000000000001.json", lambda _: read_key_points(tmp_path, "body_25"), 150
+        tmp_path / "a" / "x_000000000001.json", lambda _: read_person(tmp_path, "body_25"), 150
     ) == {
         "read",
         "named",

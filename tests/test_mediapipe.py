@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.mediapipe import read_caliscope
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
+from single_person import read_person
 
 HEADER = "sync_index,port,frame_index,frame_time,point_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"
 
@@ -28,7 +28,7 @@ def test_rows_become_an_array_whatever_their_order(tmp_path):
         x, y = pixels[t, v, k].tolist()
         rows.append(f"{frames[t]},{ports[v]},{t},1.5,{k},{x!r},{y!r},,")
     rows += ["5,0,0,1.5,400,1,2,,", "5,2,0,1.5,100,1,2,,"]
-    found = read_key_points(table(tmp_path, *rng.permutation(rows)))
+    found = read_person(table(tmp_path, *rng.permutation(rows)))
     assert found.views == ("cam_0", "cam_2", "cam_10")
     assert found.frame.tolist() == frames
     assert found.joints == SKELETONS["mediapipe_33"]
@@ -59,18 +59,18 @@ def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):
 )
 def test_a_bad_table_is_named(rows, says, tmp_path):
     with pytest.raises(GhptDataError, match=says):
-        read_key_points(table(tmp_path, *rows))
+        read_person(table(tmp_path, *rows))
 
 
 def test_another_csv_is_not_taken_for_it(tmp_path):
     with pytest.raises(GhptDataError, match=r"not a key-point format that is known.*OpenPose"):
-        read_key_points(table(tmp_path, "0,1", header="a,b"))
+        read_person(table(tmp_path, "0,1", header="a,b"))
 
 
 def test_the_real_recording(shared_data):
     """Every body landmark of the file is at its place, found by an independent count."""
     path = shared_data / "caliscope" / "xy_HOLISTIC.csv"
-    found = read_key_points(path)
+    found = read_person(path)
     assert found.views == ("cam_0", "cam_1", "cam_2", "cam_3")
     rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
     body = [row for row in rows if int(row[4]) < 33]

@@ -6,9 +6,10 @@ import types
 import numpy as np
 import pytest
 
-from ghpt.data.formats.key_points import read_key_points, read_people
+from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
+from single_person import read_person
 
 NAMES = (
     "Nose",
@@ -44,7 +45,7 @@ def test_without_movement_the_command_that_installs_it_is_told(tmp_path, monkeyp
     monkeypatch.setitem(sys.modules, "movement.io", None)
     for form in (None, "deeplabcut", "lightningpose"):
         with pytest.raises(GhptDataError, match=r"need the package movement.*pip install movement"):
-            read_key_points(tmp_path, format=form)
+            read_person(tmp_path, format=form)
 
 
 class Data(dict):
@@ -85,7 +86,7 @@ def test_what_movement_reads_is_taken_by_name(tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, name, module)
     for name in ("cam1DLC_resnet50_trial.csv", "cam2DLC_resnet50_trial.csv"):
         csv(tmp_path / name)
-    found = read_people(tmp_path)
+    found = read_key_points(tmp_path)
     assert found.views == ("cam1", "cam2")
     assert set(found.joints) < set(SKELETONS["coco_17"])
     assert found.counts().tolist() == [[2, 2]] * 3 + [[1, 1]] + [[2, 2]]
@@ -103,19 +104,19 @@ def test_what_movement_cannot_read_is_named(tmp_path, monkeypatch):
     with pytest.raises(
         GhptDataError, match=r"cam1\.csv: is damaged, or not DeepLabCut's \('bodyparts'\)"
     ):
-        read_people(tmp_path)
+        read_key_points(tmp_path)
 
 
 def test_deeplabcut_s_h5_files_are_refused(tmp_path):
     (tmp_path / "cam1.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
     with pytest.raises(GhptDataError, match=r"holds no \.csv of DeepLabCut.*Export \.csv files"):
-        read_people(tmp_path, format="deeplabcut")
+        read_key_points(tmp_path, format="deeplabcut")
 
 
 def test_a_real_file_by_the_real_package(tmp_path):
     pytest.importorskip("movement")
     for name in ("cam1", "cam2"):
         csv(tmp_path / f"{name}.csv")
-    found = read_key_points(tmp_path)
+    found = read_person(tmp_path)
     np.testing.assert_array_equal(found.key_points, np.stack([POINTS, POINTS], axis=1))
     assert (found.confidence == 0.9).all()

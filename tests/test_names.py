@@ -11,9 +11,8 @@ from ghpt.calibration.millimetres import read_scale
 from ghpt.commands.inputs import InputSettings
 from ghpt.config import check_type
 from ghpt.data.formats.names import chosen_name
-from ghpt.data.people.views import matched
 from ghpt.errors import GhptConfigError, GhptDataError
-from test_key_points import camera_file
+from test_key_points import camera_file, pairs
 
 STRANGE = ("54138969", "01", "1e5", "true", "null", "1_000", "-3", "00_03", "1.50", "no")
 INPUTS = get_type_hints(InputSettings)
@@ -29,14 +28,17 @@ def test_a_view_is_found_as_it_was_typed(name):
     wanted = typed(f"views=[{name},cam]")
     check_type(wanted, INPUTS["views"], "views")
     views = (name, "cam", "other")
-    assert matched("pose", views, camera_file(views), {}, wanted) == [(0, 0), (1, 1)]
+    assert pairs("pose", views, camera_file(views), {}, wanted) == [(0, 0), (1, 1)]
 
 
 @pytest.mark.parametrize("name", STRANGE)
 def test_match_takes_such_names_on_both_sides(name):
     match = typed(f"match={{{name}: a, b: {name}}}")
     check_type(match, INPUTS["match"], "match")
-    assert matched("pose", (name, "b"), camera_file((name, "a")), match, None) == [(1, 0), (0, 1)]
+    assert pairs("pose", (name, "b"), camera_file((name, "a")), match, None) == [
+        (1, 0),
+        (0, 1),
+    ]
 
 
 @pytest.mark.parametrize("name", STRANGE)
@@ -55,4 +57,4 @@ def test_a_leading_zero_of_yaml_is_found_and_an_exact_name_comes_first():
 
 def test_two_names_that_are_read_alike_are_not_guessed():
     with pytest.raises(GhptDataError, match=r"no view 100000\.0 with a camera.*1e5, 100000"):
-        matched("pose", ("1e5", "100000"), camera_file(("1e5", "100000")), {}, typed("views=[1e5]"))
+        pairs("pose", ("1e5", "100000"), camera_file(("1e5", "100000")), {}, typed("views=[1e5]"))

@@ -7,10 +7,12 @@ import json
 import numpy as np
 import pytest
 
-from ghpt.data.formats.key_points import read_key_points, read_people
-from ghpt.data.formats.openpose import follow, read_view
+from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.formats.openpose import read_view
 from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.people.following import follow
 from ghpt.errors import GhptDataError
+from single_person import read_person
 
 RNG = np.random.default_rng(0)
 BODY = RNG.uniform(0, 400, (25, 2))
@@ -39,7 +41,7 @@ def test_frames_keep_their_numbers_and_gaps_stay_gaps(tmp_path):
         "x.{:04d}.json",
         frames=[0, 2, 3, 7],
     )
-    found = read_key_points(tmp_path, **JOINTS)
+    found = read_person(tmp_path, **JOINTS)
     assert found.frame.tolist() == [0, 1, 2, 3, 4, 5, 7]
     assert found.valid[:, 0, 0].tolist() == [True] * 6 + [False]
     assert found.valid[:, 1, 0].tolist() == [True, False, True, True, False, False, True]
@@ -55,7 +57,7 @@ def test_zeros_are_missing_and_confidence_stays_in_its_range(tmp_path):
     one[3], one[4, 2] = 0, 1.04
     write(tmp_path / "cam1", [[one], []])
     write(tmp_path / "cam2", [[person()], [person()]])
-    found = read_key_points(tmp_path, **JOINTS)
+    found = read_person(tmp_path, **JOINTS)
     assert not found.valid[0, 0, 3]
     assert found.valid[0, 0].sum() == 24
     assert not found.valid[1, 0].any()
@@ -85,7 +87,7 @@ def test_following_is_the_best_of_all_choices():
     """Against every choice of one person a frame, by brute force."""
     from itertools import product
 
-    from ghpt.data.formats.openpose import _JUMP, _jump, _quality
+    from ghpt.data.people.following import _JUMP, _jump, _prominence
 
     rng = np.random.default_rng(5)
     people = [
@@ -97,8 +99,8 @@ def test_following_is_the_best_of_all_choices():
         )
         for _ in range(5)
     ]
-    quality = np.stack([_quality(found) for found in people]) / max(
-        _quality(found).max() for found in people
+    quality = np.stack([_prominence(found) for found in people]) / max(
+        _prominence(found).max() for found in people
     )
 
     def value(choice):
@@ -113,7 +115,7 @@ def test_a_confidence_of_nothing_is_not_seen_wherever_the_point_is(tmp_path):
     one[3:6, 2] = 0, -0.1, 1e-6
     write(tmp_path / "cam1", [[one]])
     write(tmp_path / "cam2", [[person()]])
-    found = read_key_points(tmp_path, **JOINTS)
+    found = read_person(tmp_path, **JOINTS)
     assert found.valid[0, 0, 2:6].tolist() == [True, False, False, True]
 
 
@@ -136,7 +138,7 @@ def test_a_jump_costs_twice_its_distance_in_sizes():
 def test_of_two_people_the_larger_is_followed_whoever_is_listed_first(tmp_path):
     for view in ("a", "b"):
         write(tmp_path / view, [[person(900, 0.3), person()]] * 2)
-    found = read_key_points(tmp_path, **JOINTS)
+    found = read_person(tmp_path, **JOINTS)
     np.testing.assert_allclose(found.key_points, np.broadcast_to(BODY, (2, 2, 25, 2)))
 
 
@@ -148,17 +150,17 @@ def test_person_ids_count_where_everybody_has_one(tmp_path):
 
     write_ids("a", [1, 0])
     write_ids("b", [7])
-    assert read_people(tmp_path, **JOINTS).identity.tolist() == [1, 0, 7]
+    assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [1, 0, 7]
     for other in (-1, True, 1 << 31, "1", 1.0):
         write_ids("b", [other])
-        assert read_people(tmp_path, **JOINTS).identity.tolist() == [-1, -1, -1]
+        assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [-1, -1, -1]
 
 
 def test_64_people_are_read_and_a_pixel_below_a_million(tmp_path):
     one = person()
     one[0, 0] = 999_999.5
     write(tmp_path / "a", [[one] * 64])
-    assert read_view(tmp_path / "a").values.shape == (64, 25, 3)
+    assert read_view(tmp_path / "a").points.pixels.shape == (64, 25, 2)
     one[0, 0] = -1e6
     write(tmp_path / "a", [[one]])
     with pytest.raises(GhptDataError, match="beyond 1e6"):
@@ -168,29 +170,29 @@ def test_64_people_are_read_and_a_pixel_below_a_million(tmp_path):
 def test_the_number_of_people_is_told(tmp_path):
     write(tmp_path / "a", [[person(), person(900)], [person()], []])
     write(tmp_path / "b", [[person()]] * 3)
-    assert read_key_points(tmp_path, **JOINTS).several == (1, 0)
+    assert read_key_points(tmp_path, **JOINTS).crowded_frames() == {"a": 1}
 
 
 def test_cameras_without_a_common_frame_are_refused(tmp_path):
     write(tmp_path / "a", [[person()]] * 2, frames=[1, 2])
     write(tmp_path / "b", [[person()]] * 2, frames=[3, 4])
     with pytest.raises(GhptDataError, match=r"no frame is in all views \(a 1 to 2, b 3 to 4\)"):
-        read_key_points(tmp_path, **JOINTS)
+        read_person(tmp_path, **JOINTS)
 
 
 def test_bad_folders_are_named(tmp_path):
     with pytest.raises(
         GhptDataError, match=r"holds no folder with OpenPose's JSON files.*for each camera"
     ):
-        read_key_points(tmp_path)
+        read_person(tmp_path)
     write(tmp_path / "a", [[]] * 3)
     with pytest.raises(GhptDataError, match="people: is empty"):
-        read_key_points(tmp_path)
+        read_person(tmp_path)
     write(tmp_path / "b", [[person()]] * 3)
     with pytest.raises(GhptDataError, match="view a: has no key point"):
-        read_key_points(tmp_path, **JOINTS)
+        read_person(tmp_path, **JOINTS)
     with pytest.raises(GhptDataError, match="Name the folder above"):
-        read_key_points(tmp_path / "a")
+        read_person(tmp_path / "a")
 
 
 @pytest.mark.parametrize(
@@ -236,11 +238,12 @@ def test_a_bad_file_is_named(name, content, says, tmp_path):
 
 
 def test_the_real_recording(shared_data):
-    found = read_key_points(shared_data / "pose2sim_single" / "pose")
+    found = read_person(shared_data / "pose2sim_single" / "pose")
     assert found.views == ("cam1_json", "cam2_json", "cam3_json", "cam4_json")
     assert found.joints == SKELETONS["body_25b"]
     assert found.frame.tolist() == list(range(100))
-    assert found.several == (100, 100, 0, 0)
+    people = read_key_points(shared_data / "pose2sim_single" / "pose")
+    assert people.crowded_frames() == {"cam1_json": 100, "cam2_json": 100}
     size = (
         np.where(found.valid[..., None], found.key_points, np.inf).min(2),
         np.where(found.valid[..., None], found.key_points, -np.inf).max(2),

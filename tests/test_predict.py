@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import hydra
@@ -14,7 +15,6 @@ from ghpt.commands import predict as module
 from ghpt.commands.predict import COMMAND, predict
 from ghpt.config import build, plain
 from ghpt.data.formats.camera_writers import write_pose2sim
-from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import Cameras, CameraSet, project
@@ -26,11 +26,13 @@ from predicting import (
     QUICK,
     cameras_file,
     config,
-    frames_of,
+    numbers_of,
     openpose_folders,
+    sequence_of,
     walk,
     write_people,
 )
+from single_person import SinglePerson, write_person
 
 ROOT = Path(__file__).resolve().parents[1]
 RIG = human36m_rig("S9")
@@ -48,7 +50,7 @@ def points_file(folder: Path, values=None, name="points.npz", frames=40, **chang
     """The walk in Human3.6M's cameras as an npz file of ours."""
     values = PIXELS[:frames].astype(np.float64) if values is None else values
     valid = np.isfinite(values).all(-1)
-    points = KeyPoints(
+    points = SinglePerson(
         "",
         tuple(f"cam{i}_json" for i in range(values.shape[1])),
         JOINTS,
@@ -57,9 +59,8 @@ def points_file(folder: Path, values=None, name="points.npz", frames=40, **chang
         valid.astype(float),
         valid,
         50.0,
-        (0,) * values.shape[1],
     )
-    write_key_points(folder / name, KeyPoints(**{**vars(points), **changed}))
+    write_person(folder / name, SinglePerson(**{**vars(points), **changed}))
     return folder / name
 
 
@@ -138,7 +139,7 @@ def test_the_same_command_again_predicts_nothing_and_gives_the_same_bytes(tmp_pa
     predict(settings, tmp_path / "out")
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("poses.*")}
     calls = []
-    monkeypatch.setattr(module, "predicted", refusing(module.predicted, calls))
+    monkeypatch.setattr(module, "predict_shards", refusing(module.predicted, calls))
     predict(settings, tmp_path / "out")
     assert calls == [0]
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("poses.*")} == before
@@ -146,9 +147,9 @@ def test_the_same_command_again_predicts_nothing_and_gives_the_same_bytes(tmp_pa
     predict(settings, tmp_path / "out")
     assert calls == [0, 1]
     predict(
-        settings | {"seed": 1, "fill": 3, "formats": ["npz"]}, tmp_path / "out"
+        replace(settings, seed=1, fill=3, formats=["npz"]), tmp_path / "out"
     )  # none of the prediction's business
-    predict(settings | {"evaluated_frames": 9}, tmp_path / "out")
+    predict(replace(settings, evaluated_frames=9), tmp_path / "out")
     assert calls == [0, 1, 0, 0]
 
 
@@ -205,7 +206,7 @@ def test_filled_and_smoothed_is_marked(tmp_path):
     about, plainly = result(tmp_path)
     assert not about.smoothed
     assert (plainly.state[10:13] == State.FEW_VIEWS).all()
-    numbers = predict(config(*given, "formats=[npz]", "fill=0.1s", "smooth=6"), tmp_path / "out")
+    numbers = numbers_of(config(*given, "formats=[npz]", "fill=0.1s", "smooth=6"), tmp_path / "out")
     about, found = result(tmp_path)
     assert about.smoothed
     assert about.provenance["smooth_hz"] == 6
@@ -423,8 +424,8 @@ def test_a_full_disk_is_named_and_the_next_run_goes_on(tmp_path, limit, file):
 
 
 def test_a_recording_of_a_data_set_is_a_demonstration(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_from_data", lambda _: frames_of(30))
-    numbers = predict(config("compare=[linear,ransac]", "evaluated_frames=10"), tmp_path / "out")
+    monkeypatch.setattr(module, "data_sequence", lambda _: sequence_of(30))
+    numbers = numbers_of(config("compare=[linear,ransac]", "evaluated_frames=10"), tmp_path / "out")
     assert numbers["source"] == "synthetic"
     assert set(numbers["evaluation"]["estimators"]) >= {"linear", "ransac"}
     for found in numbers["evaluation"]["estimators"].values():
@@ -438,7 +439,7 @@ def test_a_recording_of_a_data_set_is_a_demonstration(tmp_path, monkeypatch):
 def test_real_recordings_are_predicted(shared_data, tmp_path):
     """Pose2Sim's demo and caliscope's: figures of docs/recordings.md."""
     one = shared_data / "pose2sim_single"
-    numbers = predict(
+    numbers = numbers_of(
         config(
             f"keypoints={one / 'pose'}",
             f"cameras={one / 'Calib_qualisys.toml'}",
@@ -451,7 +452,7 @@ def test_real_recordings_are_predicted(shared_data, tmp_path):
     assert numbers["share"]["observed"] > 0.95
     assert next(iter(numbers["evaluation"]["estimators"].values()))["held_out"]["median"] < 40
     two = shared_data / "caliscope"
-    numbers = predict(
+    numbers = numbers_of(
         config(f"keypoints={two / 'xy_HOLISTIC.csv'}", f"cameras={two / 'camera_array.toml'}"),
         tmp_path / "two",
     )

@@ -11,10 +11,10 @@ from ghpt.data.synthetic import body
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.scale import (
-    SEGMENTS,
+    BONE_NAMES,
     BodyHeight,
     KnownScale,
-    SegmentLengths,
+    BoneLengths,
     average_lengths,
     body_scale,
     stature,
@@ -50,7 +50,7 @@ def test_every_scale_finds_the_true_length():
     length = t.norm(dim=-1)
     estimate = RelativePoseEstimate(R, t / length[:, None], torch.ones(2, dtype=torch.bool))
     true = bones(scene.points)
-    segments = SegmentLengths({SEGMENTS[i]: float(true[i]) for i in (0, 1, 11)})
+    segments = BoneLengths({BONE_NAMES[i]: float(true[i]) for i in (0, 1, 11)})
     torch.testing.assert_close(KnownScale()(estimate, problem), length)
     torch.testing.assert_close(segments(estimate, problem), length, rtol=1e-6, atol=0)
     height = float(stature(scene.points, torch.ones(scene.points.shape[:-1], dtype=torch.bool)))
@@ -70,7 +70,7 @@ def test_a_joint_that_one_of_two_views_sees_measures_nothing():
     problem, R, t, scene = batch()
     length = t.norm(dim=-1)
     estimate = RelativePoseEstimate(R, t / length[:, None], torch.ones(2, dtype=torch.bool))
-    segments = SegmentLengths({SEGMENTS[0]: float(bones(scene.points)[0])})
+    segments = BoneLengths({BONE_NAMES[0]: float(bones(scene.points)[0])})
     end = BONES[0][0]
     problem.valid[:, 0, :15, end] = False
     problem.key_points[:, 0, :15, end] = 0
@@ -119,13 +119,13 @@ def test_average_adult_is_the_median_of_many():
 
 
 def test_segments_have_names_on_both_sides():
-    assert len(set(SEGMENTS)) == len(BONES)
-    for name, ends in zip(SEGMENTS, BONES, strict=True):
+    assert len(set(BONE_NAMES)) == len(BONES)
+    for name, ends in zip(BONE_NAMES, BONES, strict=True):
         if name.endswith("thigh"):
             side = name.split("_")[0]
             assert {JOINTS[j] for j in ends} == {f"{side}_knee", f"{side}_hip"}
     both = dict(
-        zip(SEGMENTS, SegmentLengths({"thigh": 430.0, "left_forearm": 250.0}).lengths, strict=True)
+        zip(BONE_NAMES, BoneLengths({"thigh": 430.0, "left_forearm": 250.0}).lengths, strict=True)
     )
     assert {name for name, mm in both.items() if mm} == {
         "right_thigh",
@@ -137,7 +137,7 @@ def test_segments_have_names_on_both_sides():
 @pytest.mark.parametrize("lengths", [{}, {"tail": 300.0}, {"thigh": 0.0}, {"thigh": -1.0}])
 def test_bad_lengths_are_named(lengths):
     with pytest.raises(GhptConfigError, match="lengths"):
-        SegmentLengths(lengths)
+        BoneLengths(lengths)
 
 
 def test_bad_height_is_named():

@@ -18,13 +18,13 @@ from ghpt import provenance as origin
 from ghpt.commands import predict as prediction
 from ghpt.commands.app import Command
 from ghpt.commands.outputs import Files
-from ghpt.commands.prediction.frames import Frames
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.commands.train import train
+from ghpt.data.people.sequence import Sequence
 from ghpt.models.estimators.classical import Linear
 from ghpt.signals import stop as handler
 from ghpt.signals import stopped_by_signals
-from predicting import config, frames_of
+from predicting import config, sequence_of
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STATUS = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 143}
@@ -136,7 +136,7 @@ def test_pycolmap_is_imported_in_one_place():
 def predict_to(folder, patch):
     """Predict 250 frames in 5 shards into the folder."""
     patch.setattr(sys, "argv", ["predict.py"])
-    patch.setattr(prediction, "_from_data", lambda _: frames_of(250))
+    patch.setattr(prediction, "data_sequence", lambda _: sequence_of(250))
     origin_of = {"ghpt": "0", "commit": "", "command": ""}
     patch.setattr(prediction, "provenance", lambda seed: origin_of | {"seed": seed})
     settings = config("triangulation=linear", "shard_frames=50", "batch=25", "formats=[npz,csv]")
@@ -164,7 +164,7 @@ def outputs(folder: Path) -> dict[str, bytes]:
 
 
 WHERE = {
-    "between the frames": (Frames, "batch", 4, 1),
+    "between the frames": (Sequence, "read", 4, 1),
     "before a shard is written": (Shards, "write", 3, 2),
     "while a format is written": (Shards, "read", 3, 5),
     "while another is written": (Shards, "read", 8, 5),

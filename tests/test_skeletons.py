@@ -7,13 +7,14 @@ import pytest
 import torch
 
 from ghpt.data.formats.camera_files import read_cameras
-from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS, joints17, joints_of, parts_of, recognise
-from ghpt.data.people.views import undistort_and_match
+from ghpt.data.people.persons import person_sequence
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import triangulate
 from ghpt.skeleton import JOINT, JOINTS, MIRROR, PELVIS, THORAX
+from single_person import read_person
 
 REAL = {
     "pose2sim_single": ("pose", "Calib_qualisys.toml"),
@@ -26,13 +27,13 @@ def test_every_joint_comes_from_its_own_parts(name):
     """A point at (k, -k) for the k-th joint: each of the 17 must be the mean of the right k."""
     joints = SKELETONS[name]
     k = np.arange(len(joints), dtype=np.float64)
-    points, sure, valid = joints17(
-        "x",
-        joints,
-        np.stack([k, -k], -1)[None, None],
-        k[None, None] / 100,
-        np.ones((1, 1, len(k)), bool),
+    given = KeyPoints(
+        pixels=np.stack([k, -k], -1)[None, None],
+        confidence=k[None, None] / 100,
+        valid=np.ones((1, 1, len(k)), bool),
     )
+    found = joints17("x", joints, given)
+    points, sure, valid = found.pixels, found.confidence, found.valid
     assert valid.all()
     value = dict(zip(JOINTS, points[0, 0, :, 0], strict=True))
     for joint in set(JOINTS) & set(joints):
@@ -53,17 +54,19 @@ def test_a_mean_is_seen_where_all_of_its_parts_are():
     joints = SKELETONS["coco_17"]
     valid = np.ones((1, 1, 17), bool)
     valid[..., joints.index("left_hip")] = False
-    points, sure, found = joints17("x", joints, np.ones((1, 1, 17, 2)), np.ones((1, 1, 17)), valid)
-    assert {JOINTS[i] for i in np.flatnonzero(~found[0, 0])} == {"left_hip", "pelvis", "spine"}
-    assert (points[~found] == 0).all()
-    assert (sure[~found] == 0).all()
+    given = KeyPoints(np.ones((1, 1, 17, 2)), np.ones((1, 1, 17)), valid)
+    found = joints17("x", joints, given)
+    missing = ~found.valid
+    assert {JOINTS[i] for i in np.flatnonzero(missing[0, 0])} == {"left_hip", "pelvis", "spine"}
+    assert (found.pixels[missing] == 0).all()
+    assert (found.confidence[missing] == 0).all()
 
 
 def test_a_joint_that_the_detector_lacks_is_never_seen():
     joints = tuple(j for j in SKELETONS["coco_17"] if j not in ("nose", "left_ear"))
-    found = joints17(
-        "x", joints, np.ones((2, 3, 15, 2)), np.ones((2, 3, 15)), np.ones((2, 3, 15), bool)
-    )[2]
+    shape = (2, 3, 15)
+    given = KeyPoints(np.ones((*shape, 2)), np.ones(shape), np.ones(shape, bool))
+    found = joints17("x", joints, given).valid
     assert {JOINTS[i] for i in np.flatnonzero(~found.any((0, 1)))} == {"nose", "head_top"}
 
 
@@ -113,9 +116,11 @@ def test_left_is_left_on_real_people(data, shared_data):
     """In the cameras' own calibration: a person's left is up x forward, forward being from heels to
     toes.
     """
-    raw = read_key_points(shared_data / data / REAL[data][0])
-    views = undistort_and_match(raw, read_cameras(shared_data / data / REAL[data][1]))
-    points, ok = world(views.cameras.cameras, views.key_points, views.valid)
+    raw = read_person(shared_data / data / REAL[data][0])
+    cameras = read_cameras(shared_data / data / REAL[data][1])
+    sequence = person_sequence(raw.detections, cameras)
+    views = sequence.undistorted()
+    points, ok = world(sequence.cameras.cameras, views.pixels, views.valid)
     # the feet are not among the 17: put them where the ankles are
     feet = [
         raw.joints.index(f"{side}_{part}")
@@ -123,7 +128,9 @@ def test_left_is_left_on_real_people(data, shared_data):
         for part in ("big_toe", "heel")
     ]
     foot, foot_ok = world(
-        views.cameras.cameras, raw.key_points[:, :, feet].astype(np.float32), raw.valid[:, :, feet]
+        sequence.cameras.cameras,
+        raw.key_points[:, :, feet].astype(np.float32),
+        raw.valid[:, :, feet],
     )
     forward = (foot[:, [0, 2]] - foot[:, [1, 3]]).mean(1)
     up = (
@@ -145,13 +152,15 @@ def test_left_is_left_on_real_people(data, shared_data):
 @pytest.mark.parametrize("data", REAL)
 def test_the_views_agree_on_left_and_right(data, shared_data):
     """Swapping left and right in one view makes its reprojection errors larger."""
-    raw = read_key_points(shared_data / data / REAL[data][0])
-    views = undistort_and_match(raw, read_cameras(shared_data / data / REAL[data][1]))
-    straight = median_error(views.cameras.cameras, views.key_points, views.valid)
+    raw = read_person(shared_data / data / REAL[data][0])
+    cameras = read_cameras(shared_data / data / REAL[data][1])
+    sequence = person_sequence(raw.detections, cameras)
+    views = sequence.undistorted()
+    straight = median_error(sequence.cameras.cameras, views.pixels, views.valid)
     for view in range(4):
-        flipped, valid = views.key_points.copy(), views.valid.copy()
+        flipped, valid = views.pixels.copy(), views.valid.copy()
         flipped[:, view], valid[:, view] = flipped[:, view][:, MIRROR], valid[:, view][:, MIRROR]
-        assert median_error(views.cameras.cameras, flipped, valid) > 1.2 * straight
+        assert median_error(sequence.cameras.cameras, flipped, valid) > 1.2 * straight
 
 
 def world(cameras, key_points, valid):

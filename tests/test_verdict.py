@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -17,20 +18,19 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 from ghpt.calibration.check.units import unit_for, unit_of
 from ghpt.commands.cameras import examine
-from ghpt.commands.predict import predict
 from ghpt.commands.prediction.next_commands import commands_on, setting
 from ghpt.commands.prediction.verdict import Commands, Judge, Level
 from ghpt.config import build, plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_pose2sim
-from ghpt.data.formats.key_points import KeyPoints, write_key_points
-from ghpt.data.people.views import undistort_and_match
+from ghpt.data.people.persons import person_sequence
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
-from predicting import CONF, cameras_file, config, walk
+from predicting import CONF, cameras_file, config, numbers_of, walk
+from single_person import SinglePerson, write_person
 
 RIG = human36m_rig("S9")
 QUICKLY = (
@@ -59,10 +59,8 @@ def points_file(path: Path, values: np.ndarray, joints: list[int] | None = None)
     values = np.where(valid[..., None], values, 0.0)
     names = NAMES[: values.shape[1]]
     frame = np.arange(len(values))
-    points = KeyPoints(
-        "", names, JOINTS, frame, values, valid.astype(float), valid, 50.0, (0,) * len(names)
-    )
-    write_key_points(path, points)
+    points = SinglePerson("", names, JOINTS, frame, values, valid.astype(float), valid, 50.0)
+    write_person(path, points)
     return path
 
 
@@ -83,7 +81,7 @@ def judged(
     """What predict.py makes of these key points."""
     points = points_file(folder / "points.npz", values, joints)
     words = [f"keypoints={points}", f"cameras={cameras or cameras_file(folder)}"]
-    return predict(config(*QUICKLY, *words, *more), folder / "out")
+    return numbers_of(config(*QUICKLY, *words, *more), folder / "out")
 
 
 def codes(numbers: dict) -> list[str]:
@@ -172,7 +170,7 @@ def test_a_stated_unit_that_makes_a_giant_is_not_to_be_used_and_the_command_mend
     words = shlex.split(finding["command"])
     assert words[:2] == ["python", "predict.py"]
     assert "unit_mm=1" in words
-    again = predict(config(*QUICKLY, *words[2:]), tmp_path / "again")
+    again = numbers_of(config(*QUICKLY, *words[2:]), tmp_path / "again")
     assert again["verdict"]["level"] == "good"
 
 
@@ -209,7 +207,7 @@ def test_another_frame_rate_is_named_by_both_commands_and_matched_by_time(tmp_pa
     with pytest.raises(GhptDataError, match="cam_02: frame_rate"):
         examine(cameras_settings(tmp_path / "points.npz", cameras_file(tmp_path)), checked)
     words = [f"keypoints={checked / 'keypoints.npz'}", f"cameras={checked / 'cameras.toml'}"]
-    assert predict(config(*QUICKLY, *words), tmp_path / "again")["verdict"]["level"] == "good"
+    assert numbers_of(config(*QUICKLY, *words), tmp_path / "again")["verdict"]["level"] == "good"
 
 
 SIZE = RIG.size.numpy()[:, None]
@@ -230,7 +228,7 @@ def test_normalised_key_points_are_an_error_in_every_command(bounds, tmp_path):
 def test_without_an_image_size_twice_the_principal_point_is_one(tmp_path):
     values = SCALES["0 and 1"]
     cameras = read_cameras(cameras_file(tmp_path))
-    points = KeyPoints(
+    points = SinglePerson(
         "",
         NAMES,
         JOINTS,
@@ -239,10 +237,9 @@ def test_without_an_image_size_twice_the_principal_point_is_one(tmp_path):
         np.ones(values.shape[:-1]),
         np.ones(values.shape[:-1], bool),
         50.0,
-        (0,) * 4,
     )
     with pytest.raises(GhptDataError, match="normalised"):
-        undistort_and_match(points, type(cameras)(**{**vars(cameras), "size": None}))
+        person_sequence(points.detections, replace(cameras, size=None))
 
 
 def test_images_that_are_turned_are_named(tmp_path):
@@ -351,7 +348,7 @@ def test_commands_hold_what_was_given(tmp_path):
         "person=1",
         "skeleton=coco_17",
     )
-    commands = commands_on(given, tmp_path / "out")
+    commands = commands_on(given, given.person, given.ckpt, tmp_path / "out")
     assert shlex.split(commands.predict(unit_mm=1.0))[2:] == [
         "keypoints='/my data/pose'",
         "cameras=Calib.toml",

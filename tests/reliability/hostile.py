@@ -28,10 +28,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from damage import _spoilt as spoil_bytes
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_opencv, write_pose2sim
-from ghpt.data.formats.key_points import KeyPoints, read_people, write_key_points
+from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.synthetic.rigs import panoptic_rig
 from ghpt.errors import GhptDataError
+from single_person import SinglePerson, write_person
 
 SECONDS, BATCH, MEMORY = 1.0, 200, 1 << 30
 """Of the processor for one file; files in a process; bytes that a process may add to those of the
@@ -96,17 +97,17 @@ def caliscope(folder: Path) -> Path:
     return folder / "xy.csv"
 
 
-def own_points() -> KeyPoints:
+def own_points() -> SinglePerson:
     """Ours: 3 frames, 2 views."""
     points = np.broadcast_to(BODY[:, :2], (3, 2, 17, 2)) + 0.25
     sure = np.broadcast_to(BODY[:, 2], (3, 2, 17)).copy()
-    return KeyPoints(
-        "", ("a", "b"), SKELETONS["coco_17"], np.arange(3), points, sure, sure > 0, 60.0, (0, 0)
+    return SinglePerson(
+        "", ("a", "b"), SKELETONS["coco_17"], np.arange(3), points, sure, sure > 0, 60.0
     )
 
 
 def npz(folder: Path) -> Path:
-    write_key_points(folder / "points.npz", own_points())
+    write_person(folder / "points.npz", own_points())
     return folder / "points.npz"
 
 
@@ -349,12 +350,12 @@ def mutate_records(data: bytes, chance: random.Random) -> bytes:
 
 
 FORMATS: dict[str, Format] = {
-    "openpose": Format(openpose, lambda folder: read_people(folder, "coco_17"), mutate_json),
-    "mmpose": Format(mmpose, read_people, mutate_json),
-    "coco": Format(coco, read_people, mutate_json),
-    "caliscope": Format(caliscope, lambda folder: read_people(folder / "xy.csv"), mutate_text),
-    "npz": Format(npz, lambda folder: read_people(folder / "points.npz"), mutate_npz),
-    "npy": Format(npy, read_people, mutate_npy),
+    "openpose": Format(openpose, lambda folder: read_key_points(folder, "coco_17"), mutate_json),
+    "mmpose": Format(mmpose, read_key_points, mutate_json),
+    "coco": Format(coco, read_key_points, mutate_json),
+    "caliscope": Format(caliscope, lambda folder: read_key_points(folder / "xy.csv"), mutate_text),
+    "npz": Format(npz, lambda folder: read_key_points(folder / "points.npz"), mutate_npz),
+    "npy": Format(npy, read_key_points, mutate_npy),
     "toml": Format(toml, lambda folder: read_cameras(folder / "rig.toml"), mutate_text),
     "yaml": Format(yaml, read_cameras, mutate_text),
     "panoptic": Format(

@@ -23,10 +23,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 
 from hostile import forked
 
-from ghpt.commands.prediction.stored import open_stored
 from ghpt.data.datasets.labels import read_labels
 from ghpt.data.formats.camera_files import read_cameras
-from ghpt.data.formats.key_points import read_people
+from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.people.stored import open_stored
 from ghpt.errors import GhptDataError
 
 SECONDS, MEBIBYTES = 1.0, 256
@@ -189,37 +189,41 @@ DEEP, LONG = "[" * 200_000, "9" * 2_000_000
 CALISCOPE = b"sync_index,port,point_id,img_loc_x,img_loc_y\n"
 OF_COCO = '[{"image_id": 1, "keypoints": ['
 BOMBS: dict[str, Bomb] = {
-    "npz of 2 GiB of zeros": ("p.npz", npz_2gib, read_people),
-    "npz that declares 1e12 elements": ("p.npz", npz_1e12, read_people),
-    "npz of 1e5 members": ("p.npz", npz_1e5_members, read_people),
-    "npz of overlapping members": ("p.npz", npz_overlapping, read_people),
+    "npz of 2 GiB of zeros": ("p.npz", npz_2gib, read_key_points),
+    "npz that declares 1e12 elements": ("p.npz", npz_1e12, read_key_points),
+    "npz of 1e5 members": ("p.npz", npz_1e5_members, read_key_points),
+    "npz of overlapping members": ("p.npz", npz_overlapping, read_key_points),
     "npy with a header of 4 GiB": (
         "all_2d_preds.npy",
         written(b"\x93NUMPY\x02\x00\xff\xff\xff\xff" + b" " * 100),
-        read_people,
+        read_key_points,
     ),
     "npy of 1e12 elements": (
         "all_2d_preds.npy",
         written(npy_header((10**12, 4, 17, 2), "<f4")),
-        read_people,
+        read_key_points,
     ),
-    "COCO of depth 2e5": ("a.json", written(OF_COCO + DEEP), read_people),
-    "COCO with an integer of 2e6 digits": ("a.json", written(OF_COCO + LONG + "]}]"), read_people),
+    "COCO of depth 2e5": ("a.json", written(OF_COCO + DEEP), read_key_points),
+    "COCO with an integer of 2e6 digits": (
+        "a.json",
+        written(OF_COCO + LONG + "]}]"),
+        read_key_points,
+    ),
     "COCO with a frame number of 4,000 digits": (
         "a.json",
         written('[{"image_id": ' + LONG[:4000] + "}]"),
-        read_people,
+        read_key_points,
     ),
-    "MMPose of depth 2e5": ("a.json", written('{"instance_info": ' + DEEP), read_people),
+    "MMPose of depth 2e5": ("a.json", written('{"instance_info": ' + DEEP), read_key_points),
     "JSON of 1 GB in a line": (
         "a.json",
         lambda path: sparse(path, b'[{"image_id": 1, "x": "', 1 << 30),
-        read_people,
+        read_key_points,
     ),
     "CSV of 1 GB in a line": (
         "xy.csv",
         lambda path: sparse(path, CALISCOPE, 1 << 30, b"\n"),
-        read_people,
+        read_key_points,
     ),
     "cameras JSON of depth 2e5": ("c.json", written('{"cameras": ' + DEEP), read_cameras),
     "cameras JSON with an integer of 2e6 digits": (
@@ -246,15 +250,23 @@ BOMBS: dict[str, Bomb] = {
     "OpenPose of 200,000 people": (
         "o",
         openpose('{"pose_keypoints_2d": [1, 2, 1]}', 200_000),
-        read_people,
+        read_key_points,
     ),
-    "OpenPose of as many people as a file may hold": ("o", openpose("{}", 24_000), read_people),
-    "COCO of 20 million lists": ("a.json", repeated("[", "[],", 20_000_000, "[]]"), read_people),
-    "COCO of 20 million objects": ("a.json", repeated("[", "{},", 20_000_000, "{}]"), read_people),
+    "OpenPose of as many people as a file may hold": ("o", openpose("{}", 24_000), read_key_points),
+    "COCO of 20 million lists": (
+        "a.json",
+        repeated("[", "[],", 20_000_000, "[]]"),
+        read_key_points,
+    ),
+    "COCO of 20 million objects": (
+        "a.json",
+        repeated("[", "{},", 20_000_000, "{}]"),
+        read_key_points,
+    ),
     "COCO of 30 million numbers": (
         "a.json",
         repeated(OF_COCO, "0,", 30_000_000, "0]}]"),
-        read_people,
+        read_key_points,
     ),
     "MMPose of 700,000 people": (
         "a.json",
@@ -264,7 +276,7 @@ BOMBS: dict[str, Bomb] = {
             700_000,
             "{}]}]}",
         ),
-        read_people,
+        read_key_points,
     ),
     "Panoptic of 200,000 cameras": (
         "c.json",
@@ -310,9 +322,9 @@ BOMBS: dict[str, Bomb] = {
         repeated("%YAML:1.0\n---\nnames:\n  ", "- ", 200_000, "a\n"),
         read_cameras,
     ),
-    "npz of 1e5 views": ("p.npz", many_views, read_people),
+    "npz of 1e5 views": ("p.npz", many_views, read_key_points),
     "npz of 1e5 views, in parts": ("p.npz", many_views, lambda path: open_stored(path, None, None)),
-    "authors' npy of 1e5 views": ("o", authors_of_many_views, read_people),
+    "authors' npy of 1e5 views": ("o", authors_of_many_views, read_key_points),
     "COLMAP of 3e5 images": (
         "o",
         colmap_of_many_images,

@@ -125,7 +125,7 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         # ours, which read
         "ghpt.export.npz.read_reconstruction": {"path": str(ckpt)},
         "ghpt.data.formats.camera_files.read_cameras": {"path": str(ckpt)},
-        "ghpt.data.formats.key_points.read_people": {"path": str(ckpt)},
+        "ghpt.data.formats.key_points.read_key_points": {"path": str(ckpt)},
         "ghpt.data.datasets.store.open_store": {"folder": folder},
         "ghpt.data.datasets.store.cache_root": {},
         "ghpt.models.pose.predictions.open_predictions": {"path": str(ckpt)},

@@ -14,7 +14,6 @@ import torch
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.data.datasets.store import write_store
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
-from ghpt.data.formats.key_points import KeyPoints, write_key_points
 from ghpt.data.formats.stored_npz import members_of
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import WRITERS, Scene
@@ -25,6 +24,7 @@ from ghpt.models.rows import RowWriter
 from ghpt.paper.engine.tasks import Task, perform
 from ghpt.skeleton import JOINTS
 from reconstructions import about, in_parts, random_reconstruction, rig
+from single_person import SinglePerson, write_person
 from toys import recording
 
 pytestmark = pytest.mark.skipif(
@@ -128,7 +128,7 @@ def save_rig(folder: Path) -> None:
 def save_key_points(folder: Path) -> None:
     values = np.ones((3, 2, len(JOINTS), 2))
     shape = values.shape[:-1]
-    points = KeyPoints(
+    points = SinglePerson(
         "",
         ("a", "b"),
         JOINTS,
@@ -137,9 +137,8 @@ def save_key_points(folder: Path) -> None:
         np.ones(shape),
         np.ones(shape, bool),
         10.0,
-        (0, 0),
     )
-    write_key_points(folder / "points.npz", points)
+    write_person(folder / "points.npz", points)
 
 
 def save_store(folder: Path) -> None:

@@ -18,7 +18,7 @@ from ghpt.commands.train import COMMAND
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.rows import RowWriter
 from ghpt.paper.engine.pool import perform_all
-from predicting import frames_of
+from predicting import sequence_of
 from reconstructions import random_reconstruction
 from toy_tasks import task
 
@@ -71,7 +71,7 @@ def test_command(typed, conf, tmp_path, train_command):
 
 @pytest.fixture
 def predict_command(typed, tmp_path, monkeypatch):
-    monkeypatch.setattr(prediction, "_from_data", lambda _: frames_of(400))
+    monkeypatch.setattr(prediction, "data_sequence", lambda _: sequence_of(400))
     words = (
         "triangulation=linear",
         "shard_frames=100",

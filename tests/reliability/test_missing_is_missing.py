@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.commands.prediction.gaps import Gaps, after
+from ghpt.commands.prediction.gaps import Gaps, apply_gaps
 from ghpt.commands.prediction.shards import Shards
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import WRITERS, read_reconstruction
@@ -83,7 +83,7 @@ def test_d7_no_value_without_its_state(tmp_path, record_row):
                 shard, type(whole)(**{name: value[rows] for name, value in vars(whole).items()})
             )
         longest = None if number % 2 else int(rng.integers(1, 12))
-        with after(Gaps(longest, "pchip", None, 50.0), shards, J, folder) as chunks:
+        with apply_gaps(Gaps(longest, "pchip", None, 50.0), shards, J, folder) as chunks:
             for name in ("npz", "trc", "c3d"):
                 WRITERS[name].write(folder / f"poses.{name}", ABOUT, chunks)
         shards.close()

@@ -15,13 +15,13 @@ import pytest
 import sizes
 from ghpt.commands import predict as command
 from ghpt.commands.prediction.shards import MANIFEST
-from predicting import config, frames_of
+from predicting import config, sequence_of
 
 OUTPUTS = ("poses.npz", "poses.csv", "poses.trc", "prediction.json", "report.md")
 
 
 def predict(output: Path, frames: int, settings: dict) -> None:
-    command._from_data = lambda _: frames_of(frames)
+    command.data_sequence = lambda _: sequence_of(frames)
     command.predict(settings, output)
 
 

@@ -14,7 +14,7 @@ def child(output: str, frames: int) -> None:
     """
     from ghpt.commands import predict as command
     from ghpt.commands.prediction import run
-    from predicting import config, frames_of
+    from predicting import config, sequence_of
 
     held = []
     write = run.Shards.write
@@ -25,7 +25,7 @@ def child(output: str, frames: int) -> None:
         held.append(memory.private_memory())
 
     run.Shards.write = measured
-    command._from_data = lambda _: frames_of(frames)
+    command.data_sequence = lambda _: sequence_of(frames)
     words = ("triangulation=linear", "shard_frames=2000", "batch=1000", "formats=[npz,csv]")
     command.predict(config(*words), Path(output))
     third = len(held) // 3

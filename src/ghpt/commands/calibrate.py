@@ -8,29 +8,33 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypedDict
 
-import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ghpt.calibration.check.units import decide_unit
 from ghpt.calibration.diagnosis import Diagnosis
 from ghpt.calibration.millimetres import in_millimetres, of_scale, read_scale
 from ghpt.calibration.rig import RigEstimate
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
-from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
+from ghpt.commands.inputs import (
+    input_settings,
+    own_cameras,
+    own_people,
+    own_sequence,
+    recording_sequence,
+    resolve_unit,
+)
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.prediction.frames import MEASURED, frames_of_views
 from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
-from ghpt.data.formats.key_points import KeyPoints
 from ghpt.data.formats.names import Name
-from ghpt.data.people.views import Views, undistort_and_match
+from ghpt.data.people.detections import Detections
+from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
-from ghpt.geometry.cameras import Cameras, CameraSet
-from ghpt.models.estimators.classical import Baseline
+from ghpt.geometry.cameras import Cameras
+from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.observations import Recording
 from ghpt.provenance import provenance
@@ -44,7 +48,6 @@ from ghpt.report.rig_files import (
     write_rig,
     write_rig_figure,
 )
-from ghpt.report.tables import display_name
 
 _log = logging.getLogger(__name__)
 
@@ -58,8 +61,8 @@ class Scale(TypedDict):
     assumed_height: float
 
 
-class Settings(InputSettings):
-    """What `calibrate` needs of the configuration."""
+class Settings(TypedDict):
+    """What `calibrate` needs of the configuration beside the input."""
 
     scale: Scale
     calibration: dict[str, Any]
@@ -73,11 +76,9 @@ class Settings(InputSettings):
 class Case:
     """What is calibrated, and what it can be compared with."""
 
-    title: str
-    source: str
-    views: Views
+    sequence: Sequence
     reference: str
-    """What ``views.cameras.cameras``, where there are any, are: never used but for the comparison
+    """What the extrinsics of ``sequence.cameras``, where there are any, are: never used but for the comparison
     and the gauge.
     """
     notes: tuple[Diagnosis, ...] = ()
@@ -112,8 +113,8 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
         config["baselines"][config["triangulation"]], f"baselines.{config['triangulation']}"
     )
     case = in_unit(from_files(config), estimator) if config["keypoints"] else from_data(config)
-    cameras = case.views.cameras
-    views = case.views
+    cameras = case.sequence.cameras
+    points = case.sequence.undistorted()
     lengths = read_scale(config["scale"], cameras.names)
     sweep_temporaries(output)
     for name in RIG_FILES:  # of an earlier run: they must not pass for this one's
@@ -122,9 +123,9 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     estimate: RigEstimate = calibration(
         cameras.names,
         cameras.K,
-        torch.from_numpy(views.key_points).double(),
-        torch.from_numpy(views.confidence).double(),
-        torch.from_numpy(views.valid),
+        torch.from_numpy(points.pixels).double(),
+        torch.from_numpy(points.confidence).double(),
+        torch.from_numpy(points.valid),
         cameras.size,
         config["seed"],
     )
@@ -148,10 +149,10 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
     rigs = {"estimated": moved} | ({case.reference: cameras.cameras} if cameras.calibrated else {})
     seen_by = {name: _through(case, placed, rig) for name, rig in rigs.items() if placed}
     numbers = {
-        "data": case.title,
-        "source": case.source,
+        "data": case.sequence.title,
+        "source": case.sequence.source,
         "cameras_file": cameras.path,
-        "frames": len(views),
+        "frames": len(case.sequence),
         "seed": config["seed"],
         "scale": scale,
         "world": world,
@@ -167,17 +168,17 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
         ],
         "provenance": provenance(config["seed"]),
     }
-    points = gauge.points(estimate.points)
+    joints = gauge.points(estimate.points)
     estimated = estimate.estimated
     if chosen:
         recording = _through(case, chosen, moved)
-        points, estimated = triangulate_recording(recording, estimator)
+        joints, estimated = triangulate_recording(recording, estimator)
         write_rig(output, cameras.select(chosen), moved.index(chosen), numbers)
-        write_poses(output / "poses.npz", recording, points, estimated, numbers)
+        write_poses(output / "poses.npz", recording, joints, estimated, numbers)
     reference = (case.reference, cameras.cameras) if cameras.calibrated else None
     covariance = gauge.covariance(estimate.covariance)
     write_rig_figure(
-        output, numbers, moved, covariance, points, estimated, estimate.calibrated, reference
+        output, numbers, moved, covariance, joints, estimated, estimate.calibrated, reference
     )
     write_numbers(output, numbers)
     print_calibration(numbers)
@@ -194,7 +195,7 @@ def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
             else "no rig is written"
         )
         raise GhptDataError(
-            case.source,
+            case.sequence.source,
             "calibration",
             f"{errors[0].rstrip('.')}; {written}",
             f"See {display_path(output / 'report.md')}.",
@@ -209,55 +210,39 @@ def summary(numbers: dict[str, Any]) -> str:
 
 
 def from_files(config: Mapping[str, Any]) -> Case:
-    """The user's own key points and cameras."""
-    cameras = own_cameras(config, "intrinsics.toml")
-    points = own_key_points(config)
-    views = undistort_and_match(points, cameras, config["match"], config["views"])
-    title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
-    return Case(
-        title,
-        str(Path(config["keypoints"]).resolve()),
-        views,
-        "the file's own calibration",
-        people_note(points),
-    )
+    """Return the user's own key points and cameras."""
+    inputs = input_settings(config)
+    cameras = own_cameras(inputs, "intrinsics.toml")
+    people = own_people(inputs)
+    sequence = own_sequence(inputs, people, cameras, person=None)
+    return Case(sequence, "the file's own calibration", people_note(people))
 
 
-def in_unit(case: Case, estimator: Baseline) -> Case:
-    """With the file's own extrinsics in mm where the person tells their unit: they are compared
-    with.
+def in_unit(case: Case, estimator: Estimator) -> Case:
+    """Return the case with extrinsics in mm where the person tells their unit.
+
+    They are what the calibration is compared with.
     """
-    file = case.views.cameras
-    if file.unit_known or not file.calibrated or len(file) < 2:
-        return case
-    frames = frames_of_views(case.views, case.source, case.title)
-    file = decide_unit(file, frames.batch(frames.spread(MEASURED)), estimator, ask=False)
-    return replace(case, views=replace(case.views, cameras=file))
+    return replace(case, sequence=resolve_unit(case.sequence, estimator, ask=False))
 
 
-def people_note(points: KeyPoints) -> tuple[Diagnosis, ...]:
-    """A warning where one of several people was followed."""
-    several = {view: n for view, n in zip(points.views, points.several, strict=True) if n}
-    if not several:
+def people_note(people: Detections) -> tuple[Diagnosis, ...]:
+    """Return a warning where one of several people was followed."""
+    crowded = people.crowded_frames()
+    if not crowded:
         return ()
-    text = "several people in " + ", ".join(f"{n} frames of {view}" for view, n in several.items())
-    text += "; the one tracked best in each view was followed, and must be the same person in all"
-    return (
-        Diagnosis("several_people", "warning", tuple(several), text, float(max(several.values()))),
+    frames = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
+    text = (
+        f"several people in {frames}; "
+        "the one tracked best in each view was followed, and must be the same person in all"
     )
+    most = float(max(crowded.values()))
+    return (Diagnosis("several_people", "warning", tuple(crowded), text, most),)
 
 
 def from_data(config: Mapping[str, Any]) -> Case:
-    """One recording of a data set, whose true extrinsics serve the comparison alone."""
-    data, found = recording_of(config)
-    file = CameraSet.from_cameras(found.camera_names, found.cameras, path=data.source)
-    arrays = (
-        np.array(getattr(found, field)) for field in ("key_points", "confidence", "valid", "frame")
-    )
-    views = Views(file, *arrays, found.rate_hz)
-    return Case(
-        f"{found.name} of {display_name(data.name, data.source)}", data.source, views, "the truth"
-    )
+    """Return one recording of a data set, whose true extrinsics serve the comparison alone."""
+    return Case(recording_sequence(input_settings(config)), "the truth")
 
 
 def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
@@ -290,7 +275,21 @@ def _gauge(
 
 
 def _through(case: Case, views: list[int], cameras: Cameras) -> Recording:
-    return case.views.part(views).recording(case.title, cameras.index(views))
+    """Return the recording as a calibration of some of its cameras sees it."""
+    sequence = case.sequence.select_views(views)
+    points = sequence.undistorted()
+    return Recording(
+        name=sequence.title,
+        subject=sequence.title,
+        action="unknown",
+        rate_hz=sequence.rate_hz or float("nan"),
+        camera_names=sequence.cameras.names,
+        cameras=cameras.index(views),
+        key_points=points.pixels,
+        confidence=points.confidence,
+        valid=points.valid,
+        frame=sequence.frame,
+    )
 
 
 COMMAND = Command(name="calibrate", settings=dict, task=calibrate, summary=summary, files=files)

@@ -8,7 +8,7 @@ import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -23,13 +23,19 @@ from ghpt.calibration.check.mending import MENDED, write_mended
 from ghpt.calibration.check.setup import Setup, as_filed
 from ghpt.calibration.check.units import UNITS_MM
 from ghpt.commands.app import Command
-from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.calibrate import people_note
-from ghpt.commands.inputs import InputSettings, own_cameras, own_key_points, recording_of
+from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.inputs import (
+    find_recording,
+    input_settings,
+    own_cameras,
+    own_people,
+    own_sequence,
+)
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.train import display_path
 from ghpt.config import build, check_type, suggest
-from ghpt.data.formats.key_points import KeyPoints
+from ghpt.data.people.sequence import Sequence
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.files import atomic_write, remove, sweep_temporaries, write_json
@@ -44,8 +50,8 @@ _log = logging.getLogger(__name__)
 _HEADER = ["camera", "error px", "mended px"]
 
 
-class Settings(InputSettings):
-    """What `examine` needs of the configuration."""
+class Settings(TypedDict):
+    """What `examine` needs of the configuration beside the input."""
 
     spoil: str | None
     doctor: dict[str, Any]
@@ -61,10 +67,8 @@ class Patient:
     evidence: Evidence
     cameras: CameraSet
     setup: Setup
-    points: KeyPoints | None
-    """None for a demonstration."""
-    at: tuple[int, ...]
-    """Which of the key points' views are the evidence's."""
+    sequence: Sequence | None
+    """The user's key points; None for a demonstration."""
 
 
 def files(config: dict[str, Any]) -> Files:
@@ -92,7 +96,7 @@ def examine(config: dict[str, Any], output: Path) -> dict[str, Any]:
     numbers = _numbers(patient, checkup) | {"provenance": provenance(config["seed"])}
     mended = any(finding.mended for finding in checkup.findings)
     if mended:
-        write_mended(output, patient.cameras, checkup, patient.points, patient.at)
+        write_mended(output, patient.cameras, checkup, patient.sequence)
     write_json(output / "checkup.json", numbers)
     with atomic_write(output / "report.md", "w") as handle:
         handle.write(report(numbers))
@@ -124,15 +128,16 @@ def from_files(config: Mapping[str, Any], doctor: Doctor) -> Patient:
         raise GhptConfigError(
             "spoil", "is for demonstrations", "Leave it out, or leave out keypoints."
         )
-    file = own_cameras(config, "Calib.toml")
-    points = own_key_points(config)
-    evidence, cameras, at = gather(
-        points, file, config["match"] or {}, config["views"], doctor.frames, doctor.shift
-    )
-    for note in people_note(points):
+    inputs = input_settings(config)
+    file = own_cameras(inputs, "Calib.toml")
+    people = own_people(inputs)
+    sequence = own_sequence(inputs, people, file, person=None, check_sizes=False)
+    evidence = gather(sequence, doctor.frames, doctor.shift)
+    cameras = sequence.cameras
+    for note in people_note(people):
         _log.warning(note.text)
     title = f"{Path(config['cameras']).name} with {Path(config['keypoints']).resolve().name}"
-    return Patient(title, str(config["cameras"]), evidence, cameras, as_filed(cameras), points, at)
+    return Patient(title, str(config["cameras"]), evidence, cameras, as_filed(cameras), sequence)
 
 
 def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
@@ -143,7 +148,7 @@ def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
             "is a data set on disk",
             "Give keypoints and cameras, or the synthetic data.",
         )
-    data, found = recording_of(config)
+    data, found = find_recording(input_settings(config))
     evidence, cameras = from_recording(found, data, doctor, len(found))
     setup = as_filed(cameras)
     if config["spoil"]:
@@ -156,7 +161,7 @@ def from_data(config: Mapping[str, Any], doctor: Doctor) -> Patient:
         f"{found.name} of {display_name(data.name, data.source)}"
         + f", spoilt: {config['spoil']}" * bool(config["spoil"])
     )
-    return Patient(title, data.source, evidence, cameras, setup, None, ())
+    return Patient(title, data.source, evidence, cameras, setup, None)
 
 
 def from_recording(

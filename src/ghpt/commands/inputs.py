@@ -1,24 +1,41 @@
-"""What calibrate.py, cameras.py and predict.py work on: people's own files, or one recording of a
-data set.
+"""What calibrate.py, cameras.py and predict.py work on.
+
+It is people's own files, or one recording of a data set.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypedDict
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
-from ghpt.config import build, suggest
+import numpy as np
+
+from ghpt.calibration.check.units import decide_unit
+from ghpt.commands.outputs import OutputSettings
+from ghpt.config import Target, build, settings, suggest
 from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.data.datasets.store import prepared
 from ghpt.data.formats.camera_files import read_cameras
-from ghpt.data.formats.key_points import KeyPoints, read_key_points
+from ghpt.data.formats.key_points import Detections, read_key_points
 from ghpt.data.formats.names import Name
+from ghpt.data.people.persons import person_sequence
+from ghpt.data.people.sequence import KeyPointArrays, Sequence
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import CameraSet
-from ghpt.observations import LabelledRecording
+from ghpt.models.estimators.classical import Estimator
+from ghpt.observations import Recording
+from ghpt.report.tables import display_name
+
+_UNIT_FRAMES = 64
+"""Frames by which the person tells the unit of length."""
+_DEMONSTRATION = "S9/Walking-1"
 
 
-class InputSettings(TypedDict):
+@dataclass(frozen=True, kw_only=True)
+class InputSettings(OutputSettings):
     """The settings that name the input, alike in the three commands."""
 
     keypoints: str | None
@@ -31,34 +48,98 @@ class InputSettings(TypedDict):
     format: str | None
     rate_hz: float | None
     recording: str | None
-    data: dict[str, Any]
+    data: Target
 
 
-def own_cameras(config: Mapping[str, Any], example: str) -> CameraSet:
-    """The user's camera file. Raises GhptConfigError, with ``example``, if none is named."""
-    if not config["cameras"]:
+def input_settings(config: Mapping[str, Any]) -> InputSettings:
+    """Return the input's part of a command's plain configuration."""
+    names = {field.name for field in fields(InputSettings)}
+    return settings(InputSettings, {name: config[name] for name in names if name in config})
+
+
+def own_cameras(inputs: InputSettings, example: str) -> CameraSet:
+    """Return the user's cameras. Raises GhptConfigError, with ``example``, if no file is named."""
+    if not inputs.cameras:
         raise GhptConfigError("cameras", "is missing", f"Name the file: cameras={example}")
-    return read_cameras(config["cameras"], config["subject"], config["unit_mm"])
+    return read_cameras(inputs.cameras, inputs.subject, inputs.unit_mm)
 
 
-def own_key_points(config: Mapping[str, Any]) -> KeyPoints:
-    """The user's key points, of one person in each view."""
-    return read_key_points(
-        config["keypoints"], config["skeleton"], config["rate_hz"], config["format"]
+def own_people(inputs: InputSettings) -> Detections:
+    """Return everybody in the user's key points."""
+    return read_key_points(_required_path(inputs), inputs.skeleton, inputs.rate_hz, inputs.format)
+
+
+def own_sequence(
+    inputs: InputSettings,
+    people: Detections,
+    cameras: CameraSet,
+    person: int | None,
+    check_sizes: bool = True,
+) -> Sequence:
+    """Return one person of the user's key points with their cameras.
+
+    The arguments are those of `person_sequence`, which says what is raised.
+    """
+    sequence = person_sequence(
+        people, cameras, inputs.match, inputs.views, person, own_title(inputs), check_sizes
     )
+    return replace(sequence, source=str(_required_path(inputs).resolve()))
 
 
-def recording_of(config: Mapping[str, Any]) -> tuple[KeyPointDataModule, LabelledRecording]:
-    """A recording of ``config["data"]`` by name; without a name S9/Walking-1 or the first."""
-    data = build(config["data"], "data")
-    made = {"source": data.source, "split": data.evaluate}
-    stored = prepared(
-        data.cache, data.cache_key(data.evaluate), lambda: data.generate(data.evaluate), made
-    )
+def own_title(inputs: InputSettings) -> str:
+    """Return what a report calls the user's files."""
+    name = _required_path(inputs).resolve().name
+    return f"{name} with {Path(inputs.cameras or '').name}"
+
+
+def _required_path(inputs: InputSettings) -> Path:
+    if not inputs.keypoints:
+        raise GhptConfigError("keypoints", "is missing", "Name the file or folder: keypoints=pose/")
+    return Path(inputs.keypoints)
+
+
+def find_recording(inputs: InputSettings) -> tuple[KeyPointDataModule, Recording]:
+    """Return a recording of the data set by name; without a name S9/Walking-1 or the first."""
+    data = build(inputs.data, "data")
+    provenance = {"source": data.source, "split": data.evaluate}
+    key = data.cache_key(data.evaluate)
+    stored = prepared(data.cache, key, lambda: data.generate(data.evaluate), provenance)
     recordings = {recording.name: recording for recording in stored}
-    name = config["recording"] or (
-        "S9/Walking-1" if "S9/Walking-1" in recordings else next(iter(recordings), "")
-    )
+    name = inputs.recording
+    if not name:
+        first = next(iter(recordings), "")
+        name = _DEMONSTRATION if _DEMONSTRATION in recordings else first
     if name not in recordings:
         raise GhptConfigError("recording", f"there is no {name!r}", suggest(name, recordings))
     return data, recordings[name]
+
+
+def recording_sequence(inputs: InputSettings) -> Sequence:
+    """Return a recording of the data set as a sequence, without its truth."""
+    data, recording = find_recording(inputs)
+    points = KeyPoints(
+        pixels=np.array(recording.key_points),
+        confidence=np.array(recording.confidence),
+        valid=np.array(recording.valid),
+    )
+    rate = float(recording.rate_hz)
+    return Sequence(
+        title=f"{recording.name} of {display_name(data.name, data.source)}",
+        source=data.source,
+        cameras=CameraSet.from_cameras(recording.camera_names, recording.cameras, path=data.source),
+        frame=np.array(recording.frame).astype(np.int64),
+        rate_hz=None if np.isnan(rate) else rate,
+        points=KeyPointArrays(points, points),
+    )
+
+
+def resolve_unit(sequence: Sequence, estimator: Estimator, ask: bool) -> Sequence:
+    """Return the sequence with cameras in mm where their file does not say its unit.
+
+    ``ask``: raise GhptDataError where the person does not tell it; see `decide_unit`.
+    """
+    cameras = sequence.cameras
+    if cameras.unit_known or not cameras.calibrated or len(cameras) < 2:
+        return sequence
+    observations = sequence.read(sequence.spread(_UNIT_FRAMES))
+    return replace(sequence, cameras=decide_unit(cameras, observations, estimator, ask))

@@ -5,43 +5,49 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, NotRequired
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int
 
+from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
-from ghpt.commands.calibrate import from_data
-from ghpt.commands.inputs import InputSettings, own_cameras
+from ghpt.commands.inputs import (
+    InputSettings,
+    own_cameras,
+    own_people,
+    own_sequence,
+    own_title,
+    recording_sequence,
+    resolve_unit,
+)
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
-from ghpt.commands.prediction.frames import (
-    Detected,
-    Frames,
-    Seen,
-    calibrated,
-    evidence,
-    frames_of_views,
-    in_unit,
-)
-from ghpt.commands.prediction.gaps import Gaps, after, gap_frames
+from ghpt.commands.prediction.gaps import Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
 from ghpt.commands.prediction.report import prediction_report, print_prediction, print_verdict
-from ghpt.commands.prediction.run import predicted
-from ghpt.commands.prediction.statistics import Estimate, counts, estimate_of, evaluate
-from ghpt.commands.prediction.stored import frames_of_stored, open_stored
-from ghpt.commands.prediction.verdict import Level, Measures
+from ghpt.commands.prediction.run import RunSettings, predict_shards
+from ghpt.commands.prediction.shards import Shards
+from ghpt.commands.prediction.statistics import (
+    Coverage,
+    Estimate,
+    Evaluation,
+    ScaledErrors,
+    evaluate,
+    measure_coverage,
+    pose_estimate,
+)
+from ghpt.commands.prediction.verdict import Judge, Level, Measures, Verdict
 from ghpt.commands.train import display_path
-from ghpt.config import build, check_type, suggest
-from ghpt.data.formats.key_points import read_people
-from ghpt.data.formats.skeletons import joints17
-from ghpt.data.people.views import as_one_person, undistort_and_match
+from ghpt.config import Target, build, suggest
+from ghpt.data.people.sequence import Sequence
+from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
-from ghpt.export import WRITERS, Scene
+from ghpt.export import WRITERS, Chunks, Evidence, Scene
 from ghpt.export.scene import origin_note
 from ghpt.files import atomic_write, sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
@@ -55,18 +61,27 @@ from ghpt.skeleton import JOINTS
 
 SHARDS = ".shards"
 """The folder of the shards, within the output. It may be deleted: the next run then starts anew."""
-_ALL = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if name in WRITERS)
+_OWN_FORMATS = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if name in WRITERS)
 """The formats that need no further package."""
-_TIMED = ("trc", "c3d")
+_TIMED_FORMATS = ("trc", "c3d")
 _log = logging.getLogger(__name__)
 
 
-class Settings(InputSettings):
-    """What `predict` needs of the configuration."""
+@dataclass(frozen=True)
+class EstimatorSettings:
+    """How key points become joints, without a checkpoint and with one."""
+
+    classical: Target
+    learned: Target
+
+
+@dataclass(frozen=True, kw_only=True)
+class PredictSettings(InputSettings):
+    """The settings of predict.py."""
 
     person: int
     ckpt: str | None
-    trust: NotRequired[list[str]]
+    trust: list[str]
     hypotheses: int | None
     triangulation: str
     fill: int | str | None
@@ -79,20 +94,35 @@ class Settings(InputSettings):
     shard_frames: int
     batch: int
     progress_bar: bool
-    baselines: dict[str, Any]
+    baselines: dict[str, Target]
     trainer: dict[str, Any]
     flips: bool
-    estimator: dict[str, Any]
-    view_weights: dict[str, Any]
+    estimator: EstimatorSettings
+    view_weights: Target
     fitted_frames: int
-    camera_check: dict[str, Any]
-    verdict: dict[str, Any]
+    camera_check: Target
+    verdict: Target
     strict: bool
     seed: int
 
+    def __post_init__(self) -> None:
+        for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
+            count = getattr(self, name)
+            check(count >= 1, name, f"is {count}", "Give 1 or more.")
+        if not self.ckpt:
+            _check_exists("triangulation", self.triangulation, self.baselines)
+        for name in self.compare:
+            _check_exists("compare", name, self.baselines)
+        for name in self.formats or ():
+            _check_exists("formats", name, WRITERS)
+
+
+def _check_exists(key: str, name: str, existing: Mapping[str, object]) -> None:
+    check(name in existing, key, f"there is no {name!r}", suggest(name, existing))
+
 
 @dataclass(frozen=True)
-class Chosen:
+class PoseEstimator:
     """The estimator of a prediction."""
 
     name: str
@@ -105,267 +135,344 @@ class Chosen:
     """What its results depend on, as plain data."""
 
 
-def files(config: dict[str, Any]) -> Files:
-    """What a prediction reads and writes. Raises GhptConfigError for settings that cannot work."""
-    check_type(config, Settings, "")
-    _check(config)
-    check_apart(config)
-    names = [WRITERS[name].file for name in config["formats"] or _ALL]
+@dataclass(frozen=True)
+class PredictionResult:
+    """What prediction.json holds."""
+
+    data: str
+    source: str
+    cameras: tuple[str, ...]
+    estimator: str
+    estimator_text: str
+    rate_hz: float | None
+    fill_frames: int | None
+    smooth_hz: float | None
+    coverage: Coverage
+    scales: ScaledErrors
+    unit_mm: float
+    evaluation: Evaluation
+    formats: list[str]
+    provenance: dict[str, Any]
+    verdict: Verdict | None = None
+
+    def plain(self) -> dict[str, Any]:
+        """Return the result as plain data; the coverage is not a group of its own."""
+        values: dict[str, Any] = {}
+        for key, value in asdict(self).items():
+            if key == "coverage":
+                values |= value
+            elif key == "verdict":
+                values |= {key: self.verdict.numbers()} if self.verdict else {}
+            else:
+                values[key] = value
+        return values
+
+
+def files(settings: PredictSettings) -> Files:
+    """Return what a prediction reads and writes."""
+    check_apart(settings.keypoints, settings.output)
+    root = settings.data.get("root")
+    names = [WRITERS[name].file for name in settings.formats or _OWN_FORMATS]
     return Files(
-        reads=input_paths(config),
+        reads=input_paths(settings.ckpt, settings.cameras, settings.keypoints, root),
         writes=(*names, "prediction.json", "report.md"),
         growing=(SHARDS,),
     )
 
 
-def predict(config: dict[str, Any], output: Path) -> dict[str, Any]:
-    """Predict the 3D joints of ``config["keypoints"]``, or of a recording of ``config["data"]``.
+def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
+    """Predict the 3D joints of the user's key points, or of a recording of the data set.
 
     Writes poses.<format>, prediction.json and report.md into ``output`` and prints the tables; the
-    shards that an interrupted run left are gone on with. Returns what prediction.json holds.
+    shards that an interrupted run left are gone on with. Returns what prediction.json holds, and
+    None in the processes beside the first.
     """
-    check_type(config, Settings, "")
-    _check(config)
-    chosen = choose(config)
+    estimator = build_estimator(settings)
     compared = {
-        name: build(config["baselines"][name], f"baselines.{name}") for name in config["compare"]
+        name: build(settings.baselines[name], f"baselines.{name}") for name in settings.compare
     }
-    camera_check = build(config["camera_check"], "camera_check")
-    judge = build(config["verdict"], "verdict")
-    frames = (
-        in_unit(from_files(config), camera_check.consensus) if config["keypoints"] else _from_data(config)
-    )
-    hertz = None if config["smooth"] is None else float(config["smooth"])
+    camera_check: CameraCheck = build(settings.camera_check, "camera_check")
+    judge: Judge = build(settings.verdict, "verdict")
+    sequence = open_sequence(settings, camera_check)
     gaps = Gaps(
-        gap_frames(config["fill"], frames.rate_hz), config["interpolation"], hertz, frames.rate_hz
+        longest=gap_frames(settings.fill, sequence.rate_hz),
+        interpolation=settings.interpolation,
+        cut_off_hz=settings.smooth,
+        rate_hz=sequence.rate_hz,
     )
-    unit = frames.detected.cameras.unit_mm if frames.detected else 1.0
-    origin = provenance(config["seed"])
-    about = About(
-        name=frames.title,
-        source=frames.source,
-        estimator=chosen.name,
-        joints=JOINTS,
-        camera_names=frames.camera_names,
-        rate_hz=frames.rate_hz,
-        smoothed=config["smooth"] is not None,
-        provenance=origin
-        | {
-            "estimator": chosen.text,
-            "settings": chosen.identity,
-            "fill_frames": gaps.longest,
-            "interpolation": gaps.interpolation,
-            "smooth_hz": gaps.cut_off_hz,
-            "camera_unit_mm": unit,
-        },
-        origin=tuple(frames.origin.tolist()),
-    )
-    formats = _formats(config, frames)
-    _tell_origin(about, formats)
+    origin = provenance(settings.seed)
+    about = _about(sequence, estimator, gaps, origin)
+    formats = _formats(settings, sequence)
+    _warn_of_origin(about, formats)
     _log.info(
         "%s: %d frames, %d views, by %s.",
-        frames.title,
-        len(frames),
-        len(frames.camera_names),
-        chosen.text,
+        sequence.title,
+        len(sequence),
+        len(about.camera_names),
+        estimator.text,
     )
     sweep_temporaries(output)
-    predictor = chosen.predictor.fitted(frames.batch(frames.spread(config["fitted_frames"])))
-    key = _key(frames, chosen, origin)
-    with predicted(frames, predictor, chosen.weights, output / SHARDS, key, config) as shards:
-        if shards is None:
-            return {}
-        with after(gaps, shards, len(JOINTS), output) as chunks:
-            scene = Scene(frames.cameras, lambda: evidence(frames, shards))
-            settings = {"trc": config["trc"], "html": {"scene": scene}, "rerun": {"scene": scene}}
-            for name in formats:
-                WRITERS[name].write(
-                    output / WRITERS[name].file, about, chunks, **settings.get(name, {})
-                )
-            found = counts(chunks(), about.joints, about.camera_names, len(frames))
-    estimates: dict[str, Estimate] = {chosen.name: estimate_of(predictor.rejecting_nothing())}
-    estimates |= {name: baseline for name, baseline in compared.items() if name != chosen.name}
-    evaluation = evaluate(
-        frames, chosen.flips, estimates, config["evaluated_frames"], config["batch"]
+    predictor = estimator.predictor.fitted(sequence.read(sequence.spread(settings.fitted_frames)))
+    key = _shard_key(sequence, estimator, origin)
+    how = RunSettings(
+        settings.shard_frames, settings.batch, settings.progress_bar, settings.trainer
     )
-    own = evaluation["estimators"][chosen.name]
-    numbers = {
-        "data": frames.title,
-        "source": frames.source,
-        "cameras": list(frames.camera_names),
-        "estimator": chosen.name,
-        "estimator_text": chosen.text,
-        "rate_hz": frames.rate_hz,
-        "fill_frames": gaps.longest,
-        "smooth_hz": gaps.cut_off_hz,
-        **found,
-        "scales": own["scales"],
-        "unit_mm": unit,
-        "evaluation": evaluation,
-        "formats": formats,
-        "provenance": about.provenance,
-    }
-    measures = Measures.from_numbers(numbers)
-    asks = camera_check.is_worthwhile(measures.view_errors)
-    mistakes = check_cameras(frames, camera_check) if asks else ()
-    verdict = judge(measures, mistakes, unit, commands_on(config, output))
-    numbers["verdict"] = verdict.numbers()
-    write_json(output / "prediction.json", numbers)
-    with atomic_write(output / "report.md", "w") as handle:
-        handle.write(prediction_report(numbers))
-    print_prediction(numbers)
-    files = ", ".join(WRITERS[name].file for name in formats)
-    _log.info("Written: %s and report.md in %s.", files, display_path(output))
-    print_verdict(numbers["verdict"])
-    if config["strict"] and verdict.level != Level.GOOD:
+    weights = estimator.weights
+    with predict_shards(sequence, predictor, weights, output / SHARDS, key, how) as shards:
+        if shards is None:
+            return None
+        with apply_gaps(gaps, shards, len(JOINTS), output) as chunks:
+            _write_formats(settings, output, about, chunks, formats, sequence, shards)
+            views = about.camera_names
+            coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
+    estimates: dict[str, Estimate] = {estimator.name: pose_estimate(predictor.rejecting_nothing())}
+    for name, other in compared.items():
+        estimates.setdefault(name, other)
+    evaluation = evaluate(
+        sequence, estimator.flips, estimates, settings.evaluated_frames, settings.batch
+    )
+    result = PredictionResult(
+        data=sequence.title,
+        source=sequence.source,
+        cameras=about.camera_names,
+        estimator=estimator.name,
+        estimator_text=estimator.text,
+        rate_hz=sequence.rate_hz,
+        fill_frames=gaps.longest,
+        smooth_hz=gaps.cut_off_hz,
+        coverage=coverage,
+        scales=evaluation.estimators[estimator.name].scales,
+        unit_mm=sequence.cameras.unit_mm,
+        evaluation=evaluation,
+        formats=formats,
+        provenance=about.provenance,
+    )
+    measures = _measures(result)
+    asked = camera_check.is_worthwhile(measures.view_errors)
+    mistakes = check_cameras(sequence, camera_check) if asked else ()
+    commands = commands_on(settings, settings.person, settings.ckpt, output)
+    verdict = judge(measures, mistakes, result.unit_mm, commands)
+    result = replace(result, verdict=verdict)
+    _write_report(result, output)
+    if settings.strict and verdict.level != Level.GOOD:
         worst = verdict.findings[0]
         problem = f"{verdict.level.words}: {worst.text}"
-        raise GhptDataError(frames.source, "verdict", problem, f"Next: {worst.command}")
-    return numbers
+        raise GhptDataError(sequence.source, "verdict", problem, f"Next: {worst.command}")
+    return result
 
 
-def summary(numbers: dict[str, Any]) -> str:
-    """What `predict` returned, in words."""
-    if not numbers:
-        return "done by the first process"
-    observed = f"{100 * numbers['share']['observed']:.1f} % observed"
-    return (
-        f"{numbers['data']}: {numbers['frames']} frames, {observed}, {numbers['verdict']['level']}"
+def _measures(result: PredictionResult) -> Measures:
+    """Return what the verdict rests on."""
+    rejected = result.coverage.share["rejected"]
+    placed = rejected + result.coverage.share["observed"]
+    return Measures(
+        stature_mm=result.coverage.stature_mm,
+        held_out_error=result.scales.all,
+        view_errors=result.scales.views,
+        rejected=rejected / placed if placed else 0.0,
     )
 
 
-def choose(config: dict[str, Any]) -> Chosen:
-    """The checkpoint's model, or without one the classical estimator. Raises GhptCheckpointError
-    for a model that does not predict poses.
+def summary(result: PredictionResult | None) -> str:
+    """Return in words what `predict` returned."""
+    if result is None or result.verdict is None:
+        return "done by the first process"
+    observed = f"{100 * result.coverage.share['observed']:.1f} % observed"
+    frames = f"{result.coverage.frames} frames"
+    return f"{result.data}: {frames}, {observed}, {result.verdict.level.words}"
+
+
+def build_estimator(settings: PredictSettings) -> PoseEstimator:
+    """Return the estimator of the checkpoint's model, or without one the classical estimator.
+
+    Raises GhptCheckpointError for a model that does not predict poses.
     """
-    kind = "learned" if config["ckpt"] else "classical"
-    settings = config["estimator"][kind] | ({} if config["flips"] else {"flips": None})
-    if not config["ckpt"]:
-        name = config["triangulation"]
-        text = (
-            f"{NAMES.get(name, name.replace('_', ' '))}, a classical estimator (no ckpt was given)"
-        )
-        estimator = config["baselines"][name]
-        predictor = build(settings, "estimator.classical")(
-            estimator=build(estimator, f"baselines.{name}")
-        )
-        return Chosen(
-            name, text, predictor, predictor.flips, None, settings | {"estimator": estimator}
-        )
-    changes = {"hypotheses": config["hypotheses"], "seed": config["seed"]}
-    model, trained = load_model(config["ckpt"], config.get("trust") or (), **changes)
+    if settings.ckpt:
+        return _learned_estimator(settings, settings.ckpt)
+    name = settings.triangulation
+    group = _with_flips(settings, settings.estimator.classical)
+    baseline = settings.baselines[name]
+    factory = build(group, "estimator.classical")
+    predictor: Classical = factory(estimator=build(baseline, f"baselines.{name}"))
+    shown = NAMES.get(name, name.replace("_", " "))
+    return PoseEstimator(
+        name=name,
+        text=f"{shown}, a classical estimator (no ckpt was given)",
+        predictor=predictor,
+        flips=predictor.flips,
+        weights=None,
+        identity=group | {"estimator": baseline},
+    )
+
+
+def _learned_estimator(settings: PredictSettings, ckpt: str) -> PoseEstimator:
+    changes = {"hypotheses": settings.hypotheses, "seed": settings.seed}
+    model, trained = load_model(ckpt, settings.trust, **changes)
     if not isinstance(model.problem, PoseTriangulation):
         problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
-        raise GhptCheckpointError(
-            config["ckpt"], problem, "Give one that train.py model=pose wrote."
-        )
-    digest = hashlib.sha256(Path(config["ckpt"]).read_bytes()).hexdigest()
-    text = f"the learned model of {Path(config['ckpt']).name}, trained on {trained['provenance'].get('data', 'unknown')}"
-    view_weights = build(config["view_weights"], "view_weights")(model)
-    predictor = build(settings, "estimator.learned")(view_weights=view_weights)
-    identity = settings | {
-        "view_weights": config["view_weights"],
-        "ckpt_sha256": digest,
-        "hypotheses": model.hypotheses,
-        "seed": config["seed"],
-    }
-    return Chosen("view_weights", text, predictor, predictor.flips, model, identity)
-
-
-def from_files(config: dict[str, Any]) -> Frames:
-    """The user's own key points and cameras."""
-    cameras = own_cameras(config, "Calib.toml")
-    calibrated(str(config["cameras"]), cameras)
-    title = f"{Path(config['keypoints']).resolve().name} with {Path(config['cameras']).name}"
-    rate = None if config["rate_hz"] is None else float(config["rate_hz"])
-    stored = (
-        open_stored(config["keypoints"], config["skeleton"], rate)
-        if config["format"] in (None, "npz")
-        else None
+        raise GhptCheckpointError(ckpt, problem, "Give one that train.py model=pose wrote.")
+    view_weights = build(settings.view_weights, "view_weights")(model)
+    group = _with_flips(settings, settings.estimator.learned)
+    predictor: Learned = build(group, "estimator.learned")(view_weights=view_weights)
+    data = trained["provenance"].get("data", "unknown")
+    return PoseEstimator(
+        name="view_weights",
+        text=f"the learned model of {Path(ckpt).name}, trained on {data}",
+        predictor=predictor,
+        flips=predictor.flips,
+        weights=model,
+        identity=group
+        | {
+            "view_weights": settings.view_weights,
+            "ckpt_sha256": hashlib.sha256(Path(ckpt).read_bytes()).hexdigest(),
+            "hypotheses": model.hypotheses,
+            "seed": settings.seed,
+        },
     )
-    if stored is not None:
-        return frames_of_stored(stored, cameras, config["match"], config["views"], title)
-    people = read_people(config["keypoints"], config["skeleton"], rate, config["format"])
-    points, at, ordered = as_one_person(
-        people, cameras, config["match"], config["views"], config["person"]
-    )
-    views = undistort_and_match(points, cameras, config["match"], config["views"])
 
-    def detected(rows: Int[np.ndarray, " N"]) -> Seen:
-        values = (
-            part[rows][:, at] for part in (points.key_points, points.confidence, points.valid)
-        )
-        return joints17(points.path, points.joints, *values)
 
-    several = dict(zip(people.views, (people.counts() > 1).sum(0).tolist(), strict=True))
-    if any(several.values()):
-        words = ", ".join(f"{n} frames of {view}" for view, n in several.items() if n)
+def _with_flips(settings: PredictSettings, group: Target) -> dict[str, Any]:
+    return dict(group) if settings.flips else dict(group) | {"flips": None}
+
+
+def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Sequence:
+    """Return what is predicted: the user's own key points, or a recording of the data set."""
+    if not settings.keypoints:
+        return data_sequence(settings)
+    sequence = _files_sequence(settings)
+    sequence.cameras.check_calibrated(sequence.source)
+    return resolve_unit(sequence, camera_check.consensus, ask=True)
+
+
+def data_sequence(settings: PredictSettings) -> Sequence:
+    """Return a recording of the data set."""
+    return recording_sequence(settings)
+
+
+def _files_sequence(settings: PredictSettings) -> Sequence:
+    cameras = own_cameras(settings, "Calib.toml")
+    cameras.check_calibrated(str(settings.cameras))
+    if settings.format in (None, "npz"):
+        path = str(settings.keypoints)
+        stored = open_stored(path, settings.skeleton, settings.rate_hz)
+        if stored is not None:
+            title = own_title(settings)
+            return stored_sequence(stored, cameras, settings.match, settings.views, title)
+    people = own_people(settings)
+    sequence = own_sequence(settings, people, cameras, settings.person)
+    crowded = people.crowded_frames()
+    if crowded:
+        words = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
         _log.warning(
-            "Several people are in %s: person %d is followed (person=).", words, config["person"]
+            "Several people are in %s: person %d is followed (person=).", words, settings.person
         )
-    frames = frames_of_views(views, str(Path(config["keypoints"]).resolve()), title)
-    return replace(frames, detected=Detected(ordered, detected))
+    return sequence
 
 
-def _from_data(config: dict[str, Any]) -> Frames:
-    case = from_data(config)
-    return frames_of_views(case.views, case.source, case.title)
+def _about(
+    sequence: Sequence, estimator: PoseEstimator, gaps: Gaps, origin: dict[str, Any]
+) -> About:
+    made = {
+        "estimator": estimator.text,
+        "settings": estimator.identity,
+        "fill_frames": gaps.longest,
+        "interpolation": gaps.interpolation,
+        "smooth_hz": gaps.cut_off_hz,
+        "camera_unit_mm": sequence.cameras.unit_mm,
+    }
+    x, y, z = sequence.origin.tolist()
+    return About(
+        name=sequence.title,
+        source=sequence.source,
+        estimator=estimator.name,
+        joints=JOINTS,
+        camera_names=sequence.cameras.names,
+        rate_hz=sequence.rate_hz,
+        smoothed=gaps.cut_off_hz is not None,
+        provenance=origin | made,
+        origin=(x, y, z),
+    )
 
 
-def _key(frames: Frames, chosen: Chosen, origin: dict[str, Any]) -> str:
-    """What shards depend on, in one word."""
-    made = {name: value for name, value in origin.items() if name != "command"}
+def _shard_key(sequence: Sequence, estimator: PoseEstimator, origin: dict[str, Any]) -> str:
+    """Return what shards depend on, in one word."""
     parts = {
-        "frames": frames.stamp(),
-        "estimator": chosen.name,
-        "settings": chosen.identity,
-        "made": made,
+        "frames": sequence.digest(),
+        "estimator": estimator.name,
+        "settings": estimator.identity,
+        "made": {name: value for name, value in origin.items() if name != "command"},
     }
-    return hashlib.sha256(json.dumps(parts, sort_keys=True, default=str).encode()).hexdigest()
+    text = json.dumps(parts, sort_keys=True, default=str)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _formats(config: dict[str, Any], frames: Frames) -> list[str]:
-    """Those that are asked for; without any all that are there, but for those that need a rate that
-    is not known.
+def _formats(settings: PredictSettings, sequence: Sequence) -> list[str]:
+    """Return the formats that are asked for.
+
+    Without any these are all that need no further package, but for those that need a rate where
+    none is known.
     """
-    if frames.rate_hz:
-        return config["formats"] or list(_ALL)
-    for name in config["formats"] or ():
-        check(
-            name not in _TIMED,
-            "rate_hz",
-            f"is unknown, and {name} needs it",
-            "Give rate_hz=60, say.",
-        )
-    if config["formats"] is None:
-        _log.warning(
-            "The files do not tell the frame rate: no %s. Give rate_hz=60, say.",
-            " and ".join(_TIMED),
-        )
-    return config["formats"] or [name for name in _ALL if name not in _TIMED]
+    if sequence.rate_hz:
+        return settings.formats or list(_OWN_FORMATS)
+    for name in settings.formats or ():
+        problem = f"is unknown, and {name} needs it"
+        check(name not in _TIMED_FORMATS, "rate_hz", problem, "Give rate_hz=60, say.")
+    if settings.formats is None:
+        timed = " and ".join(_TIMED_FORMATS)
+        _log.warning("The files do not tell the frame rate: no %s. Give rate_hz=60, say.", timed)
+    return settings.formats or [name for name in _OWN_FORMATS if name not in _TIMED_FORMATS]
 
 
-def _tell_origin(about: About, formats: list[str]) -> None:
+def _warn_of_origin(about: About, formats: list[str]) -> None:
     """Say which files are not in the world's own millimetres, and from where they count."""
-    files = [WRITERS[name].file for name in formats if WRITERS[name].single]
-    if files and any(about.origin):
+    single = [WRITERS[name].file for name in formats if WRITERS[name].single]
+    if single and any(about.origin):
         text = "The rig is far from its world's zero: in %s, which have single precision, %s."
-        _log.warning(text, ", ".join(files), origin_note(about))
+        _log.warning(text, ", ".join(single), origin_note(about))
 
 
-def _check(config: dict[str, Any]) -> None:
-    for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
-        check(config[name] >= 1, name, f"is {config[name]}", "Give 1 or more.")
-    for key, names, existing in (
-        ("triangulation", [] if config["ckpt"] else [config["triangulation"]], config["baselines"]),
-        ("compare", config["compare"], config["baselines"]),
-        ("formats", config["formats"] or [], WRITERS),
-    ):
-        for name in names:
-            check(name in existing, key, f"there is no {name!r}", suggest(name, existing))
+def _write_formats(
+    settings: PredictSettings,
+    output: Path,
+    about: About,
+    chunks: Chunks,
+    formats: list[str],
+    sequence: Sequence,
+    shards: Shards,
+) -> None:
+    scene = Scene(sequence.cameras.cameras, lambda: _evidence(sequence, shards))
+    arguments: dict[str, dict[str, Any]] = {
+        "trc": settings.trc,
+        "html": {"scene": scene},
+        "rerun": {"scene": scene},
+    }
+    for name in formats:
+        writer = WRITERS[name]
+        writer.write(output / writer.file, about, chunks, **arguments.get(name, {}))
 
 
-COMMAND = Command(name="predict", settings=dict, task=predict, summary=summary, files=files)
+def _evidence(sequence: Sequence, shards: Shards) -> Iterator[Evidence]:
+    """Yield the key points of each shard."""
+    for shard in range(len(shards)):
+        observations = sequence.read(np.array(shards.rows(shard)))
+        yield Evidence(observations.key_points, observations.valid, None)
+
+
+def _write_report(result: PredictionResult, output: Path) -> None:
+    """Write prediction.json and report.md, and print the tables and the verdict."""
+    values = result.plain()
+    write_json(output / "prediction.json", values)
+    with atomic_write(output / "report.md", "w") as handle:
+        handle.write(prediction_report(values))
+    print_prediction(values)
+    written = ", ".join(WRITERS[name].file for name in result.formats)
+    _log.info("Written: %s and report.md in %s.", written, display_path(output))
+    print_verdict(values["verdict"])
+
+
+COMMAND = Command(
+    name="predict", settings=PredictSettings, task=predict, summary=summary, files=files
+)
 
 
 if __name__ == "__main__":

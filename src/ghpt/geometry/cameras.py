@@ -153,6 +153,19 @@ class CameraSet:
             raise GhptDataError(self.path, "rotation, translation", problem, _CALIBRATE)
         return Cameras(self.K, self.R, self.t)
 
+    def check_calibrated(self, where: str) -> None:
+        """Raise GhptDataError unless there are two cameras or more, with extrinsics.
+
+        ``where`` is what the views are of: a file of cameras or of key points.
+        """
+        if len(self) < 2:
+            problem = f"there is only {', '.join(self.names) or 'none'}"
+            hint = "A place in space takes two views or more of the same moment."
+            raise GhptDataError(where, "views", problem, hint)
+        if not self.calibrated:
+            problem = "not all cameras have extrinsics"
+            raise GhptDataError(self.path, "rotation, translation", problem, _CALIBRATE)
+
     @property
     def image_size(self) -> Int[Tensor, "V 2"]:
         """Width and height, pixels; twice the principal point where ``size`` is not known."""

@@ -13,14 +13,14 @@ from rich.table import Table
 from rich.text import Text
 from torch import Tensor
 
-from ghpt.models.estimators.classical import Baseline
-from ghpt.models.relative_pose.scale import SEGMENTS
+from ghpt.models.estimators.classical import Estimator
+from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.observations import Recording
 from ghpt.report.escape import escaped, plain
 from ghpt.report.rig_comparison import (
     held_out_errors,
     rig_difference,
-    segment_variation,
+    bone_variation,
     triangulate_recording,
 )
 from ghpt.report.tables import NONE, markdown
@@ -29,7 +29,7 @@ Numbers = dict[str, Any]
 _COLOURS = {"error": "red", "warning": "yellow"}
 
 
-def explains(recordings: Mapping[str, Recording], estimator: Baseline, frames: int) -> Numbers:
+def explains(recordings: Mapping[str, Recording], estimator: Estimator, frames: int) -> Numbers:
     """How well each calibration of the same key points explains them: name -> held-out-view errors
     (pixels) over the joints that all of them estimate, overall and by view, and the variation of
     the segments' lengths; over at most so many ``frames``, evenly spread.
@@ -44,12 +44,12 @@ def explains(recordings: Mapping[str, Recording], estimator: Baseline, frames: i
     result = {}
     for name, recording in recordings.items():
         errors = held_out[name][0]
-        variation, known = segment_variation(*triangulate_recording(recording, estimator))
+        variation, known = bone_variation(*triangulate_recording(recording, estimator))
         views = {
             view: _quantiles(errors[:, v][measured[:, v]])
             for v, view in enumerate(recording.camera_names)
         }
-        lengths = dict(zip(SEGMENTS, _known(variation, known), strict=True))
+        lengths = dict(zip(BONE_NAMES, _known(variation, known), strict=True))
         result[name] = {
             "held_out": _quantiles(errors[measured]) | {"views": views},
             "segments": {
@@ -181,7 +181,7 @@ _QUANTILES = ("median", "p90")
 def _segment_rows(explained: Numbers) -> list[list[str]]:
     each = [found["segments"]["each"] for found in explained.values()]
     return [
-        [name.replace("_", " "), *(_number(of[name], 1, 100) for of in each)] for name in SEGMENTS
+        [name.replace("_", " "), *(_number(of[name], 1, 100) for of in each)] for name in BONE_NAMES
     ]
 
 

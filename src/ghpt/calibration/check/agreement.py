@@ -11,7 +11,7 @@ from torch import Tensor
 from ghpt.calibration.check.setup import RayCache, Rays, Setup
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.estimators.classical import Baseline
+from ghpt.models.estimators.classical import Estimator
 from ghpt.observations import Observations
 
 LARGEST = 0.1
@@ -115,7 +115,7 @@ def core_of(pair_error: Float[Tensor, "P V"], level: float) -> Bool[Tensor, " V"
 
 
 def agreement(
-    cache: RayCache, setup: Setup, estimator: Baseline, level: float, most_pairs: int
+    cache: RayCache, setup: Setup, estimator: Estimator, level: float, most_pairs: int
 ) -> Agreement:
     """Return the views whose rays meet, and each view's held-out error."""
     rays = cache.all(setup)
@@ -132,7 +132,7 @@ def agreement(
 
 
 def triangulated(
-    rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: Baseline
+    rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: Estimator
 ) -> tuple[Float[Tensor, "G F J 3"], Bool[Tensor, "G F J"]]:
     """Return the points of G choices of views by an estimator, in the cameras' unit."""
     groups = len(used)

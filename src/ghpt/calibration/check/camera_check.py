@@ -28,7 +28,7 @@ from ghpt.calibration.mistakes import (
     size_finding,
 )
 from ghpt.errors import check, check_positive
-from ghpt.models.estimators.classical import Baseline
+from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import stature
 
 
@@ -69,7 +69,7 @@ class CameraCheck:
     many: int
     suspicious: float
     thresholds: Thresholds
-    consensus: Baseline
+    consensus: Estimator
 
     def __post_init__(self) -> None:
         check_positive(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,12 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.data.formats.key_points import KeyPoints
-from ghpt.data.formats.names import Name
-from ghpt.data.formats.skeletons import joints17
-from ghpt.data.people.views import check_pixels, matched
+from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError
-from ghpt.geometry.cameras import CameraSet
 
 _LEAST_JOINTS = 6
 """Seen in two views for a frame to be looked at."""
@@ -46,55 +42,32 @@ class Evidence:
         return (self.valid.shape[1] - 1) // 2
 
 
-@dataclass(frozen=True)
-class Gathered:
-    """The evidence of a recording, and what it is of."""
-
-    evidence: Evidence
-    cameras: CameraSet
-    """In the order of the views."""
-    views: tuple[int, ...]
-    """Which of the key points' views these are."""
-
-
-def gather(
-    points: KeyPoints,
-    cameras: CameraSet,
-    match: Mapping[Name, Name],
-    views: Sequence[Name] | None,
-    frames: int,
-    max_shift: int,
-) -> Gathered:
+def gather(sequence: Sequence, frames: int, max_shift: int) -> Evidence:
     """Return at most ``frames`` frames, evenly spread over those in which people are seen.
 
-    ``max_shift``: the largest shift, at most a quarter of the frames.
-
-    Raises GhptDataError where views and cameras do not match, without extrinsics, with fewer than
-    two views, and for key points that are no pixels.
+    ``max_shift``: the largest shift, at most a quarter of the frames. Raises GhptDataError without
+    extrinsics, with fewer than two views, and if no frame shows enough.
     """
-    pairs = matched(points.path, points.views, cameras, match, views)
-    if len(pairs) < 2:
-        problem = f"{len(pairs)} with a camera"
-        raise GhptDataError(points.path, "views", problem, "Give two views or more.")
-    ordered = cameras.select([camera for _, camera in pairs])
-    if not ordered.calibrated:
+    cameras = sequence.cameras
+    if len(cameras) < 2:
+        problem = f"{len(cameras)} with a camera"
+        raise GhptDataError(sequence.source, "views", problem, "Give two views or more.")
+    if not cameras.calibrated:
         problem = "are missing: there is nothing to check"
         hint = "Calibrate them first: python calibrate.py --help"
         raise GhptDataError(cameras.path, "extrinsics", problem, hint)
-    at = [view for view, _ in pairs]
-    evidence = _of_points(points, at, ordered, frames, max_shift)
-    return Gathered(evidence, ordered, tuple(at))
+    return gather_rows(sequence, np.arange(len(sequence)), frames, max_shift)
 
 
-def _of_points(
-    points: KeyPoints, views: list[int], cameras: CameraSet, frames: int, max_shift: int
+def gather_rows(
+    sequence: Sequence, rows: Int[np.ndarray, " N"], frames: int, max_shift: int
 ) -> Evidence:
-    given = points.key_points[:, views]
-    valid = points.valid[:, views]
-    check_pixels(points.path, given, valid, cameras)
-    confidence = points.confidence[:, views]
-    pixels, _, known = joints17(points.path, points.joints, given, confidence, valid)
-    return choose(cameras.names, pixels, known, points.frame, frames, max_shift, points.path)
+    """Return the evidence of some frames of a sequence, as `gather` does of all."""
+    points = sequence.detected(rows)
+    pixels = points.pixels.astype(np.float64)
+    names = sequence.cameras.names
+    valid = np.array(points.valid)
+    return choose(names, pixels, valid, sequence.frame[rows], frames, max_shift, sequence.source)
 
 
 def choose(

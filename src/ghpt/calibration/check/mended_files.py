@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,8 +11,9 @@ from ghpt.calibration.check.camera_check import CameraCheckResult
 from ghpt.calibration.check.evidence import moment
 from ghpt.calibration.check.setup import Setup
 from ghpt.data.formats.camera_writers import write_pose2sim
-from ghpt.data.formats.key_points import KeyPoints, write_key_points
-from ghpt.data.formats.skeletons import joints17
+from ghpt.data.formats.key_points import write_key_points
+from ghpt.data.people.sequence import Sequence
+from ghpt.data.points import KeyPoints
 from ghpt.geometry.cameras import CameraSet
 from ghpt.skeleton import JOINTS, MIRROR
 
@@ -23,22 +23,18 @@ MENDED = (CAMERAS_FILE, KEY_POINTS_FILE)
 
 
 def write_mended(
-    output: Path,
-    cameras: CameraSet,
-    result: CameraCheckResult,
-    points: KeyPoints | None,
-    views: Sequence[int],
+    output: Path, cameras: CameraSet, result: CameraCheckResult, sequence: Sequence | None
 ) -> None:
     """Write the mended cameras, and the mended key points where a view was shifted, thinned to the
     others' frames, mirrored or its sides exchanged.
 
-    Exchanged views are mended by their cameras' names alone. ``views``: which of the key points'
-    views the cameras are of.
+    Exchanged views are mended by their cameras' names alone.
     """
     setup = result.setup
+    names = tuple(cameras.names[source] for source in setup.source)
     rig = replace(
         cameras,
-        names=_names(cameras, setup),
+        names=names,
         K=setup.K,
         R=setup.R,
         t=setup.t,
@@ -47,49 +43,28 @@ def write_mended(
     )
     mended = "; ".join(finding.text for finding in result.findings if finding.mended)
     write_pose2sim(output / CAMERAS_FILE, rig, {"adjusted": True, "mended": mended})
-    if points is not None and _changes_points(setup):
-        write_key_points(output / KEY_POINTS_FILE, mend_points(points, views, cameras, setup))
+    if sequence is not None and _changes_points(setup):
+        points = mend_points(sequence, setup)
+        path = output / KEY_POINTS_FILE
+        write_key_points(path, names, JOINTS, sequence.frame, points, sequence.rate_hz)
 
 
-def mend_points(
-    points: KeyPoints, views: Sequence[int], cameras: CameraSet, setup: Setup
-) -> KeyPoints:
-    """Return the key points as the mended cameras are given them, in their order and by their
-    names.
-    """
-    at = list(views)
-    given, confidence, valid = joints17(
-        points.path,
-        points.joints,
-        points.key_points[:, at],
-        points.confidence[:, at],
-        points.valid[:, at],
-    )
-    new_points = given.astype(np.float64)
-    new_confidence = confidence.astype(np.float64)
-    new_valid = valid.copy()
+def mend_points(sequence: Sequence, setup: Setup) -> KeyPoints:
+    """Return the key points as the mended cameras are given them, in their order."""
+    given = sequence.detected()
+    pixels = given.pixels.astype(np.float64)
+    confidence = given.confidence.astype(np.float64)
+    valid = given.valid.copy()
     for view, source in enumerate(setup.source):
-        rows, exists = moment(points.frame, setup.rate[view], setup.shift[view])
+        rows, exists = moment(sequence.frame, setup.rate[view], setup.shift[view])
         order = list(MIRROR) if setup.sides[view] else slice(None)
-        new_points[:, view] = given[rows, source][:, order]
-        new_confidence[:, view] = confidence[rows, source][:, order]
-        new_valid[:, view] = valid[rows, source][:, order] & exists[:, None]
+        own = given[rows, source]
+        pixels[:, view] = own.pixels[:, order]
+        confidence[:, view] = own.confidence[:, order]
+        valid[:, view] = own.valid[:, order] & exists[:, None]
         if setup.mirrored[view]:
-            new_points[:, view, :, 0] = setup.width[view] - 1 - new_points[:, view, :, 0]
-    several = tuple(points.several[at[source]] for source in setup.source)
-    return replace(
-        points,
-        views=_names(cameras, setup),
-        joints=JOINTS,
-        key_points=new_points,
-        confidence=new_confidence,
-        valid=new_valid,
-        several=several,
-    )
-
-
-def _names(cameras: CameraSet, setup: Setup) -> tuple[str, ...]:
-    return tuple(cameras.names[source] for source in setup.source)
+            pixels[:, view, :, 0] = setup.width[view] - 1 - pixels[:, view, :, 0]
+    return KeyPoints(pixels, confidence, valid)
 
 
 def _changes_points(setup: Setup) -> bool:

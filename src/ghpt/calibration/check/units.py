@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
-from ghpt.models.estimators.classical import Baseline
+from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.relative_pose.scale import HUMAN, STATURES, stature
 from ghpt.observations import Observations
@@ -42,7 +42,7 @@ def unit_for(height: float) -> float:
 
 
 def decide_unit(
-    cameras: CameraSet, batch: Observations, estimator: Baseline, ask: bool
+    cameras: CameraSet, batch: Observations, estimator: Estimator, ask: bool
 ) -> CameraSet:
     """Return the cameras in mm, by the size of the person whom they show in these frames.
 

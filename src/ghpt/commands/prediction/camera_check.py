@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Int
 
 from ghpt.calibration.check.camera_check import CameraCheck
-from ghpt.calibration.check.evidence import choose
+from ghpt.calibration.check.evidence import gather_rows
 from ghpt.calibration.check.setup import setup_of
 from ghpt.calibration.findings import Finding
-from ghpt.commands.prediction.frames import Frames
+from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError
 
 _WHOLE = 2048
@@ -17,28 +17,16 @@ _WHOLE = 2048
 _WINDOWS = 12
 
 
-def check_cameras(frames: Frames, camera_check: CameraCheck) -> tuple[Finding, ...]:
+def check_cameras(sequence: Sequence, camera_check: CameraCheck) -> tuple[Finding, ...]:
     """Return what the camera check finds on a bounded number of frames; nothing where no frame
     shows enough.
     """
-    if frames.detected is None:
-        return ()
-    rows = _windows(len(frames))
-    cameras = frames.detected.cameras
-    pixels, _, valid = frames.detected.read(rows)
+    rows = _windows(len(sequence))
     try:
-        evidence = choose(
-            cameras.names,
-            np.asarray(pixels, np.float64),
-            np.array(valid),
-            frames.frame[rows],
-            camera_check.frames,
-            camera_check.shift,
-            frames.source,
-        )
+        evidence = gather_rows(sequence, rows, camera_check.frames, camera_check.shift)
     except GhptDataError:  # no frame has enough joints in two views: nothing can be told
         return ()
-    return camera_check(evidence, setup_of(cameras)).findings
+    return camera_check(evidence, setup_of(sequence.cameras)).findings
 
 
 def _windows(count: int) -> Int[np.ndarray, " N"]:

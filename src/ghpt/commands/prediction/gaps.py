@@ -1,5 +1,6 @@
-"""Filling and smoothing, on request alone, and marked: nothing is invented outside of what was
-observed.
+"""Filling and smoothing, on request alone, and marked.
+
+Nothing is invented outside of what was observed.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Gaps:
     """What is done to a joint's path over the frames.
 
     ``longest``: gaps of at most so many frames are interpolated between the observed frames on both
-    sides (None: none); ``interpolation``: ``pchip`` or ``linear``; ``cut_off_hz``: of a zero-phase
+    sides (None: none). ``interpolation``: ``pchip`` or ``linear``. ``cut_off_hz``: of a zero-phase
     Butterworth low-pass filter of fourth order over every run of frames with a position (None: no
     filter), which takes ``rate_hz``.
     """
@@ -44,21 +45,17 @@ class Gaps:
     rate_hz: float | None
 
     def __post_init__(self) -> None:
-        known = ("pchip", "linear")
-        check(
-            self.interpolation in known,
-            "interpolation",
-            f"is {self.interpolation!r}",
-            f"Existing: {known}.",
-        )
+        kinds = ("pchip", "linear")
+        problem = f"is {self.interpolation!r}"
+        check(self.interpolation in kinds, "interpolation", problem, f"Existing: {kinds}.")
         if self.cut_off_hz is None:
             return
-        rate = _known("smooth", self.rate_hz, "Give rate_hz=60, say.")
+        rate = _known_rate("smooth", self.rate_hz, "Give rate_hz=60, say.")
         hint = f"Give more than 0 and less than half the frame rate of {rate:g} Hz."
         check(0 < self.cut_off_hz < rate / 2, "smooth", f"is {self.cut_off_hz:g} Hz", hint)
 
     @property
-    def nothing(self) -> bool:
+    def changes_nothing(self) -> bool:
         return self.longest is None and self.cut_off_hz is None
 
     def __call__(
@@ -67,51 +64,63 @@ class Gaps:
         points: Float[np.ndarray, "T 3"],
         state: Int[np.ndarray, " T"],
     ) -> tuple[Float[np.ndarray, "T 3"], Int[np.ndarray, " T"]]:
-        """One joint's path, filled and smoothed, with its states; frames without a position keep
-        their reason.
+        """Return one joint's path, filled and smoothed, and its states.
+
+        Frames without a position keep their reason.
         """
         step = frame_step(frame)
         if self.longest is not None:
-            points, state = self._fill(frame, points, state, step)
+            points, state = self._fill(frame, points, state, step, self.longest)
         if self.cut_off_hz is not None:
             points = self._smooth(frame, points, state <= State.FILLED, step)
         return points, state
 
     def _fill(
-        self, frame: np.ndarray, points: np.ndarray, state: np.ndarray, step: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        known = np.flatnonzero(state == State.OBSERVED)
-        after = np.searchsorted(known, np.arange(len(frame)))
-        inside = (state != State.OBSERVED) & (after > 0) & (after < len(known))
-        rows = np.flatnonzero(inside)
-        left = known[after[rows] - 1]
-        right = known[after[rows]]
-        rows = rows[frame[right] - frame[left] <= (self.longest + 1) * step]
-        x = frame[known].astype(np.float64)
-        y = points[known].astype(np.float64)
+        self,
+        frame: Int[np.ndarray, " T"],
+        points: Float[np.ndarray, "T 3"],
+        state: Int[np.ndarray, " T"],
+        step: int,
+        longest: int,
+    ) -> tuple[Float[np.ndarray, "T 3"], Int[np.ndarray, " T"]]:
+        observed = np.flatnonzero(state == State.OBSERVED)
+        following = np.searchsorted(observed, np.arange(len(frame)))
+        inside = (following > 0) & (following < len(observed))
+        rows = np.flatnonzero(inside & (state != State.OBSERVED))
+        before = observed[following[rows] - 1]
+        after = observed[following[rows]]
+        rows = rows[frame[after] - frame[before] <= (longest + 1) * step]
         points = points.copy()
         state = state.copy()
         if len(rows):
-            points[rows] = _interpolated(x, y, frame[rows].astype(np.float64), self.interpolation)
+            times = frame.astype(np.float64)
+            known = points[observed].astype(np.float64)
+            points[rows] = _interpolate(times[observed], known, times[rows], self.interpolation)
             state[rows] = State.FILLED
         return points, state
 
     def _smooth(
-        self, frame: np.ndarray, points: np.ndarray, placed: Bool[np.ndarray, " T"], step: int
-    ) -> np.ndarray:
+        self,
+        frame: Int[np.ndarray, " T"],
+        points: Float[np.ndarray, "T 3"],
+        has_position: Bool[np.ndarray, " T"],
+        step: int,
+    ) -> Float[np.ndarray, "T 3"]:
         sections = butter(_ORDER, self.cut_off_hz, fs=self.rate_hz, output="sos")
         points = points.copy()
-        for run in runs(frame, placed, step):
+        for run in unbroken_runs(frame, has_position, step):
             if len(run) > 1:
                 padding = min(3 * (_ORDER + 1), len(run) - 1)
-                points[run] = sosfiltfilt(
-                    sections, points[run].astype(np.float64), axis=0, padlen=padding
-                )
+                path = points[run].astype(np.float64)
+                points[run] = sosfiltfilt(sections, path, axis=0, padlen=padding)
         return points
 
 
 def gap_frames(fill: int | str | None, rate_hz: float | None) -> int | None:
-    """The longest gap in frames, of ``6`` or of seconds as ``0.1s``. Raises GhptConfigError."""
+    """Return the longest gap in frames, of ``6`` or of seconds as ``0.1s``.
+
+    Raises GhptConfigError.
+    """
     hint = "Give frames (fill=6) or seconds (fill=0.1s)."
     if fill is None:
         return None
@@ -121,34 +130,40 @@ def gap_frames(fill: int | str | None, rate_hz: float | None) -> int | None:
     seconds = re.fullmatch(r"(\d+\.?\d*|\.\d+) ?s", str(fill))
     if seconds is None:
         raise GhptConfigError("fill", f"is {fill!r}", hint)
-    rate = _known("fill", rate_hz, "Give rate_hz=60, say, or frames: fill=6.")
+    rate = _known_rate("fill", rate_hz, "Give rate_hz=60, say, or frames: fill=6.")
     frames = int(float(seconds[1]) * rate + 1e-9)
     check(frames >= 1, "fill", f"is less than a frame at {rate:g} Hz", hint)
     return frames
 
 
-def _known(key: str, rate_hz: float | None, hint: str) -> float:
-    """The frame rate. Raises GhptConfigError for ``key`` unless it is one."""
+def _known_rate(key: str, rate_hz: float | None, hint: str) -> float:
+    """Return the frame rate. Raises GhptConfigError for ``key`` unless it is one."""
     rate = rate_hz or math.nan
     check(0 < rate < math.inf, key, "needs the frame rate, which the files do not tell", hint)
     return rate
 
 
 def frame_step(frame: Int[np.ndarray, " T"]) -> int:
-    """How far the numbers of successive frames are apart: the median."""
+    """Return the median difference of the numbers of successive frames."""
     return int(np.median(np.diff(frame))) if len(frame) > 1 else 1
 
 
-def runs(
-    frame: Int[np.ndarray, " T"], placed: Bool[np.ndarray, " T"], step: int
+def unbroken_runs(
+    frame: Int[np.ndarray, " T"], has_position: Bool[np.ndarray, " T"], step: int
 ) -> list[Int[np.ndarray, " N"]]:
-    """The rows of each unbroken run of placed frames; a frame number that is left out breaks it."""
-    rows = np.flatnonzero(placed)
+    """Return the rows of each unbroken run of frames with a position.
+
+    A frame number that is left out breaks a run.
+    """
+    rows = np.flatnonzero(has_position)
     broken = (np.diff(rows) > 1) | (np.diff(frame[rows]) > step)
-    return [run for run in np.split(rows, np.flatnonzero(broken) + 1) if len(run)]
+    runs = np.split(rows, np.flatnonzero(broken) + 1)
+    return [run for run in runs if len(run)]
 
 
-def _interpolated(x: np.ndarray, y: np.ndarray, at: np.ndarray, kind: str) -> np.ndarray:
+def _interpolate(
+    x: Float[np.ndarray, " N"], y: Float[np.ndarray, "N 3"], at: Float[np.ndarray, " M"], kind: str
+) -> Float[np.ndarray, "M 3"]:
     if kind == "pchip":
         return PchipInterpolator(x, y, axis=0)(at)
     return np.stack([np.interp(at, x, y[:, i]) for i in range(3)], axis=-1)
@@ -156,8 +171,9 @@ def _interpolated(x: np.ndarray, y: np.ndarray, at: np.ndarray, kind: str) -> np
 
 @contextmanager
 def _scratch(folder: Path, dtype: str, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
-    """An array of zeros in a nameless file of ``folder``. Raises OSError if the disk lacks the
-    space.
+    """Yield an array of zeros in a nameless file of ``folder``.
+
+    Raises OSError if the disk lacks the space.
     """
     size = math.prod(shape) * np.dtype(dtype).itemsize
     with tempfile.TemporaryFile(dir=folder) as handle:
@@ -166,42 +182,42 @@ def _scratch(folder: Path, dtype: str, shape: tuple[int, ...]) -> Iterator[np.nd
 
 
 @contextmanager
-def after(gaps: Gaps, shards: Shards, joints: int, folder: Path) -> Iterator[Chunks]:
-    """The shards as they are to be written: as they are, or filled and smoothed.
+def apply_gaps(gaps: Gaps, shards: Shards, joints: int, folder: Path) -> Iterator[Chunks]:
+    """Yield the shards as they are to be written: as they are, or filled and smoothed.
 
     Joint by joint, each over all frames, so that no border between chunks shows: memory holds one
     joint's path, the others are in a nameless temporary file in ``folder``. Raises OSError if the
     disk lacks the space for it.
     """
-    if gaps.nothing:
+    if gaps.changes_nothing:
         yield shards.chunks
         return
     frames = shards.frames
-    paths = (joints, frames, 3)
-    states = (joints, frames)
-    with _scratch(folder, "<f8", paths) as points, _scratch(folder, "|i1", states) as state:
+    with (
+        _scratch(folder, "<f8", (joints, frames, 3)) as points,
+        _scratch(folder, "|i1", (joints, frames)) as state,
+    ):
         frame = np.zeros(frames, np.int64)
         for shard, part in enumerate(shards.chunks()):
-            rows = slice(shards.rows(shard).start, shards.rows(shard).stop)
+            rows = _as_slice(shards.rows(shard))
             frame[rows] = part.frame.numpy()
-            points[:, rows], state[:, rows] = (
-                part.points.numpy().transpose(1, 0, 2),
-                part.state.numpy().T,
-            )
+            points[:, rows] = part.points.numpy().transpose(1, 0, 2)
+            state[:, rows] = part.state.numpy().T
         for joint in range(joints):
-            points[joint], state[joint] = gaps(
-                frame, np.array(points[joint]), np.array(state[joint])
-            )
+            path = np.array(points[joint])
+            points[joint], state[joint] = gaps(frame, path, np.array(state[joint]))
 
         def chunks() -> Iterator[Reconstruction]:
             for shard, part in enumerate(shards.chunks()):
-                rows = slice(shards.rows(shard).start, shards.rows(shard).stop)
-                changed = (
-                    np.ascontiguousarray(points[:, rows].transpose(1, 0, 2)),
-                    np.ascontiguousarray(state[:, rows].T),
-                )
+                rows = _as_slice(shards.rows(shard))
+                new_points = np.ascontiguousarray(points[:, rows].transpose(1, 0, 2))
+                new_state = np.ascontiguousarray(state[:, rows].T)
                 yield replace(
-                    part, points=torch.from_numpy(changed[0]), state=torch.from_numpy(changed[1])
+                    part, points=torch.from_numpy(new_points), state=torch.from_numpy(new_state)
                 )
 
         yield chunks
+
+
+def _as_slice(rows: range) -> slice:
+    return slice(rows.start, rows.stop)

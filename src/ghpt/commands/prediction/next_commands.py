@@ -16,13 +16,16 @@ _HEIGHT = 1750
 """mm: stands for the person's own."""
 
 
-def commands_on(config: Mapping[str, Any], output: Path) -> Commands:
-    """The commands for what predict.py was given; each writes beside ``output``."""
-    inputs = {key: config[key] for key in InputSettings.__annotations__ if key != "data"}
-    given = {key: value for key, value in inputs.items() if value is not None}
-    if not config["keypoints"]:
-        given |= {"data": config["data"]["name"]}
-    own = {key: config[key] for key in ("person", "ckpt") if config[key]}
+def commands_on(inputs: InputSettings, person: int, ckpt: str | None, output: Path) -> Commands:
+    """Return the commands for what predict.py was given; each writes beside ``output``."""
+    keys = [key for key in InputSettings.__annotations__ if key != "data"]
+    values = {key: getattr(inputs, key) for key in keys}
+    given = {key: value for key, value in values.items() if value is not None}
+    if not inputs.keypoints:
+        given |= {"data": inputs.data["name"]}
+    own: dict[str, object] = {"person": person} if person else {}
+    if ckpt:
+        own["ckpt"] = ckpt
 
     def command(script: str, suffix: str, values: Mapping[str, Any]) -> str:
         words = [setting(key, value) for key, value in values.items()]

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.table import Table
 
 from ghpt.commands.prediction.verdict import verdict_lines
-from ghpt.models.relative_pose.scale import SEGMENTS
+from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.report.escape import code, escaped, plain
 from ghpt.report.tables import NAMES, NONE, markdown
 
@@ -111,7 +111,7 @@ def prediction_report(numbers: Numbers) -> str:
             name.replace("_", " "),
             *(number(found["segments"]["each"][name], 1, 100) for found in estimators.values()),
         ]
-        for name in SEGMENTS
+        for name in BONE_NAMES
     ]
     parts = [
         f"# Prediction of {escaped(numbers['data'])}",

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch.utils.data import DataLoader
 
 from ghpt.commands.lost import told
-from ghpt.commands.prediction.frames import Frames
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.train import display_path, make_trainer
+from ghpt.data.people.sequence import Sequence
 from ghpt.observations import Observations
 from ghpt.reconstruction import Reconstruction
 
@@ -27,124 +27,140 @@ Predictor = Callable[[Observations], Reconstruction]
 _log = logging.getLogger(__name__)
 
 
+@dataclass(frozen=True)
+class RunSettings:
+    """How a recording is worked through."""
+
+    shard_frames: int
+    """Frames of a shard: what an interruption costs at most."""
+    batch: int
+    """Frames that are predicted at a time."""
+    progress_bar: bool
+    trainer: Mapping[str, Any]
+
+
 class ShardPrediction(L.LightningModule):
-    """Predicts the shards that are missing; each process takes its share of them. ``weights``: what
-    moves to the device with it.
+    """Predict the shards that are missing; each process takes its share of them.
+
+    ``weights``: what moves to the device with it.
     """
 
     def __init__(
         self,
-        frames: Frames,
+        sequence: Sequence,
         predictor: Predictor,
         weights: torch.nn.Module | None,
         shards: Shards,
         batch: int,
-        bar: bool,
+        progress_bar: bool,
     ) -> None:
         super().__init__()
-        self.frames = frames
+        self.sequence = sequence
         self.predictor = predictor
         self.weights = weights
         self.shards = shards
-        self.size = batch
-        self.bar = bar
+        self.batch = batch
+        self.progress_bar = progress_bar
         self.pending = shards.missing()
-        self.tick: Callable[[int], None] = lambda frames: None
-        self.shown = ExitStack()
+        self.advance: Callable[[int], None] = lambda frames: None
+        self.bar = ExitStack()
         """To be closed however the prediction ends: a bar left open hides the terminal's cursor."""
 
     def predict_dataloader(self) -> DataLoader[int]:
-        mine = self.pending[self.trainer.global_rank :: self.trainer.world_size]
-        return DataLoader(mine, batch_size=None)  # type: ignore[arg-type]
+        # A list is all that a DataLoader needs of a data set, but its type says Dataset.
+        return DataLoader(self._own_shards(), batch_size=None)  # type: ignore[arg-type]
 
     @torch.no_grad()
     def predict_step(self, shard: int, batch_idx: int) -> int:
         rows = np.array(self.shards.rows(int(shard)))
         parts = []
-        for start in range(0, len(rows), self.size):
-            batch = self.frames.batch(rows[start : start + self.size]).to(self.device)
-            parts.append(self.frames.to_world(to_cpu(self.predictor(batch))))
-            self.tick(len(batch))
-        self.shards.write(int(shard), joined(parts))
+        for start in range(0, len(rows), self.batch):
+            batch = self.sequence.read(rows[start : start + self.batch]).to(self.device)
+            found = move_to_cpu(self.predictor(batch))
+            parts.append(self.sequence.to_world(found))
+            self.advance(len(batch))
+        self.shards.write(int(shard), concatenate(parts))
         return int(shard)
 
     def on_predict_start(self) -> None:
-        mine = self.pending[self.trainer.global_rank :: self.trainer.world_size]
-        frames = sum(len(self.shards.rows(shard)) for shard in mine)
-        self.tick = self.shown.enter_context(_bar(frames, self.bar and self.trainer.is_global_zero))
+        frames = sum(len(self.shards.rows(shard)) for shard in self._own_shards())
+        visible = self.progress_bar and self.trainer.is_global_zero
+        self.advance = self.bar.enter_context(_progress(frames, visible))
 
     def on_predict_end(self) -> None:
-        self.shown.close()
+        self.bar.close()
+
+    def _own_shards(self) -> list[int]:
+        return self.pending[self.trainer.global_rank :: self.trainer.world_size]
 
 
 @contextmanager
-def predicted(
-    frames: Frames,
+def predict_shards(
+    sequence: Sequence,
     predictor: Predictor,
     weights: torch.nn.Module | None,
     folder: Path,
     key: str,
-    settings: dict[str, Any],
+    settings: RunSettings,
 ) -> Iterator[Shards | None]:
-    """Predict what is missing of a recording's shards and yield them; None in the processes beside
-    the first.
+    """Predict what is missing of a recording's shards and yield them.
+
+    Yields None in the processes beside the first.
     """
-    ours = {
-        "logger": False,
-        "enable_checkpointing": False,
-        "enable_progress_bar": False,
-        "default_root_dir": folder,
-    }
-    trainer = make_trainer(settings["trainer"], **ours)
-    shards = Shards(
-        folder, key, len(frames), settings["shard_frames"], clean=trainer.is_global_zero
+    trainer = make_trainer(
+        dict(settings.trainer),
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        default_root_dir=folder,
     )
+    first = trainer.is_global_zero
+    shards = Shards(folder, key, len(sequence), settings.shard_frames, clean=first)
     module = ShardPrediction(
-        frames, predictor, weights, shards, settings["batch"], settings["progress_bar"]
+        sequence, predictor, weights, shards, settings.batch, settings.progress_bar
     )
-    with closing(shards), _stop_told(shards, trainer.is_global_zero):
+    with closing(shards), _report_stop(shards, first):
         if module.pending:
-            with module.shown, told(trainer):
+            with module.bar, told(trainer):
                 trainer.predict(module, return_predictions=False)
                 trainer.strategy.barrier()
             shards.look()
-        yield shards if trainer.is_global_zero else None
+        yield shards if first else None
 
 
 @contextmanager
-def _stop_told(shards: Shards, first: bool) -> Iterator[None]:
+def _report_stop(shards: Shards, first: bool) -> Iterator[None]:
     """Say what there is to go on from, if the block ends early."""
     try:
         yield
     except BaseException:
         if first:
             shards.look()
-            done = len(shards) - len(shards.missing())
-            _log.warning(
-                "Stopped. %d of %d shards are in %s.",
-                done,
-                len(shards),
-                display_path(shards.folder),
-            )
+            total = len(shards)
+            done = total - len(shards.missing())
+            folder = display_path(shards.folder)
+            _log.warning("Stopped. %d of %d shards are in %s.", done, total, folder)
             _log.warning("The same command goes on with them.")
         raise
 
 
-def to_cpu(part: Reconstruction) -> Reconstruction:
-    return Reconstruction(**{f.name: getattr(part, f.name).cpu() for f in fields(Reconstruction)})
+def move_to_cpu(part: Reconstruction) -> Reconstruction:
+    """Return the reconstruction in the memory of the CPU."""
+    values = {field.name: getattr(part, field.name).cpu() for field in fields(Reconstruction)}
+    return Reconstruction(**values)
 
 
-def joined(parts: list[Reconstruction]) -> Reconstruction:
-    """Successive parts as one."""
-    values = {
-        f.name: torch.cat([getattr(part, f.name) for part in parts]) for f in fields(Reconstruction)
-    }
+def concatenate(parts: list[Reconstruction]) -> Reconstruction:
+    """Return successive parts as one."""
+    values = {}
+    for field in fields(Reconstruction):
+        values[field.name] = torch.cat([getattr(part, field.name) for part in parts])
     return Reconstruction(**values)
 
 
 @contextmanager
-def _bar(frames: int, visible: bool) -> Iterator[Callable[[int], None]]:
-    """What is to be called with the number of frames done."""
+def _progress(frames: int, visible: bool) -> Iterator[Callable[[int], None]]:
+    """Show a bar; yields the function to call with the number of frames done."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),

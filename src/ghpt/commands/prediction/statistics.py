@@ -1,127 +1,141 @@
-"""What a reconstruction is worth, without a truth: coverage, reprojection, held-out views,
-constancy of lengths.
+"""What a reconstruction is worth, without a truth.
+
+Coverage, reprojection, errors in held-out views, and how constant the lengths of bones are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import replace
-from typing import Any
+from collections.abc import Sequence as Items
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.commands.prediction.frames import Frames
+from ghpt.data.people.sequence import Sequence
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
-from ghpt.models.relative_pose.scale import MEASURED_FRAMES, SEGMENTS, stature
+from ghpt.models.relative_pose.scale import MEASURED_FRAMES, stature
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import FILE_STATES, Reconstruction, State
-from ghpt.report.rig_comparison import segment_variation
+from ghpt.report.rig_comparison import BoneVariation, ViewErrors, bone_variations, view_errors
 
 Estimate = Callable[[Observations], PoseEstimate]
-Numbers = dict[str, Any]
 _LEAST = 20
 """Key points for a median that a verdict may rest on."""
 
 
-def counts(
-    chunks: Iterator[Reconstruction], joints: tuple[str, ...], cameras: tuple[str, ...], total: int
-) -> Numbers:
-    """Over all ``total`` frames: how many, what share of the joints is in each state, how many
-    views were exchanged, and the person's stature (mm; None where no limb is observed).
+@dataclass(frozen=True)
+class Coverage:
+    """What all frames of a reconstruction hold."""
+
+    frames: int
+    share: dict[str, float]
+    """Share of the joints in each state."""
+    observed: dict[str, float]
+    """Share of the frames in which each joint is observed."""
+    swapped: dict[str, int]
+    """Number of the frames in which each view had left and right exchanged."""
+    stature_mm: float | None
+    """The person's height; None where no bone is observed."""
+
+
+@dataclass(frozen=True)
+class ScaledErrors:
+    """Median errors in held-out views, in sizes of the person in the image.
+
+    None where fewer than ``_LEAST`` key points tell it.
     """
+
+    all: float | None
+    """None where two views leave none to hold out: ``views`` are then reprojection errors."""
+    views: dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class EstimatorErrors:
+    """What an estimator's joints are worth."""
+
+    reprojection: ViewErrors
+    held_out: ViewErrors
+    """In views that were held out, on the joints that all estimators estimate without them."""
+    segments: BoneVariation
+    placed: float
+    """Share of the joints that have a position."""
+    scales: ScaledErrors
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Estimators compared on the same frames of a recording."""
+
+    frames: int
+    estimators: dict[str, EstimatorErrors]
+
+
+def measure_coverage(
+    chunks: Iterator[Reconstruction], joints: tuple[str, ...], views: tuple[str, ...], total: int
+) -> Coverage:
+    """Return what the ``total`` frames of a reconstruction hold."""
     frames = 0
     states = torch.zeros(len(joints), len(FILE_STATES), dtype=torch.int64)
-    flipped = torch.zeros(len(cameras), dtype=torch.int64)
-    every = max(1, -(-total // MEASURED_FRAMES))
+    flipped = torch.zeros(len(views), dtype=torch.int64)
+    step = max(1, -(-total // MEASURED_FRAMES))
     points = []
     observed = []
     for chunk in chunks:
-        measured = slice(-frames % every, None, every)
+        measured = slice(-frames % step, None, step)
         points.append(chunk.points[measured].double())
         observed.append(chunk.state[measured] == State.OBSERVED)
         frames += len(chunk)
-        states += torch.stack([(chunk.state == state).sum(0) for state in FILE_STATES], dim=1)
+        counts = [(chunk.state == state).sum(0) for state in FILE_STATES]
+        states += torch.stack(counts, dim=1)
         flipped += chunk.flipped.sum(0)
-    share = {
-        state.name.lower(): float(states[:, state].sum()) / max(frames * len(joints), 1)
-        for state in FILE_STATES
-    }
-    each = (states[:, State.OBSERVED].double() / max(frames, 1)).tolist()
-    return {
-        "frames": frames,
-        "share": share,
-        "observed": dict(zip(joints, each, strict=True)),
-        "swapped": dict(zip(cameras, flipped.tolist(), strict=True)),
-        "stature_mm": float(stature(torch.cat(points), torch.cat(observed))) or None,
-    }
+    share = {}
+    for state in FILE_STATES:
+        count = float(states[:, state].sum())
+        share[state.name.lower()] = count / max(frames * len(joints), 1)
+    observed_share = (states[:, State.OBSERVED].double() / max(frames, 1)).tolist()
+    height = float(stature(torch.cat(points), torch.cat(observed)))
+    return Coverage(
+        frames=frames,
+        share=share,
+        observed=dict(zip(joints, observed_share, strict=True)),
+        swapped=dict(zip(views, flipped.tolist(), strict=True)),
+        stature_mm=height or None,
+    )
 
 
 @torch.no_grad()
 def evaluate(
-    frames: Frames,
+    sequence: Sequence,
     flips: LeftRightFlips | None,
     estimates: Mapping[str, Estimate],
     most: int,
-    size: int,
-) -> Numbers:
-    """For each estimator, on at most so many frames, evenly spread, and with ``flips`` undone for
-    all: reprojection errors by view; errors in views that were left out, on the joints that all of
-    them estimate without that view; variation of the segments' lengths.
+    batch_size: int,
+) -> Evaluation:
+    """Return the errors of each estimator on at most so many frames, evenly spread.
+
+    ``flips`` are undone for all estimators.
     """
-    rows = frames.spread(most)
-    parts = [
-        _undone(frames.batch(rows[start : start + size]), flips)
-        for start in range(0, len(rows), size)
-    ]
-    own = {name: [estimate(part) for part in parts] for name, estimate in estimates.items()}
-    held = {
-        name: [_held_out(part, estimate) for part in parts] for name, estimate in estimates.items()
-    }
-    counted = torch.stack(
-        [torch.cat([there for _, there in found]) for found in held.values()]
-    ).all(0)
-    valid = torch.cat([part.valid for part in parts])
-    result: Numbers = {}
-    for name in estimates:
-        placed = torch.cat([found.estimated for found in own[name]])
-        error = torch.cat(
-            [_errors(part, found) for part, found in zip(parts, own[name], strict=True)]
-        )
-        measured = valid & placed[:, None] & error.isfinite()
-        variation, known = segment_variation(
-            torch.cat([found.points.double() for found in own[name]]), placed
-        )
-        lengths = [
-            v if k else None for v, k in zip(variation.tolist(), known.tolist(), strict=True)
-        ]
-        result[name] = {
-            "reprojection": _by_view(error, measured, frames.camera_names),
-            "held_out": _by_view(
-                torch.cat([e for e, _ in held[name]]), counted, frames.camera_names
-            ),
-            "segments": {
-                "median": float(variation[known].median()) if known.any() else None,
-                "each": dict(zip(SEGMENTS, lengths, strict=True)),
-            },
-            "placed": float(placed.double().mean()),
-            "scales": _scales(
-                parts,
-                error,
-                measured,
-                [e for e, _ in held[name]],
-                [c for _, c in held[name]],
-                frames.camera_names,
-            ),
-        }
-    return {"frames": len(rows), "estimators": result}
+    rows = sequence.spread(most)
+    batches = []
+    for start in range(0, len(rows), batch_size):
+        batch = sequence.read(rows[start : start + batch_size])
+        batches.append(batch if flips is None else undo_flips(batch, flips)[0])
+    held_out = {name: _hold_out_views(batches, estimate) for name, estimate in estimates.items()}
+    common = torch.stack([found.valid for found in held_out.values()]).all(0)
+    names = sequence.cameras.names
+    errors = {}
+    for name, estimate in estimates.items():
+        errors[name] = _estimator_errors(batches, estimate, held_out[name], common, names)
+    return Evaluation(len(rows), errors)
 
 
-def estimate_of(predictor: Callable[[Observations], Reconstruction]) -> Estimate:
-    """What a predictor gives, as the other estimators give it."""
+def pose_estimate(predictor: Callable[[Observations], Reconstruction]) -> Estimate:
+    """Return a predictor as the other estimators are: observations to a PoseEstimate."""
 
     def estimate(batch: Observations) -> PoseEstimate:
         found = predictor(batch)
@@ -130,71 +144,76 @@ def estimate_of(predictor: Callable[[Observations], Reconstruction]) -> Estimate
     return estimate
 
 
-def _undone(batch: Observations, flips: LeftRightFlips | None) -> Observations:
-    return batch if flips is None else undo_flips(batch, flips)[0]
+@dataclass(frozen=True)
+class _Errors:
+    """Reprojection errors of key points, pixels, and which of them are measured."""
+
+    error: Float[Tensor, "T V J"]
+    valid: Bool[Tensor, "T V J"]
 
 
-def _errors(batch: Observations, found: PoseEstimate) -> Float[Tensor, "B V J"]:
+def _estimator_errors(
+    batches: Items[Observations],
+    estimate: Estimate,
+    held_out: _Errors,
+    common: Bool[Tensor, "T V J"],
+    names: tuple[str, ...],
+) -> EstimatorErrors:
+    found = [estimate(batch) for batch in batches]
+    points = torch.cat([poses.points.double() for poses in found])
+    estimated = torch.cat([poses.estimated for poses in found])
+    pairs = zip(batches, found, strict=True)
+    error = torch.cat([_reprojection(batch, poses) for batch, poses in pairs])
+    valid = torch.cat([batch.valid for batch in batches])
+    own = _Errors(error, valid & estimated[:, None] & error.isfinite())
+    return EstimatorErrors(
+        reprojection=view_errors(own.error, own.valid, names),
+        held_out=view_errors(held_out.error, common, names),
+        segments=bone_variations(points, estimated),
+        placed=float(estimated.double().mean()),
+        scales=_scaled_errors(batches, own, held_out, names),
+    )
+
+
+def _reprojection(batch: Observations, found: PoseEstimate) -> Float[Tensor, "B V J"]:
     return reprojection_error(batch.cameras, batch.key_points, found.points)
 
 
-def _held_out(
-    batch: Observations, estimate: Estimate
-) -> tuple[Float[Tensor, "B V J"], Bool[Tensor, "B V J"]]:
-    """For each view the distance of its key points from the joints that the others give, and where
-    there is one.
-    """
+def _hold_out_views(batches: Items[Observations], estimate: Estimate) -> _Errors:
+    """Return for each view the distance of its key points from the joints that the others give."""
+    parts = [_hold_out_in_batch(batch, estimate) for batch in batches]
+    error = torch.cat([part.error for part in parts])
+    return _Errors(error, torch.cat([part.valid for part in parts]))
+
+
+def _hold_out_in_batch(batch: Observations, estimate: Estimate) -> _Errors:
     errors = []
-    counted = []
+    measured = []
     for view in range(batch.valid.shape[1]):
-        valid = batch.valid.clone()
-        valid[:, view] = False
-        found = estimate(replace(batch, valid=valid))
-        error = _errors(batch, found)[:, view]
+        others = batch.valid.clone()
+        others[:, view] = False
+        found = estimate(replace(batch, valid=others))
+        error = _reprojection(batch, found)[:, view]
         errors.append(error)
-        counted.append(batch.valid[:, view] & found.estimated & error.isfinite())
-    return torch.stack(errors, dim=1), torch.stack(counted, dim=1)
+        measured.append(batch.valid[:, view] & found.estimated & error.isfinite())
+    return _Errors(torch.stack(errors, dim=1), torch.stack(measured, dim=1))
 
 
-def _scales(
-    parts: list[Observations],
-    error: Float[Tensor, "T V J"],
-    measured: Bool[Tensor, "T V J"],
-    held: list[Tensor],
-    counted: list[Tensor],
-    names: tuple[str, ...],
-) -> Numbers:
-    """Median errors in left-out views, in sizes of the person in the image; where two views leave
-    none, ``all`` is None and those of the views are reprojection errors. None for fewer than
-    ``_LEAST`` key points.
-    """
-    size = torch.cat([person_scale(part.key_points, part.valid) for part in parts])[
-        ..., None
-    ].double()
-    left_out = torch.cat(held)
-    there = torch.cat(counted) & (size > 0)
-    some = int(there.sum()) >= _LEAST
-    values, known = (left_out, there) if some else (error, measured & (size > 0))
-    relative = values / size.clamp(min=1e-12)
-
-    def middle(of: Tensor) -> float | None:
-        return float(of.median()) if len(of) >= _LEAST else None
-
-    views = {name: middle(relative[:, v][known[:, v]]) for v, name in enumerate(names)}
-    return {"all": middle(relative[known]) if some else None, "views": views}
+def _scaled_errors(
+    batches: Items[Observations], own: _Errors, held_out: _Errors, names: tuple[str, ...]
+) -> ScaledErrors:
+    scales = [person_scale(batch.key_points, batch.valid) for batch in batches]
+    scale = torch.cat(scales)[..., None].double()
+    measured = held_out.valid & (scale > 0)
+    enough = int(measured.sum()) >= _LEAST
+    error = held_out.error
+    if not enough:
+        error = own.error
+        measured = own.valid & (scale > 0)
+    relative = error / scale.clamp(min=1e-12)
+    views = {name: _median(relative[:, view][measured[:, view]]) for view, name in enumerate(names)}
+    return ScaledErrors(_median(relative[measured]) if enough else None, views)
 
 
-def _by_view(
-    errors: Float[Tensor, "T V J"], counted: Bool[Tensor, "T V J"], names: tuple[str, ...]
-) -> Numbers:
-    views = {name: quantiles(errors[:, v][counted[:, v]]) for v, name in enumerate(names)}
-    return quantiles(errors[counted]) | {"views": views}
-
-
-def quantiles(errors: Float[Tensor, " N"]) -> Numbers:
-    """Median and 90 %, the lower of two; None of nothing."""
-    if not len(errors):
-        return {"median": None, "p90": None, "count": 0}
-    ordered = errors.sort().values
-    middle, late = (float(ordered[int(q * (len(errors) - 1))]) for q in (0.5, 0.9))
-    return {"median": middle, "p90": late, "count": len(errors)}
+def _median(values: Float[Tensor, " N"]) -> float | None:
+    return float(values.median()) if len(values) >= _LEAST else None

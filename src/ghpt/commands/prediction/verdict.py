@@ -42,15 +42,6 @@ class Measures:
     rejected: float
     """The share of the joints with a position that no two views explain."""
 
-    @classmethod
-    def from_numbers(cls, numbers: Mapping[str, Any]) -> Measures:
-        """Return the measures that prediction.json holds."""
-        share = numbers["share"]
-        scales = numbers["scales"]
-        placed = share["rejected"] + share["observed"]
-        rejected = share["rejected"] / placed if placed else 0.0
-        return cls(numbers["stature_mm"], scales["all"], scales["views"], rejected)
-
 
 @dataclass(frozen=True)
 class Verdict:

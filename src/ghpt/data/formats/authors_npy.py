@@ -9,13 +9,14 @@ import numpy as np
 
 from ghpt.data.datasets.detections import in_image
 from ghpt.data.formats.validate import check_view_count, read_json, read_npy
-from ghpt.data.people.people import KeyPoints, joints_for
+from ghpt.data.people.detections import Detections, joints_for
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
 _LAYOUT = "A folder must hold all_2d_preds.npy and all_bboxes.npy, or all_2d_preds<n>.npy and all_bboxes<n>.npy."
 
 
-def read_authors(path: Path, skeleton: str | None) -> KeyPoints:
+def read_authors(path: Path, skeleton: str | None) -> Detections:
     """The one person of a folder of predictions [T, V, 17, 2] in pixels of the 384-high crop, or of
     its first file.
 
@@ -57,17 +58,10 @@ def read_authors(path: Path, skeleton: str | None) -> KeyPoints:
         raise GhptDataError(
             folder, "all_frames.npy", "is empty, or does not rise", "Number the frames in order."
         )
-    return KeyPoints(
-        str(path),
-        _names(folder, views),
-        joints_for(path, skeleton or "human36m", count),
-        frame,
-        points,
-        valid.astype(np.float64),
-        valid,
-        None,
-        (0,) * views,
-    )
+    names = _names(folder, views)
+    joints = joints_for(path, skeleton or "human36m", count)
+    key_points = KeyPoints(points, valid.astype(np.float64), valid)
+    return Detections.of_person(path, names, joints, frame, key_points)
 
 
 def _chunks(folder: Path, path: Path) -> list[tuple[Path, Path]]:

@@ -13,13 +13,12 @@ from jaxtyping import Float
 from ghpt.data.formats.json_views import json_files, view_name
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.formats.validate import check_view_count, read_json
-from ghpt.data.people.people import (
+from ghpt.data.people.detections import (
     Detections,
-    ViewDetections,
     check_people,
-    detections,
-    gather,
-    triples,
+    joint_values,
+    merge_views,
+    sort_people,
 )
 from ghpt.errors import GhptDataError
 
@@ -28,8 +27,7 @@ _Found = list[tuple[int, Float[np.ndarray, "K 3"]]]
 
 
 def read_coco(path: Path, skeleton: str | None) -> Detections:
-    """Everybody in COCO results: a folder with a file for each camera, or one file with the names
-    of the images.
+    """Return everybody in COCO results: a file for each camera, or one with the images' names.
 
     In a folder the file's name is the view's. In one file it is the folder of the image
     (``cam1/000012.jpg``), or the image's name before its last number (``cam1_000012.jpg``). The
@@ -37,18 +35,18 @@ def read_coco(path: Path, skeleton: str | None) -> Detections:
     without a name. 17 joints are COCO's. Raises GhptDataError.
     """
     files = json_files(path)
-    found: list[ViewDetections] = []
+    found: list[Detections] = []
     for file in files:
         views, frames = _views(file, named=path.is_dir())
-        found += [detections(file, view, frames[view], views[view]) for view in sorted(frames)]
-    coco = {view.values.shape[1] for view in found if len(view.values)} == {
-        len(SKELETONS["coco_17"])
-    }
-    return gather(path, found, SKELETONS["coco_17"] if coco else None, skeleton)
+        found += [sort_people(file, view, frames[view], views[view]) for view in sorted(frames)]
+    counts = {view.points.valid.shape[1] for view in found if len(view)}
+    if skeleton is None and counts == {len(SKELETONS["coco_17"])}:
+        skeleton = "coco_17"
+    return merge_views(path, found, skeleton)
 
 
 def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[int]]]:
-    """View -> (frame number, joints) of its people, and the numbers of its frames."""
+    """Return each view's people as (frame number, joints), and the numbers of its frames."""
     content = read_json(file)
     images = content.get("images", []) if isinstance(content, dict) else []
     people = content.get("annotations") if isinstance(content, dict) else content
@@ -60,8 +58,8 @@ def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[i
     names = {_key(image.get("id")): image.get("file_name") for image in images}
     views: dict[str, _Found] = defaultdict(list)
     frames: dict[str, list[int]] = defaultdict(list)
-    for image in names.items():
-        view, frame = _image(file, image[1] if isinstance(image[1], str) else image[0], named)
+    for image_id, name in names.items():
+        view, frame = _image(file, name if isinstance(name, str) else image_id, named)
         frames[view].append(frame)
     check_view_count(file, len(frames))
     places: dict[Any, tuple[str, int]] = {}
@@ -72,7 +70,7 @@ def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[i
             places[image_id] = _image(file, name if isinstance(name, str) else image_id, named)
             frames[places[image_id][0]].append(places[image_id][1])
             check_view_count(file, len(frames))
-        joints = triples(file, f"[{index}].keypoints", person.get("keypoints"))
+        joints = joint_values(file, f"[{index}].keypoints", person.get("keypoints"))
         if len(joints):
             view, frame = places[image_id]
             views[view].append((frame, joints))
@@ -84,7 +82,7 @@ def _key(image_id: Any) -> int | str | None:
 
 
 def _image(file: Path, image: int | str | None, named: bool) -> tuple[str, int]:
-    """View and frame number of an image's name or number."""
+    """Return the view and the frame number of an image's name or number."""
     if isinstance(image, str) and image.isdigit() and len(image) <= 15:
         image = int(image)
     if isinstance(image, int) and 0 <= image < 10**15:
@@ -92,14 +90,11 @@ def _image(file: Path, image: int | str | None, named: bool) -> tuple[str, int]:
     name = PurePosixPath(image.replace("\\", "/")) if isinstance(image, str) else PurePosixPath()
     digits = list(re.finditer(r"\d+", name.stem))
     if not digits or len(digits[-1][0]) > 15:
-        problem = (
-            f"{image!r} has no frame number"
-            if image is not None
-            else "an image has neither number nor name"
-        )
-        raise GhptDataError(
-            file, "image_id", problem, "Name the images like cam1/000012.jpg, or number them."
-        )
+        problem = f"{image!r} has no frame number"
+        if image is None:
+            problem = "an image has neither number nor name"
+        hint = "Name the images like cam1/000012.jpg, or number them."
+        raise GhptDataError(file, "image_id", problem, hint)
     before = name.stem[: digits[-1].start()].rstrip(" _.-")
     view = name.parent.name or before or view_name(file)
     return (view_name(file) if named else view), int(digits[-1][0])

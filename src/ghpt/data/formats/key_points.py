@@ -8,8 +8,6 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from ghpt.data.formats.authors_npy import read_authors
 from ghpt.data.formats.coco import read_coco
 from ghpt.data.formats.mediapipe import is_caliscope, opening, read_caliscope
@@ -20,21 +18,15 @@ from ghpt.data.formats.movement_files import (
     read_lightning_pose,
     read_sleap,
 )
-from ghpt.data.formats.openpose import follow_views, read_openpose
+from ghpt.data.formats.openpose import read_openpose
 from ghpt.data.formats.own_npz import read_own, write_key_points
-from ghpt.data.formats.skeletons import SKELETONS, joints_of, parts_of
+from ghpt.data.formats.skeletons import joints_of, parts_of
 from ghpt.data.formats.validate import frame_rate, open_input
-from ghpt.data.people.people import Detections, KeyPoints, as_people
+from ghpt.data.people.detections import Detections
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
-__all__ = [
-    "FORMATS",
-    "Detections",
-    "KeyPoints",
-    "read_key_points",
-    "read_people",
-    "write_key_points",
-]
+__all__ = ["FORMATS", "Detections", "KeyPoints", "read_key_points", "write_key_points"]
 
 _HINT = (
     "Known: a folder with OpenPose's JSON files in a folder for each camera; COCO results or MMPose's JSON, a file for "
@@ -43,16 +35,18 @@ _HINT = (
 )
 
 
-def read_people(
+def read_key_points(
     path: str | Path,
     skeleton: str | None = None,
     rate_hz: int | float | None = None,
     format: str | None = None,
 ) -> Detections:
-    """Everybody in a folder or file of key points; ``skeleton`` and ``rate_hz`` say what the files
-    do not, or overrule them; ``format`` is one of ``FORMATS``, and recognised by content if None.
+    """Return everybody in a folder or file of key points.
 
-    Raises GhptDataError for what is damaged, empty or not known, naming file, field and mend.
+    ``skeleton`` and ``rate_hz`` say what the files do not, or overrule them; ``format`` is one of
+    ``FORMATS``, and recognised by content if None.
+
+    Raises GhptDataError for what is damaged, empty or not known, naming file, field and hint.
     """
     path = Path(path)
     rate = None if rate_hz is None else frame_rate(path, rate_hz)
@@ -62,10 +56,9 @@ def read_people(
         raise GhptDataError(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
-    found = FORMATS[format or _recognised(path)](path, skeleton)
-    people = as_people(found) if isinstance(found, KeyPoints) else found
+    people = FORMATS[format or _format_of(path)](path, skeleton)
     parts_of(path, people.joints)
-    seen_by = set(people.view[people.valid.any(-1)].tolist())
+    seen_by = set(people.view[people.points.valid.any(-1)].tolist())
     for view, name in enumerate(people.views):
         if view not in seen_by:
             raise GhptDataError(
@@ -74,41 +67,11 @@ def read_people(
     return people if rate_hz is None else replace(people, rate_hz=rate)
 
 
-def read_key_points(
-    path: str | Path,
-    skeleton: str | None = None,
-    rate_hz: int | float | None = None,
-    format: str | None = None,
-) -> KeyPoints:
-    """The one person of ``read_people`` who is tracked best in each view
-    (``ghpt.data.formats.openpose.follow``), without regard to the other views:
-    `ghpt.data.people.views.undistort_and_match` chooses better where cameras are calibrated.
-    """
-    people = read_people(path, skeleton, rate_hz, format)
-    return people.pick(follow_views(people))
-
-
-def _caliscope(path: Path, _: str | None) -> KeyPoints:
-    views, frame, points, valid = read_caliscope(path)
-    joints = SKELETONS["mediapipe_33"]
-    return KeyPoints(
-        str(path),
-        views,
-        joints,
-        frame,
-        points,
-        valid.astype(np.float64),
-        valid,
-        None,
-        (0,) * len(views),
-    )
-
-
-FORMATS: dict[str, Callable[[Path, str | None], KeyPoints | Detections]] = {
+FORMATS: dict[str, Callable[[Path, str | None], Detections]] = {
     "openpose": read_openpose,
     "coco": read_coco,
     "mmpose": read_mmpose,
-    "caliscope": _caliscope,
+    "caliscope": lambda path, _: read_caliscope(path),
     "npz": read_own,
     "authors": read_authors,
     "deeplabcut": read_deeplabcut,
@@ -117,10 +80,10 @@ FORMATS: dict[str, Callable[[Path, str | None], KeyPoints | Detections]] = {
 }
 
 
-def _recognised(path: Path) -> str:
+def _format_of(path: Path) -> str:
     """The name of the format, by what a folder has in it or how a file begins."""
     if not path.is_dir():
-        form = _of_file(path)
+        form = _format_of_file(path)
         if form in (None, "openpose"):
             raise GhptDataError(path, "", "is not a key-point format that is known", _HINT)
         return form
@@ -130,10 +93,10 @@ def _recognised(path: Path) -> str:
         file for file in sorted(path.iterdir()) if file.suffix.lower() in (".json", *EXTENSIONS)
     )
     first = next(inside, None)
-    return "openpose" if first is None else _of_file(first) or "openpose"
+    return "openpose" if first is None else _format_of_file(first) or "openpose"
 
 
-def _of_file(path: Path) -> str | None:
+def _format_of_file(path: Path) -> str | None:
     with open_input(path) as handle:
         start = handle.read(4096)
     for magic, form in _MAGIC.items():

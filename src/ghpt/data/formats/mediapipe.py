@@ -11,10 +11,12 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.formats.validate import open_input
+from ghpt.data.people.detections import Detections
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
 COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
@@ -46,15 +48,10 @@ def is_caliscope(text: str) -> bool:
     return set(COLUMNS) <= {name.strip().strip('"') for name in re.split("[,;\t]", header)}
 
 
-def read_caliscope(
-    path: Path,
-) -> tuple[
-    tuple[str, ...], Int[np.ndarray, " T"], Float[np.ndarray, "T V K 2"], Bool[np.ndarray, "T V K"]
-]:
-    """Camera names (``cam_<port>``), frames (``sync_index``), the body's 33 landmarks (pixels) and
-    which are there.
+def read_caliscope(path: Path) -> Detections:
+    """Return the one person of the table: 33 landmarks in the views ``cam_<port>``.
 
-    Points beyond the body's (hands, face) are left out. There is no confidence in these files.
+    The frame numbers are ``sync_index``. Points beyond the body's (hands, face) are left out. There is no confidence in these files.
     Raises GhptDataError for a table that is damaged, or that has a point twice.
     """
     table = _table(path)
@@ -75,8 +72,11 @@ def read_caliscope(
     shape = (len(frames), len(ports), _JOINTS)
     points = np.zeros((*shape, 2))
     valid = np.zeros(shape, np.bool_)
-    points.reshape(-1, 2)[place], valid.reshape(-1)[place] = table[:, 3:5], True
-    return tuple(f"cam_{port}" for port in ports), frames, points, valid
+    points.reshape(-1, 2)[place] = table[:, 3:5]
+    valid.reshape(-1)[place] = True
+    views = tuple(f"cam_{port}" for port in ports)
+    key_points = KeyPoints(points, valid.astype(np.float64), valid)
+    return Detections.of_person(path, views, SKELETONS["mediapipe_33"], frames, key_points)
 
 
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,12 @@ from jaxtyping import Float
 from ghpt.data.formats.json_views import json_files, view_name
 from ghpt.data.formats.skeletons import canonical
 from ghpt.data.formats.validate import read_json
-from ghpt.data.people.people import (
+from ghpt.data.people.detections import (
     Detections,
-    ViewDetections,
     check_people,
-    detections,
-    gather,
-    triples,
+    joint_values,
+    merge_views,
+    sort_people,
 )
 from ghpt.errors import GhptDataError
 
@@ -25,12 +25,12 @@ _HINT = "It must be a file that MMPose wrote for a video (save_predictions, or p
 
 
 def read_mmpose(path: Path, skeleton: str | None) -> Detections:
-    """Everybody in a folder with MMPose's file of each camera; the files' names are the views'.
+    """Return everybody in a folder with MMPose's file of each camera; the files' names are the views'.
 
     Frame numbers are ``frame_id``; the joints' names those of ``meta_info``, if it is there. Raises
     GhptDataError.
     """
-    found: list[ViewDetections] = []
+    found: list[Detections] = []
     named: dict[tuple[str, ...], Path] = {}
     for file in json_files(path):
         content = read_json(file)
@@ -40,22 +40,23 @@ def read_mmpose(path: Path, skeleton: str | None) -> Detections:
             raise GhptDataError(file, "instance_info", "is not a list of frames", _HINT)
         joints = _joints(file, meta)
         view = _view(file, frames)
-        if joints is not None and len(view.values) and view.values.shape[1] != len(joints):
-            problem = f"names {len(joints)} joints, and people have {view.values.shape[1]}"
+        count = view.points.valid.shape[1]
+        if joints is not None and len(view) and count != len(joints):
+            problem = f"names {len(joints)} joints, and people have {count}"
             raise GhptDataError(
                 file, "meta_info.keypoint_id2name", problem, "Detect this view again."
             )
         named.setdefault(joints or (), file)
-        found.append(view)
+        found.append(replace(view, joints=joints or ()))
     if len(named) > 1:
         problem = f"names other joints than {next(iter(named.values())).name}"
         raise GhptDataError(
             list(named.values())[1], "meta_info", problem, "Detect all views with one model."
         )
-    return gather(path, found, next(iter(named)) or None, skeleton)
+    return merge_views(path, found, skeleton)
 
 
-def _view(file: Path, frames: list[dict[str, Any]]) -> ViewDetections:
+def _view(file: Path, frames: list[dict[str, Any]]) -> Detections:
     numbers = []
     found = []
     for index, frame in enumerate(frames):
@@ -77,7 +78,7 @@ def _view(file: Path, frames: list[dict[str, Any]]) -> ViewDetections:
         ]
     if len(set(numbers)) != len(numbers):
         raise GhptDataError(file, "frame_id", "is there twice", "Keep one entry for each frame.")
-    return detections(file, view_name(file), numbers, found)
+    return sort_people(file, view_name(file), numbers, found)
 
 
 def _person(file: Path, field: str, person: dict[str, Any]) -> Float[np.ndarray, "K 3"]:
@@ -91,7 +92,7 @@ def _person(file: Path, field: str, person: dict[str, Any]) -> Float[np.ndarray,
         raise GhptDataError(
             file, f"{field}.keypoint_scores", "is not a list of a score for each joint", _HINT
         )
-    return triples(
+    return joint_values(
         file,
         field,
         [x for point, score in zip(points, scores, strict=True) for x in (*point, score)],

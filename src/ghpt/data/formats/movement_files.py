@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ghpt.data.formats.skeletons import canonical
-from ghpt.data.people.people import Detections, ViewDetections, gather
+from ghpt.data.people.detections import Detections, detections_in_view, merge_views
 from ghpt.errors import GhptDataError
 
 EXTENSIONS = (".csv", ".h5", ".slp")
@@ -25,19 +25,20 @@ _LARGEST = 2 << 30
 
 
 def read_deeplabcut(path: Path, skeleton: str | None) -> Detections:
-    """Everybody in a folder with DeepLabCut's CSV of each camera. Its .h5 files are refused: they
-    hold pickles.
+    """Return everybody in a folder with DeepLabCut's CSV of each camera.
+
+    Its .h5 files are refused: they hold pickles.
     """
     return _read(path, skeleton, "DeepLabCut", (".csv",))
 
 
 def read_lightning_pose(path: Path, skeleton: str | None) -> Detections:
-    """The one person of a folder with LightningPose's CSV of each camera."""
+    """Return the one person of a folder with LightningPose's CSV of each camera."""
     return _read(path, skeleton, "LightningPose", (".csv",))
 
 
 def read_sleap(path: Path, skeleton: str | None) -> Detections:
-    """Everybody in a folder with SLEAP's .slp or analysis .h5 of each camera."""
+    """Return everybody in a folder with SLEAP's .slp or analysis .h5 of each camera."""
     return _read(path, skeleton, "SLEAP", (".slp", ".h5"))
 
 
@@ -69,13 +70,13 @@ def _read(path: Path, skeleton: str | None, software: str, endings: tuple[str, .
                     "ignore"
                 )  # of a missing frame rate, which does not matter here
                 data = getattr(load_poses, _LOADERS[software])(file)
-            joints, view = _view(file, data)
+            view = _view(file, data)
         except GhptDataError:
             raise
         except Exception as error:  # whatever pandas, h5py and movement raise for a damaged file
             problem = f"is damaged, or not {software}'s ({' '.join(str(error).split())[:200]})"
             raise GhptDataError(file, "", problem, "Export it again.") from error
-        named.setdefault(joints, file)
+        named.setdefault(view.joints, file)
         found.append(view)
     if len(named) > 1:
         raise GhptDataError(
@@ -84,13 +85,11 @@ def _read(path: Path, skeleton: str | None, software: str, endings: tuple[str, .
             "are named otherwise than in the files before",
             "Track all views with one model.",
         )
-    return gather(path, found, next(iter(named)), skeleton)
+    return merge_views(path, found, skeleton)
 
 
-def _view(file: Path, data: Any) -> tuple[tuple[str, ...], ViewDetections]:
-    """The joints' names and the detections of movement's data set: dimensions time, space,
-    keypoints, individuals.
-    """
+def _view(file: Path, data: Any) -> Detections:
+    """Return the detections of movement's data set: time, space, keypoints, individuals."""
     order = ("time", "individuals", "keypoints")
     position = np.asarray(data["position"].transpose(*order, "space"), dtype=np.float64)[..., :2]
     confidence = np.asarray(data["confidence"].transpose(*order), dtype=np.float64)
@@ -101,6 +100,6 @@ def _view(file: Path, data: Any) -> tuple[tuple[str, ...], ViewDetections]:
     frame, person = np.nonzero(valid.any(-1))
     joints = canonical([str(name) for name in data["keypoints"].values])
     name = re.split(r"DLC_|[_.-]?(?:predictions|analysis)", file.stem)[0] or file.stem
-    return joints, ViewDetections(
-        name, np.arange(len(valid)), frame, values[frame, person], np.full(len(frame), -1)
+    return detections_in_view(
+        file, name, np.arange(len(valid)), frame, values[frame, person], joints=joints
     )

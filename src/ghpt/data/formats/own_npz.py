@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 import zipfile
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int
 
 from ghpt.data.formats.skeletons import recognise
 from ghpt.data.formats.validate import (
@@ -17,7 +19,8 @@ from ghpt.data.formats.validate import (
     open_input,
     read_npz,
 )
-from ghpt.data.people.people import KeyPoints, joints_for
+from ghpt.data.people.detections import Detections, joints_for
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
 
@@ -26,26 +29,36 @@ _LONGEST_NAMES = 1 << 20
 """Bytes of a list of texts."""
 
 
-def write_key_points(path: str | Path, points: KeyPoints) -> None:
-    """Write the npz file that ``read_key_points`` reads."""
+def write_key_points(
+    path: str | Path,
+    views: Sequence[str],
+    joints: Sequence[str],
+    frame: Int[np.ndarray, " T"],
+    points: KeyPoints,
+    rate_hz: float | None = None,
+) -> None:
+    """Write one person's key points [T V K] as the npz file that ``read_key_points`` reads."""
     arrays = {
-        "key_points": points.key_points,
-        "views": np.array(points.views, dtype=np.str_),
-        "joints": np.array(points.joints, dtype=np.str_),
-        "frame": points.frame,
+        "key_points": points.pixels,
+        "views": np.array(views, dtype=np.str_),
+        "joints": np.array(joints, dtype=np.str_),
+        "frame": frame,
         "confidence": points.confidence,
         "seen": points.valid,
     }
-    if points.rate_hz is not None:
-        arrays["rate_hz"] = np.array(points.rate_hz)
+    if rate_hz is not None:
+        arrays["rate_hz"] = np.array(rate_hz)
     with atomic_write(path) as handle:
         # zip's check sums guard the values but not the list of names, where damage may hide what
         # comes after it
         np.savez_compressed(handle, members=np.array(sorted(arrays)), **arrays)
 
 
-def read_own(path: Path, skeleton: str | None) -> KeyPoints:
-    """The key points of our npz file; ``skeleton`` overrules what it says. Raises GhptDataError."""
+def read_own(path: Path, skeleton: str | None) -> Detections:
+    """Return the one person of our npz file; ``skeleton`` overrules what it says.
+
+    Raises GhptDataError.
+    """
     there = _members(path)
     for field in ("key_points", "views"):
         if field not in there:
@@ -92,17 +105,8 @@ def read_own(path: Path, skeleton: str | None) -> KeyPoints:
             path, "frame", "is empty, or does not rise", "Number the frames in order."
         )
     rate = frame_rate(path, float(more["rate_hz"])) if "rate_hz" in more else None
-    return KeyPoints(
-        str(path),
-        views,
-        joints,
-        frame,
-        values,
-        np.where(valid, confidence, 0),
-        valid,
-        rate,
-        (0,) * count_views,
-    )
+    points = KeyPoints(values, np.where(valid, confidence, 0), valid)
+    return Detections.of_person(path, views, joints, frame, points, rate)
 
 
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ghpt.data.datasets.panoptic import COCO19
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 from ghpt.skeleton import JOINTS
 
@@ -132,37 +133,33 @@ def parts_of(where: object, joints: Sequence[str]) -> list[tuple[str, ...]]:
     return [found[joint] for joint in JOINTS]
 
 
-def joints17(
-    where: object,
-    joints: Sequence[str],
-    key_points: Float[np.ndarray, "T V K 2"],
-    confidence: Float[np.ndarray, "T V K"],
-    valid: Bool[np.ndarray, "T V K"],
-) -> tuple[Float[np.ndarray, "T V J 2"], Float[np.ndarray, "T V J"], Bool[np.ndarray, "T V J"]]:
-    """Any skeleton's undistorted key points as the 17 joints, float32.
+def joints17(where: object, joints: Sequence[str], points: KeyPoints) -> KeyPoints:
+    """Map any skeleton's undistorted key points to the 17 joints, float32.
 
-    A joint that is a mean of others is seen where all of them are and has the least of their
-    confidences; a joint that the detector does not have is never seen.
+    A joint that is a mean of others is valid where all of them are and has the least of their
+    confidences; a joint that the detector does not have is never valid.
     """
     index = {name: i for i, name in enumerate(joints)}
-    shape = (*key_points.shape[:2], len(JOINTS))
-    points = np.zeros((*shape, 2), np.float32)
-    sure = np.zeros(shape, np.float32)
-    there = np.zeros(shape, np.bool_)
+    shape = (*points.valid.shape[:-1], len(JOINTS))
+    pixels = np.zeros((*shape, 2), np.float32)
+    confidence = np.zeros(shape, np.float32)
+    valid = np.zeros(shape, np.bool_)
     parts = parts_of(where, joints)
-    for place, names in enumerate(parts):
+    for joint, names in enumerate(parts):
         if not names or not set(names) <= set(index):
             continue
         chosen = [index[name] for name in names]
-        there[..., place] = valid[..., chosen].all(-1)
-        sure[..., place] = confidence[..., chosen].min(-1)
-        points[..., place, :] = key_points[..., chosen, :].mean(-2)
+        valid[..., joint] = points.valid[..., chosen].all(-1)
+        confidence[..., joint] = points.confidence[..., chosen].min(-1)
+        pixels[..., joint, :] = points.pixels[..., chosen, :].mean(-2)
     spine = JOINTS.index("spine")
     if parts[spine] == ("pelvis", "thorax"):
         ends = [JOINTS.index(name) for name in parts[spine]]
-        there[..., spine], sure[..., spine] = there[..., ends].all(-1), sure[..., ends].min(-1)
-        points[..., spine, :] = points[..., ends, :].mean(-2)
-    return np.where(there[..., None], points, 0), np.where(there, sure, 0), there
+        valid[..., spine] = valid[..., ends].all(-1)
+        confidence[..., spine] = confidence[..., ends].min(-1)
+        pixels[..., spine, :] = pixels[..., ends, :].mean(-2)
+    pixels = np.where(valid[..., None], pixels, 0)
+    return KeyPoints(pixels, np.where(valid, confidence, 0), valid)
 
 
 def recognise(

@@ -55,7 +55,7 @@ def everywhere(value: float, batch: Observations) -> Float[Tensor, " B"]:
     return torch.full(batch.index.shape, value, dtype=torch.float64, device=batch.index.device)
 
 
-class Baseline(ABC):
+class Estimator(ABC):
     """A classical estimator: ``baseline(batch)`` gives a PoseEstimate in the dtype of the key
     points.
     """
@@ -94,7 +94,7 @@ class Baseline(ABC):
         return poses_of(self.triangulate(batch), batch)
 
 
-class Linear(Baseline):
+class Linear(Estimator):
     """All seen views with equal weights."""
 
     def triangulate(self, batch: Observations) -> Triangulation:
@@ -102,7 +102,7 @@ class Linear(Baseline):
 
 
 @dataclass(frozen=True)
-class WeightedLinear(Baseline):
+class WeightedLinear(Estimator):
     """All seen views; the detector's confidence to the power ``power`` weights the squared
     residuals.
     """
@@ -120,7 +120,7 @@ class WeightedLinear(Baseline):
 
 
 @dataclass(frozen=True)
-class MEstimator(Baseline):
+class MEstimator(Estimator):
     """Iteratively reweighted least squares on the reprojection error, from the linear estimate.
 
     ``scale``: where the loss turns robust, as a fraction of the person's size in each view. Each

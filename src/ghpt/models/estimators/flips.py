@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ghpt.errors import check
 from ghpt.geometry.cameras import reprojection_error
-from ghpt.models.estimators.classical import Baseline, person_scale
+from ghpt.models.estimators.classical import Estimator, person_scale
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import JOINTS, MIRROR
 
@@ -36,7 +36,7 @@ class LeftRightFlips:
     that fit worst.
     """
 
-    estimator: Baseline
+    estimator: Estimator
     scale: float
     gain: float
     rounds: int

@@ -13,12 +13,12 @@ from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
 from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.models.estimators.classical import Baseline, Linear, everywhere, otherwise, person_scale
+from ghpt.models.estimators.classical import Estimator, Linear, everywhere, otherwise, person_scale
 from ghpt.observations import Observations
 
 
 @dataclass(frozen=True)
-class LoRansac(Baseline):
+class LoRansac(Estimator):
     """pycolmap's LO-RANSAC over views for each joint, and its inliers triangulated together.
 
     ``threshold``: an inlier's largest reprojection error, as a fraction of the person's size in

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation
-from ghpt.models.estimators.classical import Baseline, poses_of
+from ghpt.models.estimators.classical import Estimator, poses_of
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.estimators.uncertainty import JointUncertainty, UncertaintyModel
@@ -48,7 +48,7 @@ class Classical:
 
     def __init__(
         self,
-        estimator: Baseline,
+        estimator: Estimator,
         uncertainty: UncertaintyModel,
         flips: LeftRightFlips | None,
         reject: Rejection | None,
@@ -128,7 +128,7 @@ class Learned:
 
 
 def _prepared(
-    batch: Observations, flips: LeftRightFlips | None, estimator: Baseline
+    batch: Observations, flips: LeftRightFlips | None, estimator: Estimator
 ) -> tuple[Observations, Bool[Tensor, "B V J"], Bool[Tensor, "B V"], Triangulation]:
     """The batch to triangulate, what was taken out of it, in which views left and right were
     exchanged, and what ``estimator`` makes of the batch. It does so once where it is the one that

@@ -21,13 +21,13 @@ from ghpt.geometry.triangulation import (
     solve_in_parts,
     triangulate_subsets,
 )
-from ghpt.models.estimators.classical import Baseline, everywhere, person_scale
+from ghpt.models.estimators.classical import Estimator, everywhere, person_scale
 from ghpt.observations import Observations
 from ghpt.randomness import key, uniform
 
 
 @dataclass(frozen=True)
-class Ransac(Baseline):
+class Ransac(Estimator):
     """For each joint the pair of views whose point has the most inliers (least residual among
     equals), then the inliers together.
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ghpt.errors import check
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.models.estimators.classical import Baseline, otherwise
+from ghpt.models.estimators.classical import Estimator, otherwise
 from ghpt.models.estimators.ransac import Ransac
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pool import Pool
@@ -40,7 +40,7 @@ class Weighed:
     pool: Pool
 
 
-class ViewWeights(Baseline):
+class ViewWeights(Estimator):
     """``model``'s scores of poses made of the views on which ``consensus`` finds agreement, turned
     into view weights.
 

@@ -1,0 +1,176 @@
+"""From detections to a sequence: whose they are, before which cameras, and out of the lens."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from collections.abc import Sequence as Items
+
+import numpy as np
+from jaxtyping import Int
+
+from ghpt.data.datasets.detections import undistorted
+from ghpt.data.formats.names import Name
+from ghpt.data.formats.skeletons import joints17
+from ghpt.data.people.association import associate
+from ghpt.data.people.detections import Detections
+from ghpt.data.people.following import follow_views
+from ghpt.data.people.matching import match_views
+from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels
+from ghpt.data.people.sequence import KeyPointArrays, Sequence
+from ghpt.data.points import KeyPoints
+from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import CameraSet
+
+_log = logging.getLogger(__name__)
+
+Chosen = Int[np.ndarray, "T V"]
+"""The index of one person's detection in each frame and view, -1 where there is none."""
+
+
+def person_sequence(
+    people: Detections,
+    cameras: CameraSet,
+    match: Mapping[Name, Name] | None = None,
+    views: Items[Name] | None = None,
+    person: int | None = 0,
+    title: str = "",
+    check_sizes: bool = True,
+) -> Sequence:
+    """Return one person with their cameras, the lens distortion undone, as the 17 joints.
+
+    Views and cameras are matched as `match_views` says. ``person`` chooses as `select_person` says;
+    None follows the most prominent person of each view by itself. ``check_sizes`` refuses key
+    points of images of another size. Raises GhptDataError.
+    """
+    at, ordered = match_views(people.path, people.views, cameras, match, views)
+    ideal = undistort_detections(people, ordered, at)
+    if person is None:
+        chosen = follow_views(people)[:, at]
+    else:
+        chosen = select_person(people, ordered, at, ideal, person)[:, at]
+    raw = people.points.take(chosen)
+    check_pixels(people.path, raw, ordered)
+    if check_sizes:
+        check_image_sizes(people.path, raw, ordered)
+    detected = joints17(people.path, people.joints, raw)
+    return Sequence(
+        title=title,
+        source=people.path,
+        cameras=ordered,
+        frame=people.frame.astype(np.int64),
+        rate_hz=people.rate_hz,
+        points=KeyPointArrays(ideal.take(chosen), detected),
+    )
+
+
+def undistort_detections(people: Detections, cameras: CameraSet, at: Items[int]) -> KeyPoints:
+    """Return the 17 joints [N J] of all detections in the views ``at``, as pinholes would see them.
+
+    ``cameras`` are those of the views. Nothing is valid in the other views.
+    """
+    pixels = np.zeros(people.points.pixels.shape, np.float32)
+    valid = np.zeros(people.points.valid.shape, np.bool_)
+    for camera, view in enumerate(at):
+        indices = np.flatnonzero(people.view == view)
+        points = undistort_view(people.points[indices], cameras, camera)
+        pixels[indices] = points.pixels
+        valid[indices] = points.valid
+    points = KeyPoints(pixels, people.points.confidence, valid)
+    return joints17(people.path, people.joints, points)
+
+
+def undistort_view(points: KeyPoints, cameras: CameraSet, camera: int) -> KeyPoints:
+    """Return one camera's key points [N K] as an ideal pinhole would see them, float32.
+
+    Those that are not finite, or where the lens model cannot be inverted, are not valid.
+    """
+    K = cameras.K[camera].numpy()
+    distortion = cameras.distortion[camera].numpy()
+    pixels, valid = undistorted(points.pixels, points.valid, K, distortion)
+    return KeyPoints(pixels, points.confidence, valid)
+
+
+def select_person(
+    people: Detections,
+    cameras: CameraSet,
+    at: Items[int],
+    ideal: KeyPoints,
+    person: int = 0,
+) -> Chosen:
+    """Return the detections of one person, the most visible (``person`` = 0), the next, ...
+
+    ``cameras`` are those of the views ``at``, and ``ideal`` what `undistort_detections` gives.
+    Persons are told apart
+
+    1. by their identities, where all detections have one;
+    2. not at all, where nobody is ever beside another: everybody is one person;
+    3. by what agrees across the views (`associate`), where the cameras have extrinsics;
+    4. otherwise, or where no two views agree in half of the frames, each view follows its own
+       person (`follow_views`), in the last case with a warning.
+
+    Raises GhptDataError if there is no such person.
+    """
+    in_views = np.isin(people.view, list(at))
+    if len(people.identity) and (people.identity >= 0).all():
+        return _nth(people, _by_identity(people, in_views), person)
+    counts = people.counts()[:, at]
+    if not (counts > 1).any():
+        return _nth(people, [people.first()], person)
+    if cameras.calibrated:
+        found = _across_views(people, cameras, at, ideal)
+        frames_of_two_views = ((counts > 0).sum(1) >= 2).sum()
+        frames_of_best = (found[0] >= 0).any(1).sum() if found else 0
+        if found and 2 * frames_of_best >= frames_of_two_views:
+            return _nth(people, found, person)
+        _log.warning(
+            "%s: the views agree on nobody: check the extrinsics of %s, and that frames have the "
+            "same numbers in all views. Each view follows the person that it tracks best.",
+            people.path,
+            cameras.path,
+        )
+    return _nth(people, [follow_views(people)], person)
+
+
+def _by_identity(people: Detections, in_views: np.ndarray) -> list[Chosen]:
+    """Return the detections of every identity, the most frequent first."""
+    numbers, counts = np.unique(people.identity[in_views], return_counts=True)
+    order = numbers[np.argsort(-counts, kind="stable")]
+    found = []
+    for number in order:
+        indices = np.flatnonzero(in_views & (people.identity == number))
+        found.append(people.first_of(indices))
+    return found
+
+
+def _nth(people: Detections, found: Items[Chosen], person: int) -> Chosen:
+    if not 0 <= person < len(found):
+        problem = f"there is no person {person}: {len(found)} can be told apart"
+        hint = f"Give a number below {len(found)}; 0 is who is seen most."
+        raise GhptDataError(people.path, "person", problem, hint)
+    return found[person]
+
+
+def _across_views(
+    people: Detections, cameras: CameraSet, at: Items[int], ideal: KeyPoints
+) -> list[Chosen]:
+    """Return the detections of everybody who can be told apart across the views ``at``."""
+    indices = [np.flatnonzero(people.view == view) for view in at]
+    index = np.concatenate(indices)
+    camera = np.repeat(np.arange(len(at)), [len(each) for each in indices])
+    points = ideal[index]
+    found = associate(
+        cameras.cameras,
+        len(people.frame),
+        people.row[index],
+        camera,
+        points.pixels,
+        points.valid,
+        points.confidence,
+    )
+    persons = []
+    for members in found:
+        chosen = np.full((len(people.frame), len(people.views)), -1)
+        chosen[:, at] = np.where(members >= 0, index[members], -1)
+        persons.append(chosen)
+    return persons
