@@ -170,7 +170,9 @@ def _add_view(
             camera.sensor_id
         )
         # what is not used may be anything
-        xy = torch.where(rig.inlier[view, own][:, None], observed.xy[view, own], 0.0).numpy() * focal
+        xy = (
+            torch.where(rig.inlier[view, own][:, None], observed.xy[view, own], 0.0).numpy() * focal
+        )
         image = pycolmap.Image(name=str(number), keypoints=xy, camera_id=number, image_id=number)
         image.frame_id = view + 1
         frame.add_data_id(image.data_id)

@@ -212,8 +212,7 @@ def _units_of_bone(name: str, length: float) -> set[str]:
 def _read_distance(baseline: Sequence[Any], names: Sequence[str]) -> KnownDistance:
     key = "scale.baseline"
     hint = (
-        f"Give two of {', '.join(names)} and their distance in mm: "
-        f"[{names[0]}, {names[-1]}, 3000]."
+        f"Give two of {', '.join(names)} and their distance in mm: [{names[0]}, {names[-1]}, 3000]."
     )
     chosen = [chosen_name(name, names) for name in baseline[:2]]
     two = len(baseline) == 3 and len(set(chosen) & set(names)) == 2

@@ -48,7 +48,6 @@ class Correspondences:
             / self.noise
         )
 
-
     def with_view(self, view: int, other: Correspondences) -> Correspondences:
         """Return the same with one view's key points from another set of the same points."""
         xy = self.xy.clone()

@@ -79,13 +79,17 @@ class PairEstimation:
 
     def __call__(self, observed: Correspondences, seed: int) -> PairTable:
         count = len(observed.valid)
-        found = (self._pair(observed, a, b, seed) for a in range(count) for b in range(a + 1, count))
+        found = (
+            self._pair(observed, a, b, seed) for a in range(count) for b in range(a + 1, count)
+        )
         rows = [row for row in found if row is not None]
         return (
             PairTable(*map(torch.stack, zip(*rows, strict=True))) if rows else PairTable(*_NOTHING)
         )
 
-    def _pair(self, observed: Correspondences, a: int, b: int, seed: int) -> tuple[Tensor, ...] | None:
+    def _pair(
+        self, observed: Correspondences, a: int, b: int, seed: int
+    ) -> tuple[Tensor, ...] | None:
         both = observed.valid[a] & observed.valid[b]
         common = int(both.sum())
         if common < self.least:

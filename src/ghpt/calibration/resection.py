@@ -75,7 +75,9 @@ class Resection:
         )
         return self.triangulate(observed, PlacedRig(R, t, placed, *nothing), seed)
 
-    def grow(self, observed: Correspondences, table: PairTable, rig: PlacedRig, seed: int) -> PlacedRig:
+    def grow(
+        self, observed: Correspondences, table: PairTable, rig: PlacedRig, seed: int
+    ) -> PlacedRig:
         """Place every view that a chain of linked pairs reaches, the one best bound to the placed
         ones first; a view that fails is tried again when the rig has grown.
         """
@@ -161,7 +163,9 @@ class Resection:
             observed, replace(rig, points=result.points), result.ok & (agree.sum(0) >= 2)
         )
 
-    def inlier_views(self, observed: Correspondences, rig: PlacedRig, known: Bool[Tensor, " N"]) -> PlacedRig:
+    def inlier_views(
+        self, observed: Correspondences, rig: PlacedRig, known: Bool[Tensor, " N"]
+    ) -> PlacedRig:
         """The rig with the inliers of its points where they are ``known``."""
         inlier = (
             (observed.error(rig.R, rig.t, rig.points) <= self.threshold)

@@ -15,7 +15,13 @@ from ghpt.calibration.bundle import Adjusted, BundleAdjustment
 from ghpt.calibration.diagnostics import Case, Diagnostics
 from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.mistakes import size_finding
-from ghpt.calibration.observations import Correspondences, choose_frames, observe, reweighted, usable
+from ghpt.calibration.observations import (
+    Correspondences,
+    choose_frames,
+    observe,
+    reweighted,
+    usable,
+)
 from ghpt.calibration.pairs import PairEstimation, PairTable
 from ghpt.calibration.resection import Resection, PlacedRig
 from ghpt.calibration.uncertainty import uncertainty

@@ -45,7 +45,9 @@ def gauge(R: Float[Tensor, "V 3 3"], centre: Float[Tensor, "V 3"]) -> Float[Tens
     return torch.cat((rotation, translation, scale), dim=-1).flatten(0, 1)
 
 
-def uncertainty(observed: Correspondences, rig: PlacedRig, state: Linearised, blocks: int) -> Uncertainty:
+def uncertainty(
+    observed: Correspondences, rig: PlacedRig, state: Linearised, blocks: int
+) -> Uncertainty:
     """``state``: of the rig, whose size (root mean square distance of the centres from their mean)
     is 1.
 

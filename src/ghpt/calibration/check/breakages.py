@@ -129,9 +129,7 @@ def _exchange_with_first(case: Case, views: Views) -> Case:
     evidence = case.evidence
     return replace(
         case,
-        evidence=replace(
-            evidence, pixels=evidence.pixels[order], valid=evidence.valid[order]
-        ),
+        evidence=replace(evidence, pixels=evidence.pixels[order], valid=evidence.valid[order]),
     )
 
 

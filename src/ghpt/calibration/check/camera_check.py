@@ -148,9 +148,7 @@ class CameraCheck:
         return float(stature(points[0], known[0]))
 
 
-def pixels_of(
-    cache: RayCache, setup: Setup, error: Float[Tensor, " V"]
-) -> Float[Tensor, " V"]:
+def pixels_of(cache: RayCache, setup: Setup, error: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
     """Return the errors of the views, in sizes of the person, as pixels."""
     size = cache.all(setup).size
     typical = torch.where(size > 0, size, torch.nan).nanmedian(-1).values.nan_to_num(0.0)

@@ -153,9 +153,7 @@ class RayCache:
             return
         pixels, valid = self._pixels(setup, view, slice(None))
         shape = valid.shape[:2]
-        flat = rays_of(
-            pixels.flatten(0, 1), valid.flatten(0, 1), setup.K[view], setup.lens[view]
-        )
+        flat = rays_of(pixels.flatten(0, 1), valid.flatten(0, 1), setup.K[view], setup.lens[view])
         xy = flat.xy.unflatten(0, shape)
         seen = flat.valid.unflatten(0, shape)
         size = flat.size.unflatten(0, shape)

@@ -86,7 +86,6 @@ def _unknown_unit(path: str, height: float) -> GhptDataError:
             "is seen, does not tell"
         )
         hint = (
-            "Give the length of the unit in mm: unit_mm=1000 for metres, unit_mm=1 for "
-            "millimetres."
+            "Give the length of the unit in mm: unit_mm=1000 for metres, unit_mm=1 for millimetres."
         )
     return GhptDataError(path, "unit_mm", problem, hint)

@@ -59,8 +59,7 @@ class Verdict:
     def numbers(self) -> dict[str, Any]:
         """Return the verdict as plain data, with the level of each finding in words."""
         findings = [
-            vars(finding) | {"level": _LEVELS[finding.severity].words}
-            for finding in self.findings
+            vars(finding) | {"level": _LEVELS[finding.severity].words} for finding in self.findings
         ]
         return {
             "level": self.level.words,
