@@ -25,7 +25,8 @@ import scene
 import torch
 from measure import configuration, machine, settings, show
 
-from ghpt.commands.train import train
+from ghpt.commands.train import TrainSettings, train
+from ghpt.config import settings as typed_settings
 
 HYPOTHESES = 200
 
@@ -97,7 +98,9 @@ def ours(samples: int, bfloat16: bool) -> float:
         config["trainer"] |= {"accelerator": "cpu", "devices": 1}
         _prepare(config["data"])
         start = time.perf_counter()
-        train(config, Path(folder) / "run")
+        output = Path(folder) / "run"
+        typed = typed_settings(TrainSettings, config | {"output": str(output)})
+        train(typed, output)
         return time.perf_counter() - start
 
 

@@ -58,7 +58,8 @@ def test_scene(checkpoint: str, folder: str, frames: int, hypotheses: int) -> No
     import scene
     from measure import configuration
 
-    from ghpt.commands.test import test
+    from ghpt.commands.test import TestSettings, test
+    from ghpt.config import settings
 
     config = configuration(
         "test", "progress_bar=false", f"ckpt={checkpoint}", f"hypotheses={hypotheses}"
@@ -66,7 +67,8 @@ def test_scene(checkpoint: str, folder: str, frames: int, hypotheses: int) -> No
     lengths = {"train": 16, "validation": 16, "test": frames}
     config["data"] = scene.DATA | {"cache": folder, "views": 4, "frames": lengths}
     config["trainer"] |= {"accelerator": "cpu", "devices": 1}
-    test(config, Path(folder) / f"test-{frames}")
+    output = Path(folder) / f"test-{frames}"
+    test(settings(TestSettings, config | {"output": str(output)}), output)
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ from measure import configuration, machine, settings, show
 from ghpt import randomness
 from ghpt.config import build
 from ghpt.data.datasets.pairs import Pairs, PairSettings
-from ghpt.models.relative_pose.baselines import Robust, size_in_image
+from ghpt.models.relative_pose.baselines import Correspondences, Robust, size_in_image
 from ghpt.observations import PairObservations
 
 THEIRS = ("usac_accurate", "poselib")
@@ -41,9 +41,9 @@ def solve(baseline: Robust, batch: PairObservations) -> list[float]:
     a, b, used = batch.correspondences()
     size, taken = size_in_image(batch).tolist(), []
     for i in range(len(batch)):
-        x, y = a[i, used[i]], b[i, used[i]]
+        pair = Correspondences(a[i, used[i]], b[i, used[i]], size[i], batch.index[i])
         start = time.perf_counter()
-        baseline.pose(x, y, size[i], batch.index[i])
+        baseline.pose(pair)
         taken.append(time.perf_counter() - start)
     return taken
 

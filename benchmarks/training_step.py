@@ -22,7 +22,8 @@ import scene
 import torch
 from measure import configuration, machine, settings, show
 
-from ghpt.commands.train import train
+from ghpt.commands.train import TrainSettings, train
+from ghpt.config import settings as typed_settings
 from ghpt.models.module import StochasticEstimator
 
 
@@ -67,7 +68,9 @@ def run(views: int, epochs: int, progress_bar: bool, save_every: int) -> list[tu
         config["data"] = scene.DATA | {"cache": folder, "views": views, "frames": frames}
         config["model"]["_target_"] = "__main__.TimedEstimator"
         config["trainer"] |= {"max_epochs": epochs, "accelerator": "cpu", "devices": 1}
-        train(config, Path(folder) / "run")
+        output = Path(folder) / "run"
+        typed = typed_settings(TrainSettings, config | {"output": str(output)})
+        train(typed, output)
     return list(TimedEstimator.pairs)
 
 

@@ -73,8 +73,8 @@ def pycolmap_alone(data: Observations, threshold: float) -> Callable[[], None]:
     options.ransac.random_seed = 0
     tasks = []
     for frame in range(len(data)):
-        K, R, t = (x[frame].numpy() for x in (data.cameras.K, data.cameras.R, data.cameras.t))
-        found = pycolmap_cameras(K, R, t, np.ones(len(K), dtype=bool))
+        rig = data.cameras.index(frame)
+        found = pycolmap_cameras(rig, np.ones(len(rig.K), dtype=bool))
         for joint in range(data.valid.shape[-1]):
             views = np.flatnonzero(data.valid[frame, :, joint])
             pixels = data.key_points[frame, views, joint].double().numpy()

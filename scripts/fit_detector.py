@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.optimize import least_squares
 
-from ghpt.data.synthetic.detector import Detector, Processes
+from ghpt.data.synthetic.detector import BodyError, Detector, Processes
 from ghpt.data.synthetic.random_processes import generator
 from ghpt.data.synthetic.recordings import Take, takes
 from ghpt.data.synthetic.rigs import ARRANGEMENTS
@@ -64,19 +64,22 @@ class Draw:
 
     take: Take
     points: np.ndarray
-    body_error: tuple[np.ndarray, np.ndarray]
+    body_error: BodyError
     processes: list[Processes]
 
     def batch(self, detector: Detector) -> Labelled[Observations, Truth]:
         """The detections in all views by these numbers."""
         take, count, views = self.take, len(self.points), range(len(self.processes))
-        shown = detector.shown(self.points, self.body_error, take.familiar)
+        apparent = detector.displace_joints(self.points, self.body_error, take.familiar)
         found = [
-            detector.view(self.points, shown, take.rig, view, self.processes[view], take.familiar)
+            detector.detect_view(
+                self.points, apparent, take.rig, view, self.processes[view], take.familiar
+            )
             for view in views
         ]
         key_points, confidence, valid = (
-            torch.from_numpy(np.stack(x, axis=1)) for x in zip(*found, strict=True)
+            torch.from_numpy(np.stack(x, axis=1))
+            for x in zip(*([d.key_points, d.confidence, d.valid] for d in found), strict=True)
         )
         rig = take.rig.cameras
         observations = Observations(
@@ -104,19 +107,20 @@ def draws(detector: Detector, data: str, split: str, seed: int) -> list[Draw]:
         parts = []
         for take in group:
             frames = len(take.truth)
-            bias, drift = detector.body_error(frames, take.rate_hz, seed, take.subject, take.name)
+            error = detector.draw_body_error(frames, take.rate_hz, seed, take.subject, take.name)
             generators = [generator(seed, "camera", take.name, name) for name in take.rig.names]
             processes = [
-                detector.processes(frames, take.rate_hz, rng).every(STRIDE) for rng in generators
+                detector.draw_processes(frames, take.rate_hz, rng).subsample(STRIDE)
+                for rng in generators
             ]
-            parts.append((take.truth[::STRIDE], drift[::STRIDE], processes))
+            parts.append((take.truth[::STRIDE], error.drift[::STRIDE], processes))
         points, drift, processes = zip(*parts, strict=True)
         drift = np.concatenate(drift)
         drawn.append(
             Draw(
                 take,
                 np.concatenate(points),
-                (bias, drift),
+                BodyError(error.bias, drift),
                 [_join(view) for view in zip(*processes, strict=True)],
             )
         )

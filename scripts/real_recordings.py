@@ -15,18 +15,19 @@ import csv
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
 
 import hydra
 import numpy as np
 import torch
 
-from ghpt.commands.predict import predict
-from ghpt.commands.prediction.report import comparison_rows
-from ghpt.config import plain
+from ghpt.commands.predict import PredictSettings, predict
+from ghpt.commands.prediction.report import comparison_table
+from ghpt.commands.prediction.result import PredictionResult
+from ghpt.config import plain, settings
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.export import read_reconstruction
-from ghpt.report.tables import markdown
+from ghpt.report.document import Document, Heading, Table
+from ghpt.report.markdown import render_markdown
 from ghpt.skeleton import JOINT
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -68,17 +69,17 @@ def main(folder: Path, words: list[str]) -> None:
                 found[estimator] = poses(
                     [*given, *more, "formats=[npz]", "evaluated_frames=1"], Path(output)
                 )
-            numbers = run([*given, *words, f"compare=[{','.join(ESTIMATORS)}]"], Path(output))
-        header, rows = comparison_rows(numbers)
-        print(f"\n{name}, {numbers['frames']} frames:\n\n{markdown(header, rows)}\n")
+            result = run([*given, *words, f"compare=[{','.join(ESTIMATORS)}]"], Path(output))
         rows = [[e, *(f"{value:.1f}" for value in distance(found[e], theirs))] for e in found]
-        print(markdown(["distance from the tool's own 3D, mm", "median", "90 %"], rows))
+        distances = Table(["distance from the tool's own 3D, mm", "median", "90 %"], rows)
+        heading = Heading(f"{name}, {result.coverage.frames} frames")
+        print(render_markdown(Document("", [heading, comparison_table(result), distances])))
 
 
-def run(words: list[str], output: Path) -> dict[str, Any]:
+def run(words: list[str], output: Path) -> PredictionResult:
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        settings = plain(hydra.compose("predict", overrides=["progress_bar=false", *words]))
-    return predict(settings, output)
+        config = plain(hydra.compose("predict", overrides=["progress_bar=false", *words]))
+    return predict(settings(PredictSettings, config | {"output": str(output)}), output)
 
 
 def poses(words: list[str], output: Path) -> dict[int, np.ndarray]:

@@ -24,7 +24,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -208,6 +208,19 @@ def output_of(
     ended = run(*words, env=env, cwd=cwd, is_forked=is_forked)
     assert ended.status == 0, ended.errors[-3000:]
     return ended.out
+
+
+def wait_until(
+    condition: Callable[[], bool], child: Child | subprocess.Popen[str] | None = None
+) -> None:
+    """Return when the condition holds, which must be before the child ends."""
+    end = time.monotonic() + LIMIT
+    while not condition():
+        if child is not None and child.poll() is not None:
+            _, errors = child.communicate()
+            raise AssertionError(f"the child ended with status {child.wait()} before: {errors}")
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.02)
 
 
 class Server:

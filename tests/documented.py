@@ -17,7 +17,7 @@ import torch
 from ghpt.data.formats.camera_writers import write_opencv, write_pose2sim
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.synthetic.rigs import human36m_rig
-from ghpt.geometry.cameras import Cameras, CameraSet, project
+from ghpt.geometry.cameras import CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import walk, write_people
 from real_layout import write_human36m_layout
@@ -126,8 +126,8 @@ def workplace(folder: Path) -> Path:
         50.0,
     )
     write_person(folder / "points.npz", given)
-    same = Cameras(rig.cameras.K, rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3))
-    write_pose2sim(folder / "intrinsics.toml", replace(rig, cameras=same), {})
+    R, t = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
+    write_pose2sim(folder / "intrinsics.toml", replace(rig, R=R, t=t), {})
     for name in ("Calib.toml", "Calib_qualisys.toml"):
         write_pose2sim(folder / name, rig, {})
     write_opencv(folder, rig)

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 
 from ghpt.data.datasets.pairs import RigOfSplit
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.relative_pose.predictions import PairPredictions, PairWriter, open_pairs
-from ghpt.models.rows import WEIGHTS
+from ghpt.models.aggregation import WeightSummary
+from ghpt.models.predictions import PredictionWriter, open_predictions
+from ghpt.models.relative_pose.schema import PAIRS, PairPredictions, PairSample, RigTables
 from ghpt.observations import RelativePoseEstimate
 from scenes import look_at
 
@@ -78,7 +79,7 @@ def moved(
 
 
 def content(rigs: list[RigOfSplit], draws: int = 10) -> dict:
-    """What a ``PairWriter`` takes: all pairs of ``draws`` draws of each rig."""
+    """What a predictions file is of: all pairs of ``draws`` draws of each rig."""
     pairs = list(combinations(range(len(rigs[0].names)), 2))
     each = [
         (g, g * draws + d, pair) for g in range(len(rigs)) for d in range(draws) for pair in pairs
@@ -92,7 +93,8 @@ def content(rigs: list[RigOfSplit], draws: int = 10) -> dict:
         )
         for i, name in enumerate(NAMES)
     }
-    weights = {summary: torch.linspace(0, 1, len(each)) for summary in WEIGHTS}
+    summary = torch.linspace(0, 1, len(each))
+    weights = WeightSummary(summary, summary, summary)
     return {
         "estimates": estimates,
         "truth": truth,
@@ -107,16 +109,17 @@ def written(
     folder: Path, rigs: list[RigOfSplit], values: Mapping, meta: Mapping = META
 ) -> PairPredictions:
     """The content through a predictions file."""
-    count = len(values["draw"])
-    writer = PairWriter(folder / "rows", count, tuple(values["estimates"]))
-    for rows in torch.arange(count).split(7):
-        part = {key: values[key][rows] for key in ("rig", "draw", "pair")}
-        part["truth"] = tuple(x[rows] for x in values["truth"])
-        part["weights"] = {key: value[rows] for key, value in values["weights"].items()}
-        part["estimates"] = {
-            name: RelativePoseEstimate(e.R[rows], e.t[rows], e.estimated[rows])
-            for name, e in values["estimates"].items()
-        }
-        writer.write(rows, **part)
-    writer.finish(folder / "predictions.npz", rigs, meta)
-    return open_pairs(folder / "predictions.npz")
+    names = tuple(values["estimates"])
+    writer = PredictionWriter(folder / "rows", len(values["draw"]), names, PAIRS)
+    for rows in torch.arange(len(values["draw"])).split(7):
+        write_rows(writer, rows, values)
+    writer.finish(folder / "predictions.npz", RigTables.from_rigs(rigs), meta)
+    return open_predictions(folder / "predictions.npz", PAIRS)
+
+
+def write_rows(writer: PredictionWriter, rows: torch.Tensor, values: Mapping) -> None:
+    """Write some of the rows of the content."""
+    R, t = values["truth"]
+    sample = PairSample(R, t, values["rig"], values["draw"], values["pair"])
+    estimates = {name: estimate.rows(rows) for name, estimate in values["estimates"].items()}
+    writer.write(rows, estimates, sample.rows(rows), values["weights"].rows(rows))

@@ -18,7 +18,7 @@ from ghpt.config import plain, settings
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.points import KeyPoints
-from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 
@@ -44,7 +44,7 @@ def numbers_of(settings: PredictSettings, output: Path) -> dict[str, Any]:
 @cache
 def walk(frames: int = 200) -> Tensor:
     """A walking person, mm [T, 17, 3]."""
-    return torch.from_numpy(motion(0, "S9", "S9/Walking-1", "Walking", frames, 50.0)).double()
+    return torch.from_numpy(draw_motion(0, "S9", "S9/Walking-1", "Walking", frames, 50.0)).double()
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ def write_panoptic_layout(
             frame=np.asarray(frames),
             key_points=shown[:, view].astype(np.float32),
             confidence=confidence[:, view].astype(np.float32),
-            valid=valid[:, view],
+            seen=valid[:, view],
         )
 
 

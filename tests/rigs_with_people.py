@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.config import build
-from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.models.estimators.classical import person_scale
@@ -63,7 +63,7 @@ class Detections:
 def _walk(frames: int, seed: int) -> np.ndarray:
     takes = ("Walking", "Greeting", "Phoning", "WalkingDog")
     return np.concatenate(
-        [motion(seed, "S8", f"S8/{a}-1", a, 8 * frames, 50.0)[::32] for a in takes]
+        [draw_motion(seed, "S8", f"S8/{a}-1", a, 8 * frames, 50.0)[::32] for a in takes]
     )[:frames]
 
 

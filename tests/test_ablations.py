@@ -9,19 +9,19 @@ from typing import Any
 import pytest
 import torch
 
-from ghpt.commands.train import train
 from ghpt.config import build
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.models.checkpoint import load_model
-from ghpt.paper.ablations.actions import evaluate
+from ghpt.paper.ablations.actions import measure_pools
 from ghpt.paper.ablations.tables import ARTEFACTS
 from ghpt.paper.engine.artefact import Results, Section
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import read_json
-from toys import DATA, TRAIN
+from sections import markdown
+from sections import setup as whole_setup
+from toys import DATA, TRAIN, train
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}
 SIZES = {
     "stride": {"validation": 512, "test": 512},
@@ -47,7 +47,9 @@ def evaluated(
     toy: tuple[Path, dict[str, Any]], settings: Sequence[Sequence[Any]], out: Path
 ) -> list[dict[str, float]]:
     folder, data = toy
-    evaluate({"sets": {"test": data}, "settings": settings, "seed": 0}, {"model": folder}, out)
+    pools = [{"hypotheses": count, "temperature": value} for count, value in settings]
+    config = {"splits": {"test": data}, "pools": pools, "seed": 0}
+    measure_pools(config, {"model": folder}, out)
     return read_json(out / "result.json")["test"]
 
 
@@ -78,10 +80,7 @@ def test_a_high_temperature_is_the_average_and_the_default_is_the_models_own(toy
 
 
 def setup(seed: int = 0, **sizes: Any) -> Setup:
-    overrides = {"train": (), "test": ()}
-    return Setup(
-        CONF, {"human36m": None, "panoptic": None}, overrides, {"ablation": SIZES | sizes}, seed
-    )
+    return whole_setup(seed, ablation=SIZES | sizes)
 
 
 def section(
@@ -97,13 +96,13 @@ def section(
             own = task.folder(folder)
             own.mkdir(parents=True, exist_ok=True)
             write_json(own / "task.json", {"seconds": 90.0 + 20 * one.seed})
-            if "sets" in task.config:
+            if "splits" in task.config:
                 result = {
                     split: [
                         {"weight": error(one.seed, name, split, i), "average": 40.0, "best": 20.0}
-                        for i in range(len(task.config["settings"]))
+                        for i in range(len(task.config["pools"]))
                     ]
-                    for split in task.config["sets"]
+                    for split in task.config["splits"]
                 }
                 write_json(own / "result.json", result)
     return BY_LABEL[label].section(Results(setups, tasks, folder))
@@ -125,7 +124,7 @@ def test_each_setting_is_trained_twice_and_the_default_is_the_reports_own_model(
     }
     for data, task in defaults.items():
         assert task.dependencies["model"].key == setup().trained(data).key
-    assert set(defaults["cmu3"].config["sets"]) == {"test"}
+    assert set(defaults["cmu3"].config["splits"]) == {"test"}
     others = [
         task.dependencies["model"].config for name, task in tasks.items() if "default" not in name
     ]
@@ -159,15 +158,15 @@ def test_a_table_says_what_validation_chooses_and_what_that_is_worth(tmp_path: P
         return (20.0 if better else 25.0) + seed
 
     found = section("ablation-gumbel", error, tmp_path, seeds=2)
-    assert "Validation would choose: without." in found.body
-    assert "without: -19.6 %, +24.4 %, +24.4 %." in found.body
-    assert "20.5 ± 0.7" in found.body
-    assert "| average of the same pool " in found.body
+    assert "Validation would choose: without." in markdown(found)
+    assert "without: -19.6 %, +24.4 %, +24.4 %." in markdown(found)
+    assert "20.5 ± 0.7" in markdown(found)
+    assert "| average of the same pool " in markdown(found)
     assert found.data == "synthetic Human3.6M"
     equal = section(
         "ablation-gumbel", lambda seed, task, split, i: 20.0 + 0.1 * ("default" in task), tmp_path
     )
-    assert "Validation keeps the default." in equal.body
+    assert "Validation keeps the default." in markdown(equal)
 
 
 def test_a_table_without_another_training_set_has_none(tmp_path: Path):
@@ -182,9 +181,12 @@ def test_five_hundred_samples_are_enough_only_where_no_other_number_is_better(tm
 
     enough, minutes = section("ablation-samples", falls, tmp_path).claims
     assert not enough.holds
-    assert enough.by == "30.0 mm of 500; the best of 50, 500, 5000 is 5000 with 25.0 mm (-16.7 %)"
+    assert (
+        enough.evidence
+        == "30.0 mm of 500; the best of 50, 500, 5000 is 5000 with 25.0 mm (-16.7 %)"
+    )
     assert minutes.holds
-    assert "90 s" in minutes.by
+    assert "90 s" in minutes.evidence
     enough, _ = section("ablation-samples", lambda seed, task, split, i: 30.0, tmp_path).claims
     assert enough.holds
 
@@ -202,11 +204,11 @@ def test_a_figure_has_validation_and_test_on_logarithmic_axes(
 ):
     found = section(f"ablation-{label}", lambda seed, task, split, i: 30.0 + i, tmp_path)
     ((name, figure),) = found.figures.items()
-    assert f"]({name}.svg)" in found.body
+    assert f"](figures/{name}.svg)" in markdown(found)
     assert "synthetic Human3.6M" in figure.get_suptitle()
     assert len(figure.axes) == 2
     for axes in figure.axes:
         assert axes.get_xscale() == "log"
         assert list(axes.containers[0].lines[0].get_xdata()) == places
-    assert "(default)" in found.body
-    assert "Validation " in found.body
+    assert "(default)" in markdown(found)
+    assert "Validation " in markdown(found)

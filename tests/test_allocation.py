@@ -152,11 +152,11 @@ LAYOUT = {"points": ("<f4", (17, 3))}
 
 
 def test_rows_are_allocated_before_they_are_written(tmp_path):
-    RowWriter(tmp_path / "rows", 1000, "frames", ["linear"], LAYOUT)
+    RowWriter(tmp_path / "rows", 1000, LAYOUT)
     assert taken(tmp_path / "rows" / "points") >= 1000 * 17 * 3 * 4
 
 
 def test_rows_that_the_disk_cannot_hold_are_named(tmp_path, small_files):
     with pytest.raises(OSError, match="points") as caught:
-        RowWriter(tmp_path / "rows", 1000, "frames", ["linear"], LAYOUT)
+        RowWriter(tmp_path / "rows", 1000, LAYOUT)
     assert caught.value.filename == str(tmp_path / "rows" / "points")

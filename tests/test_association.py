@@ -19,10 +19,10 @@ from ghpt.data.people.persons import (
     select_person,
     undistort_detections,
 )
-from ghpt.data.people.tracks import tracks
+from ghpt.data.people.tracks import Bodies, track_bodies
 from ghpt.data.points import KeyPoints
 from ghpt.data.synthetic.detector import Detector
-from ghpt.data.synthetic.recordings import motion
+from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
@@ -62,7 +62,7 @@ def scene(detector: Detector, rig: CameraSet, seed: int = 1) -> tuple[Detections
     parts, owner = [], []
     for person, action in enumerate(("Walking", "Greeting")):
         name = f"{person}-{seed}"
-        points = motion(seed, name, name, action, FRAMES, 50.0)
+        points = draw_motion(seed, name, name, action, FRAMES, 50.0)
         found = detector(points, rig, 50.0, seed, name, name)
         there = found.valid.any(-1)
         for view in range(len(rig)):
@@ -203,26 +203,17 @@ def test_nobody_is_no_error():
     rig = rig_of(3)
     none = np.zeros((0, 17, 2), np.float32)
     empty = np.zeros(0, np.int64)
-    assert (
-        associate(
-            rig.cameras,
-            5,
-            empty,
-            empty,
-            none,
-            np.zeros((0, 17), bool),
-            np.zeros((0, 17), np.float32),
-        )
-        == []
-    )
+    points = KeyPoints(none, np.zeros((0, 17), np.float32), np.zeros((0, 17), bool))
+    assert associate(rig.cameras, 5, empty, empty, points) == []
 
 
 def test_who_was_seen_beside_another_is_not_that_one():
     """Two stand apart; one leaves and another comes far away: a third track, not the second's."""
     body = np.random.default_rng(0).uniform(-1, 1, (17, 3)) * [300, 300, 900]
     frame, place = np.array([0, 0, 1, 1, 2, 2, 3]), np.array([0, 4000, 30, 4020, 60, 9000, 9020])
-    bodies = body + place[:, None, None] * np.array([1.0, 0, 0])
-    assert tracks(frame, bodies, np.ones((7, 17), bool)).tolist() == [0, 1, 0, 1, 0, 2, 2]
+    points = body + place[:, None, None] * np.array([1.0, 0, 0])
+    bodies = Bodies(frame, points, np.ones((7, 17), bool))
+    assert track_bodies(bodies).tolist() == [0, 1, 0, 1, 0, 2, 2]
 
 
 def test_the_real_recording_keeps_its_person(shared_data):

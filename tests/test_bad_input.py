@@ -17,10 +17,10 @@ import pytest
 import torch
 
 import toys
-from ghpt.commands.train import train
 from ghpt.config import build, plain
 from ghpt.errors import GhptConfigError, GhptDataError, GhptError
 from ghpt.files import atomic_write
+from toys import train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 

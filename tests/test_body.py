@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ghpt.data.synthetic.body import CAPSULES, SEGMENT, SEGMENTS, Body, pose, random_body
+from ghpt.data.synthetic.body import CAPSULES, SEGMENTS, Body, Segment, pose, random_body
 from ghpt.skeleton import BONES, JOINT, MIRROR
 
 PARENT = {"knee": "hip", "ankle": "knee", "elbow": "shoulder", "wrist": "elbow"}
@@ -23,6 +23,12 @@ def bones(joints: np.ndarray) -> np.ndarray:
     )
 
 
+def opposite(segment: Segment) -> Segment:
+    side, _, name = segment.name.partition("_")
+    other = {"LEFT": "RIGHT", "RIGHT": "LEFT"}
+    return Segment[f"{other[side]}_{name}"] if side in other else segment
+
+
 def test_joint_angles_never_change_the_length_of_a_bone(body):
     lengths = bones(pose(body, random_angles(0)))
     np.testing.assert_allclose(lengths, np.broadcast_to(lengths[0], lengths.shape), atol=1e-9)
@@ -31,7 +37,7 @@ def test_joint_angles_never_change_the_length_of_a_bone(body):
 def test_turning_the_pelvis_turns_the_whole_body(body):
     angles = random_angles(1)
     turned = angles.copy()
-    turned[:, SEGMENT["pelvis"], 2] += 0.7
+    turned[:, Segment.PELVIS, 2] += 0.7
     expected = pose(body, angles) @ Rotation.from_euler("z", 0.7).as_matrix().T
     np.testing.assert_allclose(pose(body, turned), expected, atol=1e-9)
 
@@ -45,16 +51,8 @@ def test_exchanging_the_sides_mirrors_a_symmetric_body(body):
     ] * [1, -1, 1]
     symmetric = Body(body.stature, offsets)
     angles = random_angles(2)
-    names = [
-        s.replace("left", "right")
-        if "left" in s
-        else s.replace("right", "left")
-        if "right" in s
-        else s
-        for s in SEGMENTS
-    ]
-    mirrored = angles[:, [SEGMENT[name] for name in names]]
-    middle = [SEGMENT[name] for name in ("pelvis", "lumbar", "thorax", "neck")]
+    mirrored = angles[:, [opposite(segment) for segment in SEGMENTS]]
+    middle = [Segment.PELVIS, Segment.LUMBAR, Segment.THORAX, Segment.NECK]
     mirrored[:, middle, 1:] *= -1
     expected = pose(symmetric, angles)[:, list(MIRROR)] * [1, -1, 1]
     np.testing.assert_allclose(pose(symmetric, mirrored), expected, atol=1e-9)
@@ -80,7 +78,7 @@ def test_exchanging_the_sides_mirrors_a_symmetric_body(body):
 )
 def test_positive_angles_move_the_way_their_names_say(body, segment, column, joint, axis, sign):
     angles = np.zeros((2, len(SEGMENTS), 3))
-    angles[1, SEGMENT[segment], column] = 0.3
+    angles[1, Segment[segment.upper()], column] = 0.3
     still, moved = pose(body, angles)[:, JOINT[joint]]
     assert sign * (moved - still)[axis] > 10.0
 
@@ -106,4 +104,4 @@ def test_the_body_stands_as_tall_as_it_should(body):
     standing = pose(body, np.zeros((1, len(SEGMENTS), 3)))[0]
     height = standing[JOINT["head_top"], 2] - standing[JOINT["right_ankle"], 2]
     assert 0.85 < height / body.stature < 0.97
-    assert all(0.01 < radius < 0.1 for _, _, radius in CAPSULES)
+    assert all(0.01 < capsule.radius < 0.1 for capsule in CAPSULES)

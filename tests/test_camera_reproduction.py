@@ -10,12 +10,12 @@ import pytest
 
 import real_layout as layout
 from ghpt.files import write_json
-from ghpt.paper.camera.tables import ARTEFACTS
+from ghpt.paper.camera.tables import ARTEFACTS, Shape
 from ghpt.paper.engine.artefact import Artefact, Results, Section
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task, perform, read_json, with_dependencies
+from sections import markdown, setup
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 SIZES = {
     "frames_sweep": {"frames": [12, 24], "draws": 1, "all_pairs": True},
     "unknown_extrinsics": {"frames": 30, "draws": 1, "stride": 8},
@@ -27,17 +27,16 @@ SMALL = (
     "trainer.max_epochs=1",
 )
 OF_CAMERAS = ("model.problem.draws=1", "model.problem.points=20")
-NONE = {"train": (), "test": ()}
 BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}
 PAIRS = ("1-2", "1-3", "1-4", "2-3", "2-4", "3-4")
 
 
 def synthetic(seed: int = 0) -> Setup:
-    return Setup(CONF, {"human36m": None, "panoptic": None}, NONE, SIZES, seed)
+    return setup(seed, **SIZES)
 
 
 def sized(real: tuple[dict[str, str | None], Path], *overrides: str, **sizes: Any) -> Setup:
-    return Setup(CONF, real[0], NONE | {"train": (*SMALL, *overrides)}, SIZES | sizes, 0)
+    return setup(0, real[0], (*SMALL, *overrides), **(SIZES | sizes))
 
 
 @pytest.fixture(scope="module")
@@ -61,18 +60,19 @@ def made_up(
     setups: list[Setup], artefact: Artefact, folder: Path, contents: Any, file: str = "result.json"
 ) -> Section:
     """The artefact's section of tasks that hold ``contents(seed, name)``."""
-    tasks = [artefact.tasks(setup) for setup in setups]
-    for setup, by_name in zip(setups, tasks, strict=True):
+    tasks = [artefact.tasks(one) for one in setups]
+    for one, by_name in zip(setups, tasks, strict=True):
         for name, task in by_name.items():
             task.folder(folder).mkdir(parents=True, exist_ok=True)
-            write_json(task.folder(folder) / file, contents(setup.seed, name))
+            write_json(task.folder(folder) / file, contents(one.seed, name))
     return artefact.section(Results(setups, tasks, folder))
 
 
 def test_sweep_of_perfect_detections_has_no_error(real):
-    setup, folder = sized(real, *OF_CAMERAS), real[1]
+    small = sized(real, *OF_CAMERAS)
+    folder = real[1]
     artefact = BY_LABEL["comparison-to-8-point"]
-    tasks = artefact.tasks(setup)
+    tasks = artefact.tasks(small)
     made(tasks, folder)
     result = read_json(tasks["12"].folder(folder) / "result.json")
     assert set(result) == set(PAIRS)
@@ -80,14 +80,14 @@ def test_sweep_of_perfect_detections_has_no_error(real):
         len(values) == 2 for errors in result.values() for values in errors.values()
     )  # a draw of each rig
     assert max(result["2-3"]["eight_point"]) < 3
-    section = artefact.section(Results([setup], [tasks], folder))
+    section = artefact.section(Results([small], [tasks], folder))
     assert "Human3.6M from" in section.data
     assert (
         "synthetic"
         not in section.data + section.figures["comparison-to-8-point"].axes[0].get_title()
     )
-    assert "of 12 cells" in section.body
-    assert "](comparison-to-8-point.svg)" in section.body
+    assert "of 12 cells" in markdown(section)
+    assert "](figures/comparison-to-8-point.svg)" in markdown(section)
 
 
 def test_sweep_of_one_pair_tests_no_other(real):
@@ -97,27 +97,28 @@ def test_sweep_of_one_pair_tests_no_other(real):
     made(tasks, folder)
     assert set(read_json(tasks["12"].folder(folder) / "result.json")) == {"2-3"}
     section = BY_LABEL["comparison-to-8-point"].section(Results([alone], [tasks], folder))
-    assert "All pairs" not in section.body
+    assert "All pairs" not in markdown(section)
 
 
 def test_tables_of_perfect_detections(real):
-    setup, folder = sized(real, *OF_CAMERAS), real[1]
-    tasks = BY_LABEL["fundamental-evaluation"].tasks(setup)
+    small = sized(real, *OF_CAMERAS)
+    folder = real[1]
+    tasks = BY_LABEL["fundamental-evaluation"].tasks(small)
     made(tasks, folder)
-    results = Results([setup], [tasks], folder)
+    results = Results([small], [tasks], folder)
     evaluation, dissection = (
         BY_LABEL[f"fundamental-{name}"].section(results) for name in ("evaluation", "dissection")
     )
     assert (len(evaluation.comparisons), len(dissection.comparisons)) == (24, 24)
     first = evaluation.comparisons[0]
-    assert (first.what, first.paper) == ("1-3 E_R", pytest.approx(17.0))
+    assert (first.label, first.paper) == ("1-3 E_R", pytest.approx(17.0))
     for row in ("1-3 paper", "1-3 ours", "1-3 difference", "PoseLib", "rig (all views)"):
-        assert f"| {row} " in evaluation.body
+        assert f"| {row} " in markdown(evaluation)
     assert [claim.holds for claim in evaluation.claims[:2]] == [True, True]  # subpixel, few pixels
-    narrow, wide = (_shape(evaluation.body, pair) for pair in ("1-3", "1-4"))
+    narrow, wide = (_shape(markdown(evaluation), pair) for pair in ("1-3", "1-4"))
     assert narrow == pytest.approx((3.7, 43), rel=0.1)  # m, degrees
     assert wide == pytest.approx((9.5, 170), rel=0.1)
-    assert "estimated t" in dissection.comparisons[-1].what
+    assert "estimated t" in dissection.comparisons[-1].label
 
 
 def _shape(body: str, pair: str) -> tuple[float, ...]:
@@ -127,8 +128,9 @@ def _shape(body: str, pair: str) -> tuple[float, ...]:
 
 
 def test_estimated_extrinsics_of_perfect_detections_cost_nothing(real):
-    setup, folder = sized(real), real[1]
-    tasks = BY_LABEL["unknown-extrinsics-evaluation"].tasks(setup)
+    small = sized(real)
+    folder = real[1]
+    tasks = BY_LABEL["unknown-extrinsics-evaluation"].tasks(small)
     tasks = {name: tasks[name] for name in ("h36m", "h36m poselib", "h36m rig")}
     made(tasks, folder)
     known = read_json(tasks["h36m"].folder(folder) / "result.json")["known"]
@@ -160,19 +162,19 @@ def test_sweep_claims_count_the_numbers_of_frames(tmp_path):
     section = made_up([synthetic()], BY_LABEL["comparison-to-8-point"], tmp_path, sweep_cells)
     better, steadier = section.claims
     assert not better.holds
-    assert "lower mean for 1 of 2" in better.by
-    assert "M = 24: 70.0 ≥ 35.0" in better.by
+    assert "lower mean for 1 of 2" in better.evidence
+    assert "M = 24: 70.0 ≥ 35.0" in better.evidence
     assert not steadier.holds
     assert (
         "below 8-point in 11 of 12, below RANSAC in 12 of 12, below PoseLib in 0 of 12 cells"
-        in section.body
+        in markdown(section)
     )
     assert "synthetic Human3.6M" in section.figures["comparison-to-8-point"].axes[0].get_title()
     several = made_up(
         [synthetic(1), synthetic(2)], BY_LABEL["comparison-to-8-point"], tmp_path, sweep_cells
     )
     assert [claim.holds for claim in several.claims] == [True, True]
-    assert "4 draws" in several.body
+    assert "4 draws" in markdown(several)
 
 
 def metrics(e3d: dict[str, float | None], alone: tuple[float, float]) -> dict[str, Any]:
@@ -210,7 +212,7 @@ def metrics(e3d: dict[str, float | None], alone: tuple[float, float]) -> dict[st
 )
 def test_claims_of_the_tables(tmp_path, monkeypatch, e3d, alone, evaluated, dissected):
     monkeypatch.setattr(
-        "ghpt.paper.camera.tables._shapes", lambda results: dict.fromkeys(PAIRS, ("1", "2"))
+        "ghpt.paper.camera.tables._shapes", lambda results: dict.fromkeys(PAIRS, Shape(1.0, 2.0))
     )
     content = metrics(dict(zip(PAIRS, e3d, strict=True)), alone)
     sections = [
@@ -225,7 +227,7 @@ def test_claims_of_the_tables(tmp_path, monkeypatch, e3d, alone, evaluated, diss
     ]
     assert [claim.holds for claim in sections[0].claims] == evaluated
     assert [claim.holds for claim in sections[1].claims] == dissected
-    assert [c.what for c in sections[0].comparisons if c.ours is None] == (
+    assert [c.label for c in sections[0].comparisons if c.ours is None] == (
         [] if e3d[0] else ["1-2 E_2D", "1-2 E_3D"]
     )
 
@@ -255,4 +257,4 @@ def test_claims_on_unknown_extrinsics(tmp_path, base, inter, held):
     assert len(section.comparisons) == 8
     assert section.comparisons[3].ours.values == (base["both"]["relative"],) * 2
     share = 100 * (base["both"]["relative"] / 20 - 1)
-    assert f" {base['both']['relative']:.1f} ± 0.0 (+{share:.1f} %) " in section.body
+    assert f" {base['both']['relative']:.1f} ± 0.0 (+{share:.1f} %) " in markdown(section)

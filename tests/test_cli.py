@@ -8,7 +8,6 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,10 +19,12 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import children
 import ghpt.commands.test as testing
 import toys
-from ghpt.commands.train import COMMAND, shell_override, train
+from ghpt.commands.display import shell_override
+from ghpt.commands.train import COMMAND
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
+from toys import train
 
 ROOT = Path(__file__).resolve().parents[1]
 SMALL = (
@@ -291,11 +292,9 @@ def test_a_stopped_run_says_how_to_go_on_and_ends_as_if_it_had_not_been(
     script = ROOT / "tests" / "reliability" / "run_toy.py"
     child = children.start(script, tmp_path, json.dumps(STOPPED))
     last = tmp_path / "last.ckpt"
-    while not last.exists():
-        assert child.poll() is None, "training ended before its first save"
-        time.sleep(0.01)
+    children.wait_until(last.exists, child)
     child.send_signal(number)
-    _, said = child.communicate(timeout=300)
+    _, said = child.communicate(timeout=children.LIMIT)
     assert child.returncode == status, said
     stopped = read_checkpoint(last)["global_step"]
     assert 0 < stopped < uninterrupted["global_step"]

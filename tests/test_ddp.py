@@ -5,27 +5,28 @@ once.
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
-import time
 from pathlib import Path
 
 import hydra
 import numpy as np
 import pytest
-import yaml
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import children
-import ghpt.commands.test as testing
 import toys
-from ghpt.commands.train import train
 from ghpt.config import plain
 from ghpt.models.checkpoint import read_checkpoint
+from toys import train
 
 ROOT = Path(__file__).resolve().parents[1]
-SMALL = ("data=toy", "progress_bar=false", "trainer.accelerator=cpu")
+SMALL = (
+    "data=toy",
+    "data.train_samples=77",
+    "progress_bar=false",
+    "trainer.accelerator=cpu",
+)
 MODELS = {
     "pose": ("model=pose", "model.hypotheses=5", "model.scorer.layers=[8]"),
     "camera": (
@@ -42,35 +43,35 @@ MODELS = {
 TWO = ("trainer.devices=2", "trainer.strategy=ddp")
 
 
-@pytest.fixture(scope="module")
-def project(tmp_path_factory):
-    """The project's commands and configuration, with a toy data set of 77 training samples."""
-    folder = tmp_path_factory.mktemp("project")
-    shutil.copytree(ROOT / "conf", folder / "conf")
-    (folder / "conf" / "data" / "toy.yaml").write_text(
-        yaml.safe_dump(toys.DATA | {"train_samples": 77})
-    )
-    for name in ("train.py", "test.py"):
-        shutil.copy(ROOT / name, folder)
-    return folder
+SCRIPT = """
+from pathlib import Path
+from ghpt.commands.app import run
+
+if __name__ == "__main__":
+    run(Path({conf!r}), {name!r})
+"""
 
 
 @pytest.fixture(scope="module")
-def typed_for_two(project):
+def typed_for_two(conf, tmp_path_factory):
     """``typed_for_two("train", *words)`` starts train.py on two processes, the second one as
     Lightning does only with ``env={}``.
     """
 
+    folder = tmp_path_factory.mktemp("scripts")
+    for name in ("train", "test"):
+        (folder / f"{name}.py").write_text(SCRIPT.format(conf=str(conf), name=name))
+
     def start(name, *words, env=children.RANKS):
-        return children.start(project / f"{name}.py", *SMALL, *TWO, *words, env=env)
+        return children.start(folder / f"{name}.py", *SMALL, *TWO, *words, env=env)
 
     return start
 
 
 @pytest.fixture(scope="module")
-def composed(project):
+def composed(conf):
     def compose(name, *words):
-        with hydra.initialize_config_dir(str(project / "conf"), version_base="1.3"):
+        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
             return plain(hydra.compose(name, overrides=[*SMALL, "output=none", *words]))
 
     return compose
@@ -106,11 +107,7 @@ def alive(pid):
 
 
 def until_saved(child, folder):
-    end = time.monotonic() + children.LIMIT
-    while not (folder / "last.ckpt").exists():
-        assert child.poll() is None, child.communicate()
-        assert time.monotonic() < end, "training did not begin"
-        time.sleep(0.05)
+    children.wait_until((folder / "last.ckpt").exists, child)
 
 
 def written(folder):
@@ -143,7 +140,7 @@ def test_testing_on_two_processes(composed, typed_for_two, tmp_path, capsys):
     train(composed("train", *MODELS["pose"]), checkpoint.parent)
     one, two = tmp_path / "one", tmp_path / "two"
     child = typed_for_two("test", f"ckpt={checkpoint}", f"output={two}")
-    testing.test(composed("test", f"ckpt={checkpoint}"), one)
+    toys.run_test(composed("test", f"ckpt={checkpoint}"), one)
     out, errors = child.communicate(timeout=children.LIMIT)
     assert child.returncode == 0, errors
     assert out == capsys.readouterr().out
@@ -209,10 +206,7 @@ def test_a_killed_process_ends_both_in_a_line_and_the_training_goes_on(
     (second,) = others_of(child.pid)
     os.kill(second if dies == "the second" else child.pid, signal.SIGKILL)
     _, errors = child.communicate(timeout=children.LIMIT)
-    end = time.monotonic() + children.LIMIT
-    while alive(second):
-        assert time.monotonic() < end, "the other process hangs"
-        time.sleep(0.05)
+    children.wait_until(lambda: not alive(second))
     if dies == "the second":
         *how, error = errors.splitlines()
         assert child.returncode == 1

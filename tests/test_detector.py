@@ -8,8 +8,8 @@ import yaml
 
 from ghpt.data.synthetic.body import occlusion, random_body, stature, trunk_frame
 from ghpt.data.synthetic.detector import KINDS, Detector
-from ghpt.data.synthetic.motion import move
-from ghpt.data.synthetic.random_processes import generator, process
+from ghpt.data.synthetic.motion import synthesize_motion
+from ghpt.data.synthetic.random_processes import gaussian_process, generator
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry import lens
 from ghpt.geometry.cameras import CameraSet, project
@@ -48,7 +48,7 @@ PERFECT = {
 
 def take(action: str = "Greeting", frames: int = 600) -> np.ndarray:
     rng = np.random.default_rng(11)
-    return move(random_body(rng), action, frames, 50.0, rng)
+    return synthesize_motion(random_body(rng), action, frames, 50.0, rng)
 
 
 def detect(
@@ -108,8 +108,8 @@ def test_familiar_people_are_found_better():
 def test_bias_turns_with_the_body_and_is_the_same_in_all_views():
     points = take("Walking")
     detector = Detector(**PERFECT | {"bias": 0.01})
-    error = detector.body_error(len(points), 50.0, 0, "S9", "take")
-    offset = detector.shown(points, error, False) - points
+    error = detector.draw_body_error(len(points), 50.0, 0, "S9", "take")
+    offset = detector.displace_joints(points, error, False) - points
     in_trunk = (trunk_frame(points).mT @ offset[:, JOINT["spine"], :, None])[..., 0]
     np.testing.assert_allclose(in_trunk, np.broadcast_to(in_trunk[0], in_trunk.shape), atol=1e-6)
     limb = points[:, JOINT["left_wrist"]] - points[:, JOINT["left_elbow"]]
@@ -121,8 +121,8 @@ def test_bias_turns_with_the_body_and_is_the_same_in_all_views():
     expected, _ = project(
         RIG.cameras,
         torch.from_numpy(
-            detector.shown(
-                points, detector.body_error(len(points), 50.0, 0, "S9", "S9/Greeting-1"), False
+            detector.displace_joints(
+                points, detector.draw_body_error(len(points), 50.0, 0, "S9", "S9/Greeting-1"), False
             )
         ),
     )
@@ -134,14 +134,15 @@ def test_bias_turns_with_the_body_and_is_the_same_in_all_views():
 
 def test_the_definition_is_mirrored_between_the_sides():
     detector = Detector(**PERFECT | {"bias": 0.01, "bias_of_subject": 0.0})
-    bias, _ = detector.body_error(10, 50.0, 0, "S9", "take")
+    bias = detector.draw_body_error(10, 50.0, 0, "S9", "take").bias
     np.testing.assert_allclose(bias[list(MIRROR)], bias * [1, 1, -1, 1], atol=1e-12)
-    np.testing.assert_array_equal(bias, detector.body_error(10, 50.0, 5, "S1", "other")[0])
+    other = detector.draw_body_error(10, 50.0, 5, "S1", "other").bias
+    np.testing.assert_array_equal(bias, other)
 
 
 def facing_joints(yaw: float) -> np.ndarray:
     """A standing person in camera coordinates, 4 m away; yaw 0 faces the camera."""
-    standing = move(
+    standing = synthesize_motion(
         random_body(np.random.default_rng(0)), "Waiting", 2, 50.0, np.random.default_rng(1)
     )
     standing = (standing - standing[:, [JOINT["pelvis"]]])[:1]
@@ -231,7 +232,7 @@ def test_a_view_does_not_depend_on_the_other_views():
 
 @pytest.mark.parametrize("persistence", [0.5, 5.0, 40.0])
 def test_processes_are_stationary_unit_gaussians(persistence):
-    values = process(generator(0, "test"), (3000,), 100, persistence)
+    values = gaussian_process(generator(0, "test"), (3000,), 100, persistence)
     np.testing.assert_allclose(values.std(axis=1), 1.0, atol=0.06)
     np.testing.assert_allclose(values.mean(axis=1), 0.0, atol=0.08)
     lag = max(round(6 * persistence), 1)
@@ -254,8 +255,9 @@ def test_every_64th_frame_can_be_detected_alone():
     points = take(frames=400)
     numbers = {"noise": 0.005, "outlier_rate": 0.1, "swap_rate": 0.02, "miss_rate": 0.05}
     detector = Detector(**PERFECT | numbers)
-    processes = detector.processes(len(points), 50.0, generator(0, "camera"))
-    whole = detector.view(points, points, RIG, 1, processes, False)
-    some = detector.view(points[::64], points[::64], RIG, 1, processes.every(64), False)
-    np.testing.assert_allclose(some[0], whole[0][::64], atol=1e-3)
-    np.testing.assert_array_equal(some[2], whole[2][::64])
+    processes = detector.draw_processes(len(points), 50.0, generator(0, "camera"))
+    sampled = processes.subsample(64)
+    whole = detector.detect_view(points, points, RIG, 1, processes, False)
+    some = detector.detect_view(points[::64], points[::64], RIG, 1, sampled, False)
+    np.testing.assert_allclose(some.key_points, whole.key_points[::64], atol=1e-3)
+    np.testing.assert_array_equal(some.valid, whole.valid[::64])

@@ -5,9 +5,12 @@ import numpy as np
 import pytest
 import torch
 
+from ghpt.files import write_json
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.pose.evaluation import NAMES, evaluate, write_metrics
-from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
+from ghpt.models.aggregation import WeightSummary
+from ghpt.models.pose.evaluation import NAMES, evaluate_poses
+from ghpt.models.pose.schema import POSES, PoseSample, PoseTables
+from ghpt.models.predictions import PredictionWriter, open_predictions, with_nan
 from ghpt.observations import PoseEstimate, Recording, Truth
 from ghpt.skeleton import JOINTS, PELVIS, SIX_JOINTS
 
@@ -57,17 +60,19 @@ def content(count: int = 60, takes: int = len(TAKES)) -> dict:
         "estimates": estimates,
         "truth": Truth(truth, torch.rand(count, 17, generator=g) > 0.1),
         "recording": recording,
-        "frame": torch.arange(count),
-        "weights": {w: torch.zeros(count) for w in WEIGHTS},
     }
 
 
 def predictions(tmp_path, values: dict, takes=TAKES):
-    count = len(values["frame"])
-    writer = PredictionWriter(tmp_path / "rows", count, tuple(values["estimates"]))
-    writer.write(torch.arange(count), **values)
-    writer.finish(tmp_path / "predictions.npz", [recording(name) for name in takes], META)
-    return open_predictions(tmp_path / "predictions.npz")
+    index = torch.arange(len(values["recording"]))
+    writer = PredictionWriter(tmp_path / "rows", len(index), tuple(values["estimates"]), POSES)
+    truth = values["truth"]
+    sample = PoseSample(with_nan(truth), truth.valid, values["recording"], index)
+    none = torch.zeros(len(index))
+    writer.write(index, values["estimates"], sample, WeightSummary(none, none, none))
+    tables = PoseTables.from_recordings([recording(name) for name in takes])
+    writer.finish(tmp_path / "predictions.npz", tables, META)
+    return open_predictions(tmp_path / "predictions.npz", POSES)
 
 
 def relative(values: dict, name: str) -> np.ndarray:
@@ -81,7 +86,7 @@ def relative(values: dict, name: str) -> np.ndarray:
 
 def test_numbers_equal_numpy_on_the_same_arrays(tmp_path):
     values = content()
-    metrics = evaluate(predictions(tmp_path, values))
+    metrics = evaluate_poses(predictions(tmp_path, values))
     recording = values["recording"].numpy()
     for name, numbers in metrics["selections"].items():
         errors = relative(values, name)
@@ -105,7 +110,7 @@ def test_numbers_equal_numpy_on_the_same_arrays(tmp_path):
 
 
 def test_form_is_the_documented_one(tmp_path):
-    metrics = evaluate(predictions(tmp_path, content()))
+    metrics = evaluate_poses(predictions(tmp_path, content()))
     assert list(metrics) == [
         "format_version",
         "data",
@@ -142,15 +147,15 @@ def test_form_is_the_documented_one(tmp_path):
 
 
 def test_without_damaged_only_where_there_are_damaged_takes(tmp_path):
-    metrics = evaluate(predictions(tmp_path, content(takes=3), takes=TAKES[1:]))
+    metrics = evaluate_poses(predictions(tmp_path, content(takes=3), takes=TAKES[1:]))
     assert all("without_damaged" not in numbers for numbers in metrics["selections"].values())
 
 
 def test_chunks_do_not_matter(tmp_path, monkeypatch):
     opened = predictions(tmp_path, content())
-    whole = evaluate(opened)
+    whole = evaluate_poses(opened)
     monkeypatch.setattr("ghpt.models.pose.evaluation._CHUNK", 7)
-    for name, numbers in evaluate(opened)["selections"].items():
+    for name, numbers in evaluate_poses(opened)["selections"].items():
         for mean in MEANS:
             assert numbers[mean] == pytest.approx(whole["selections"][name][mean], rel=1e-12)
 
@@ -158,8 +163,8 @@ def test_chunks_do_not_matter(tmp_path, monkeypatch):
 def test_nothing_to_measure_is_null_and_never_nan(tmp_path):
     values = content()
     values["truth"] = replace(values["truth"], valid=torch.zeros(60, 17, dtype=torch.bool))
-    metrics = evaluate(predictions(tmp_path, values))
-    write_metrics(tmp_path / "metrics.json", metrics)
+    metrics = evaluate_poses(predictions(tmp_path, values))
+    write_json(tmp_path / "metrics.json", metrics)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     weight = metrics["selections"]["weight"]
     assert all(weight[mean] is None for mean in (*MEANS, "coverage"))
@@ -171,6 +176,6 @@ def test_leaving_hard_joints_out_shows_in_the_coverage(tmp_path):
     full = values["estimates"]["worst"]
     hard = torch.linalg.vector_norm(full.points - values["truth"].points, dim=-1) > 60
     values["estimates"]["weight"] = PoseEstimate(full.points, full.estimated & ~hard)
-    selections = evaluate(predictions(tmp_path, values))["selections"]
+    selections = evaluate_poses(predictions(tmp_path, values))["selections"]
     assert selections["weight"]["mpjpe_absolute"] < selections["worst"]["mpjpe_absolute"]
     assert selections["weight"]["coverage"] < selections["worst"]["coverage"]

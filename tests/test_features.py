@@ -3,7 +3,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ghpt.models.pose.features import (
-    body_part_lengths,
+    bone_lengths,
     centre_on_pelvis,
     normalised_coordinates,
     torso_normal_to_z,
@@ -41,9 +41,7 @@ def test_invariant_to_translation_and_equivariant_lengths():
         normalised_coordinates(x + shift, ALL), normalised_coordinates(x, ALL)
     )
     turn = torch.from_numpy(Rotation.random(None, 3).as_matrix())
-    torch.testing.assert_close(
-        body_part_lengths(x @ turn.T + shift, ALL), body_part_lengths(x, ALL)
-    )
+    torch.testing.assert_close(bone_lengths(x @ turn.T + shift, ALL), bone_lengths(x, ALL))
 
 
 def test_a_turn_about_z_of_an_upright_normal_only_turns_the_coordinates():
@@ -74,7 +72,7 @@ def test_a_missing_joint_is_zero_and_its_value_does_not_matter(missing):
     valid[:, JOINT[missing]] = False
     other = x.clone()
     other[:, JOINT[missing]] = 1e9
-    for featurize in (normalised_coordinates, body_part_lengths):
+    for featurize in (normalised_coordinates, bone_lengths):
         torch.testing.assert_close(featurize(x, valid), featurize(other, valid))
         assert torch.isfinite(featurize(x, valid)).all()
     assert torch.equal(
@@ -82,9 +80,7 @@ def test_a_missing_joint_is_zero_and_its_value_does_not_matter(missing):
         torch.zeros(5, 3).double(),
     )
     touching = [i for i, bone in enumerate(BONES) if JOINT[missing] in bone]
-    assert torch.equal(
-        body_part_lengths(x, valid)[:, touching], torch.zeros(5, len(touching)).double()
-    )
+    assert torch.equal(bone_lengths(x, valid)[:, touching], torch.zeros(5, len(touching)).double())
 
 
 def test_without_a_pelvis_the_mean_of_the_others_is_the_origin():

@@ -9,8 +9,10 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 
 from ghpt.geometry.cameras import Cameras
 from ghpt.metrics.pose_prior import PARTS
-from ghpt.models.pose.evaluation import evaluate
-from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
+from ghpt.models.aggregation import WeightSummary
+from ghpt.models.pose.evaluation import evaluate_poses
+from ghpt.models.pose.schema import POSES, PoseSample, PoseTables
+from ghpt.models.predictions import PredictionWriter, open_predictions, with_nan
 from ghpt.observations import PoseEstimate, Recording, Truth
 from ghpt.report import figures
 from ghpt.report.tensorboard import SHOWN, write_events
@@ -58,20 +60,21 @@ def run(tmp_path, with_truth: bool = True):
     )
     g = torch.Generator().manual_seed(0)
     truth = torch.from_numpy(PERSON).float().expand(40, 17, 3) + torch.arange(40)[:, None, None]
-    writer = PredictionWriter(tmp_path / "rows", 40, SHOWN)
+    writer = PredictionWriter(tmp_path / "rows", 40, SHOWN, POSES)
     estimates = {
         name: PoseEstimate(
             truth + 20 * torch.randn(40, 17, 3, generator=g), torch.rand(40, 17, generator=g) > 0.02
         )
         for name in SHOWN
     }
-    valid = torch.full((40, 17), with_truth)
-    weights = {summary: torch.rand(40, generator=g) for summary in WEIGHTS}
+    labels = Truth(truth, torch.full((40, 17), with_truth))
+    weights = WeightSummary(*(torch.rand(40, generator=g) for _ in range(3)))
     rows = torch.arange(40)
-    writer.write(rows, estimates, Truth(truth, valid), 0 * rows, rows, weights)
-    writer.finish(tmp_path / "predictions.npz", [take], META)
-    predictions = open_predictions(tmp_path / "predictions.npz")
-    return predictions, evaluate(predictions)
+    sample = PoseSample(with_nan(labels), labels.valid, 0 * rows, rows)
+    writer.write(rows, estimates, sample, weights)
+    writer.finish(tmp_path / "predictions.npz", PoseTables.from_recordings([take]), META)
+    predictions = open_predictions(tmp_path / "predictions.npz", POSES)
+    return predictions, evaluate_poses(predictions)
 
 
 def test_view_shows_a_person_from_the_front_and_upright_in_any_world():
@@ -146,8 +149,8 @@ def test_events_hold_the_numbers_of_metrics_json(tmp_path):
         (scalar,) = events.Scalars(f"mpjpe_relative/{name}")
         assert scalar.value == pytest.approx(numbers["mpjpe_relative"], rel=1e-6)
     assert set(tags["images"]) == {"skeletons", "pose_prior/S9"}
-    assert set(tags["histograms"]) == {f"weights/{summary}" for summary in WEIGHTS}
-    entropy = predictions.read(0, 40).weights["entropy"]
+    assert set(tags["histograms"]) == {f"weights/{x}" for x in ("entropy", "max", "effective")}
+    entropy = predictions.read(0, 40).weights.entropy
     assert events.Scalars("weights/entropy")[0].value == pytest.approx(
         entropy.mean().item(), rel=1e-6
     )

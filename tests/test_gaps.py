@@ -154,7 +154,7 @@ def test_the_borders_between_shards_do_not_show(tmp_path, gaps, size):
 
 
 def test_without_a_request_nothing_is_done(tmp_path):
-    assert Gaps(None, "pchip", None, None).nothing
+    assert Gaps(None, "pchip", None, None).changes_nothing
     assert gap_frames(None, 50.0) is None
     assert len(sequence_of(3)) == 3
 
@@ -275,7 +275,7 @@ def test_what_is_no_gap_or_no_rate_is_named(fill, rate, said):
 
 @pytest.mark.parametrize(("cut_off", "rate"), [(0.1, 0.5), (0.5, 10.0), (5.9, 12.0)])
 def test_a_filter_below_half_the_rate_can_be(cut_off, rate):
-    assert not Gaps(None, "pchip", cut_off, rate).nothing
+    assert not Gaps(None, "pchip", cut_off, rate).changes_nothing
 
 
 @pytest.mark.parametrize(
@@ -294,8 +294,8 @@ def test_a_rate_or_a_cut_off_that_is_not_positive_is_named(cut_off, rate, said):
 
 
 def test_either_request_is_something_and_none_takes_no_file(tmp_path, monkeypatch):
-    assert not filling(3).nothing
-    assert not smoothing(5.0).nothing
+    assert not filling(3).changes_nothing
+    assert not smoothing(5.0).changes_nothing
     shards = Shards(tmp_path, "key", 90, 40)
     monkeypatch.setattr("ghpt.commands.prediction.gaps.allocate", None)
     with apply_gaps(Gaps(None, "linear", None, None), shards, 17, tmp_path) as chunks:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import real_layout as layout
-from ghpt.data.datasets.detections import in_image, undistorted
+from ghpt.data.datasets.detections import uncrop, undistort_key_points
 from ghpt.data.datasets.human36m import DAMAGED, human36m_files, human36m_recordings
 from ghpt.data.datasets.labels import LABELS_FILE
 from ghpt.data.synthetic.rigs import human36m_rig
@@ -149,7 +149,7 @@ def test_sides_come_from_the_order_of_joints(root: Path, takes: list) -> None:
 
 def test_scale_is_the_boxes_height_and_the_corner_is_x_y() -> None:
     box = np.array([[[[100.0, 200.0], [999.0, 392.0]]]])  # 192 high: half of the crop's 384
-    pixels, there = in_image(np.array([[[[10.0, 20.0]]]]), box)
+    pixels, there = uncrop(np.array([[[[10.0, 20.0]]]]), box)
     assert pixels.tolist() == [[[[105.0, 210.0]]]]
     assert there.all()
 
@@ -157,7 +157,7 @@ def test_scale_is_the_boxes_height_and_the_corner_is_x_y() -> None:
 def test_a_point_beyond_the_lens_is_not_seen() -> None:
     rig = human36m_rig("S1")
     K, distortion = rig.cameras.K[0].numpy(), rig.distortion[0].numpy()
-    pixels, valid = undistorted(
+    pixels, valid = undistort_key_points(
         np.full((1, 2, 2), [[600.0, 600.0], [1e7, 0]]), np.ones((1, 2), bool), K, distortion
     )
     assert valid.tolist() == [[True, False]]

@@ -16,7 +16,7 @@ from ghpt.data.datasets import panoptic
 from ghpt.data.datasets.panoptic import COCO19
 from ghpt.data.formats.skeletons import SKELETONS, canonical, joints17
 from ghpt.data.points import KeyPoints
-from ghpt.skeleton import BONES, JOINTS, MIRROR, SIX_JOINTS, SYMMETRIC_PARTS
+from ghpt.skeleton import BONES, JOINTS, MIRROR, SIX_JOINTS, SYMMETRIC_BONES
 from single_person import read_person
 
 DOCUMENTED = {
@@ -284,7 +284,7 @@ def test_the_body_s_parts_are_the_documented_ones():
         (13, 14),
         (14, 15),
     )
-    assert SYMMETRIC_PARTS == {
+    assert SYMMETRIC_BONES == {
         "upper_arm": ((13, 14), (12, 11)),
         "lower_arm": ((14, 15), (11, 10)),
         "shoulder": ((13, 8), (12, 8)),

@@ -63,8 +63,8 @@ def test_coco_results_with_a_file_for_each_camera(tmp_path):
     assert found.joints == COCO
     assert found.frame.tolist() == [5, 7, 9]
     assert found.counts().tolist() == [[2, 1], [1, 0], [0, 1]]
-    chosen = found.pick(found.first())
-    np.testing.assert_allclose(chosen.key_points[:, 0, 0, 0] - BODY[0, 0], [10, 0, -BODY[0, 0]])
+    chosen = found.points.take(found.first())
+    np.testing.assert_allclose(chosen.pixels[:, 0, 0, 0] - BODY[0, 0], [10, 0, -BODY[0, 0]])
     np.testing.assert_allclose(chosen.confidence[0, 0], BODY[:, 2])
 
 
@@ -86,7 +86,7 @@ def test_one_coco_file_whose_images_name_the_views(form, tmp_path):
     again = read_key_points(tmp_path / "results.json")
     assert again.views == ("left", "right")
     assert again.frame.tolist() == [2, 3, 4, 12]  # an image without anybody is a frame
-    np.testing.assert_array_equal(again.key_points, found.key_points)
+    np.testing.assert_array_equal(again.points.pixels, found.points.pixels)
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_mmpose_s_files_of_each_camera(meta, tmp_path):
     assert (found.views, found.joints, found.rate_hz) == (("cam1", "cam2"), COCO, 50)
     assert found.frame.tolist() == [1, 2, 3, 4]
     assert found.counts().tolist() == [[2, 1], [0, 1], [1, 0], [0, 1]]
-    np.testing.assert_allclose(found.key_points[found.first()[3, 1]], BODY[:, :2] + [3, 0])
+    np.testing.assert_allclose(found.points.pixels[found.first()[3, 1]], BODY[:, :2] + [3, 0])
 
 
 def test_the_joints_are_those_that_mmpose_names(tmp_path):

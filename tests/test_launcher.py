@@ -8,7 +8,6 @@ import re
 import shlex
 import signal
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -81,7 +80,7 @@ def test_a_sweep_says_the_same_wherever_its_jobs_run(toy, tmp_path, launcher):
     child = toy(
         "-m", "how=well,user", f"hydra/launcher={launcher}", path=commands(tmp_path, **SLURM)
     )
-    said, errors = child.communicate(timeout=300)
+    said, errors = child.communicate(timeout=children.LIMIT)
     jobs, after = lines(said)
     assert child.returncode == 1, errors
     assert jobs == WELL_AND_NOT
@@ -98,7 +97,7 @@ def test_a_sweep_says_the_same_wherever_its_jobs_run(toy, tmp_path, launcher):
 @pytest.mark.posix
 def test_a_job_that_dies_is_named_and_the_others_finish(toy, tmp_path):
     child = toy("-m", "how=killed,fault,exits,well", LOCAL)
-    said, errors = child.communicate(timeout=300)
+    said, errors = child.communicate(timeout=children.LIMIT)
     (killed, *others), after = lines(said)
     assert child.returncode == 1, errors
     log = re.fullmatch(
@@ -117,12 +116,9 @@ def test_a_job_that_dies_is_named_and_the_others_finish(toy, tmp_path):
 @pytest.mark.posix
 def test_an_interrupt_stops_every_job(toy, tmp_path):
     child = toy("-m", "how=well,waits", LOCAL)
-    end = time.monotonic() + 300
-    while not (tmp_path / "out" / "1_how-waits" / "begun").exists():
-        assert time.monotonic() < end, "the job did not begin"
-        time.sleep(0.05)
+    children.wait_until((tmp_path / "out" / "1_how-waits" / "begun").exists, child)
     child.send_signal(signal.SIGINT)
-    said, errors = child.communicate(timeout=300)
+    said, errors = child.communicate(timeout=children.LIMIT)
     assert child.returncode == 130, errors
     assert lines(said) == (["  0_how-well: done", "  1_how-waits: stopped"], None)
     assert "Traceback" not in errors
@@ -140,7 +136,7 @@ def test_what_sbatch_refuses_is_said_in_one_line(toy, tmp_path):
         "hydra.launcher.partition=gpuu",
     )
     child = toy(*words, path=commands(tmp_path, **refusing))
-    _, errors = child.communicate(timeout=300)
+    _, errors = child.communicate(timeout=children.LIMIT)
     assert child.returncode == 1
     assert errors.splitlines()[-1].startswith(
         "error: hydra.launcher: sbatch: error: invalid partition specified: gpuu"

@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from ghpt.data.formats.mediapipe import read_caliscope
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
 from single_person import read_person
@@ -38,11 +37,10 @@ def test_rows_become_an_array_whatever_their_order(tmp_path):
 
 
 def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):
-    _, _, points, valid = read_caliscope(
-        table(tmp_path, "0,0,0,1.5,0,10,20,,", "0,1,0,1.5,0,,,,", "0,1,0,1.5,1,3,4,,")
-    )
-    assert valid[0, :, :2].tolist() == [[True, False], [False, True]]
-    assert (points[~valid] == 0).all()
+    rows = ("0,0,0,1.5,0,10,20,,", "0,1,0,1.5,0,,,,", "0,1,0,1.5,1,3,4,,")
+    found = read_person(table(tmp_path, *rows))
+    assert found.valid[0, :, :2].tolist() == [[True, False], [False, True]]
+    assert (found.key_points[~found.valid] == 0).all()
 
 
 @pytest.mark.parametrize(

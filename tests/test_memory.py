@@ -21,7 +21,6 @@ def child(folder: str, frames: int) -> None:
     import numpy as np
 
     import toys
-    from ghpt.commands.test import test
 
     class Longer(toys.ToyData):
         def generate(self, split):
@@ -57,14 +56,14 @@ def child(folder: str, frames: int) -> None:
             time.sleep(0.005)
 
     threading.Thread(target=watch, daemon=True).start()
-    metrics = test(config, Path(folder) / str(frames))
+    metrics = toys.run_test(config, Path(folder) / str(frames)).metrics
     print(json.dumps({"peak": peak[0], "frames": metrics["frames"]}))
 
 
 @pytest.mark.skipif(not memory.STATUS.is_file(), reason="needs Linux's /proc")
 def test_testing_holds_one_batch_however_many_frames(tmp_path):
     import toys
-    from ghpt.commands.train import train
+    from toys import train
 
     train(toys.TRAIN, tmp_path)
     peaks = []

@@ -35,7 +35,7 @@ class Numbers(Samples):
     number: torch.Tensor
 
 
-class GuessTheNumber:
+class GuessTheNumber(Problem):
     """Hypotheses are the truth plus noise; the feature is the noise, so a scorer can learn to
     prefer little of it.
     """
@@ -133,10 +133,10 @@ def test_a_pool_gives_every_estimate_and_a_summary_of_the_weights():
     for name in ("most", "least", "stochastic", "random"):
         assert (errors["best"] <= errors[name]).all()
         assert (errors[name] <= errors["worst"]).all()
-    assert (
-        (summary["entropy"] >= 0) & (summary["entropy"] <= torch.log(torch.tensor(20.0)) + 1e-5)
-    ).all()
-    assert ((summary["effective"] >= 1 - 1e-5) & (summary["effective"] <= 20 + 1e-4)).all()
+    assert (summary.entropy >= 0).all()
+    assert (summary.entropy <= torch.log(torch.tensor(20.0)) + 1e-5).all()
+    assert (summary.effective >= 1 - 1e-5).all()
+    assert (summary.effective <= 20 + 1e-4).all()
 
 
 def test_the_first_hypotheses_are_those_of_a_smaller_pool():

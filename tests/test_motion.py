@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from ghpt.data.synthetic.actions import Postures, action_names
 from ghpt.data.synthetic.body import random_body
-from ghpt.data.synthetic.motion import actions, keyframes, move
+from ghpt.data.synthetic.motion import keyframes, synthesize_motion
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS
 
 RATE = 50.0
@@ -28,7 +29,7 @@ HUMAN36M = {
 def take(action: str, seed: int = 0, frames: int = 1000) -> tuple[np.ndarray, float]:
     rng = np.random.default_rng(seed)
     body = random_body(rng)
-    return move(body, action, frames, RATE, rng), body.stature
+    return synthesize_motion(body, action, frames, RATE, rng), body.stature
 
 
 def speed(joints: np.ndarray) -> np.ndarray:
@@ -43,10 +44,10 @@ def bend(joints: np.ndarray, side: str, chain: tuple[str, str, str]) -> np.ndarr
 
 
 def test_the_15_actions_are_there():
-    assert set(actions()) == HUMAN36M | {"RangeOfMotion"}
+    assert set(action_names()) == HUMAN36M | {"RangeOfMotion"}
 
 
-@pytest.mark.parametrize("action", actions())
+@pytest.mark.parametrize("action", action_names())
 def test_motion_is_possible(action):
     joints, stature = take(action)
     assert joints.shape == (1000, len(JOINTS), 3)
@@ -67,7 +68,7 @@ def test_motion_is_possible(action):
     assert lowest.max() < 0.14 * stature
 
 
-@pytest.mark.parametrize("action", actions())
+@pytest.mark.parametrize("action", action_names())
 def test_knees_bend_backward(action):
     joints, _ = take(action, seed=1)
     across = joints[:, JOINT["left_hip"]] - joints[:, JOINT["right_hip"]]
@@ -77,7 +78,7 @@ def test_knees_bend_backward(action):
         assert ((ankle - knee) * forward).sum(axis=-1).max() < 0
 
 
-@pytest.mark.parametrize("action", actions())
+@pytest.mark.parametrize("action", action_names())
 def test_elbows_bend_one_way_about_the_upper_arm(action):
     # However the arm is turned, the shoulder-elbow-wrist plane's normal has one sign against the
     # humeral axis' x: so a straight arm is never passed.
@@ -131,7 +132,7 @@ def test_left_handed_people_use_the_other_hand():
     rng = np.random.default_rng
     body = random_body(rng(0))
     lifted = [
-        move(body, "Phoning", 500, RATE, rng(1), left_handed)[
+        synthesize_motion(body, "Phoning", 500, RATE, rng(1), left_handed)[
             :, [JOINT["right_wrist"], JOINT["left_wrist"]], 2
         ]
         for left_handed in (False, True)
@@ -142,10 +143,8 @@ def test_left_handed_people_use_the_other_hand():
 
 def test_keyframes_rest_in_the_postures_and_stay_between_them():
     time = np.arange(4000) / RATE
-    postures = np.array([[0.0, 1.0], [1.0, 0.0]])
-    curve = keyframes(
-        np.random.default_rng(5), time, postures, [1.0, 3.0], 0.0, hold=1.0, reach=0.5
-    )
+    postures = Postures(np.array([[0.0, 1.0], [1.0, 0.0]]), np.array([1.0, 3.0]))
+    curve = keyframes(np.random.default_rng(5), time, postures, 0.0, hold=1.0, reach=0.5)
     assert curve.min() >= 0
     assert curve.max() <= 1
     resting = np.abs(np.diff(curve[:, 0])) == 0

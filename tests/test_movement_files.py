@@ -90,8 +90,8 @@ def test_what_movement_reads_is_taken_by_name(tmp_path, monkeypatch):
     assert found.views == ("cam1", "cam2")
     assert set(found.joints) < set(SKELETONS["coco_17"])
     assert found.counts().tolist() == [[2, 2]] * 3 + [[1, 1]] + [[2, 2]]
-    np.testing.assert_array_equal(found.key_points[:2], np.stack([POINTS[0], POINTS[0] + 600]))
-    assert found.confidence[0, 1:4].tolist() == [0.7, 1, 0.7]
+    np.testing.assert_array_equal(found.points.pixels[:2], np.stack([POINTS[0], POINTS[0] + 600]))
+    assert found.points.confidence[0, 1:4].tolist() == [0.7, 1, 0.7]
 
 
 def test_what_movement_cannot_read_is_named(tmp_path, monkeypatch):

@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ghpt.models.pose.evaluation import write_metrics
+from ghpt.files import write_json
 from ghpt.models.relative_pose.evaluation import (
     ALONE,
     ERRORS,
@@ -130,7 +130,7 @@ def test_form_is_the_documented_one(tmp_path):
                 np.mean([pair[error] for pair in numbers["pairs"].values()])
             )
     assert NAMES[-1] == "rig"
-    write_metrics(tmp_path / "metrics.json", metrics)
+    write_json(tmp_path / "metrics.json", metrics)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
 
 
@@ -166,7 +166,7 @@ def test_a_median_that_is_infinite_is_null_in_the_file(tmp_path):
     without(values, "weight", first & (values["draw"] % 5 < 4))
     without(values, "average", torch.ones(60, dtype=torch.bool))
     metrics = evaluate_pairs(written(tmp_path, RIGS, values))
-    write_metrics(tmp_path / "metrics.json", metrics)
+    write_json(tmp_path / "metrics.json", metrics)
     read = json.loads((tmp_path / "metrics.json").read_text())["selections"]
     assert read["weight"]["pairs"]["1-2"]["E_3D"] is None
     assert read["weight"]["pairs"]["1-2"]["coverage"] == pytest.approx(0.2)

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from ghpt.errors import GhptDataError, GhptError
-from ghpt.models.pose.predictions import open_predictions
-from ghpt.models.relative_pose.predictions import PairWriter, open_pairs
+from ghpt.models.pose.schema import POSES
+from ghpt.models.predictions import PredictionWriter, open_predictions
+from ghpt.models.relative_pose.schema import PAIRS, RigTables
 from ghpt.observations import RelativePoseEstimate
-from pair_report import META, NAMES, content, rig, written
+from pair_report import META, NAMES, content, rig, write_rows, written
 from test_predictions import array, changed, write_all
 
 RIGS = [rig(9), rig(11)]
@@ -26,28 +27,30 @@ def test_round_trip(tmp_path):
     opened = written(tmp_path, RIGS, values)
     assert len(opened) == 2 * 3 * 6
     assert opened.names == NAMES
-    assert opened.rig_name == ("S9", "S11")
-    assert opened.camera_name == (("c0", "c1", "c2", "c3"),) * 2
+    assert opened.tables.rig_name.tolist() == ["S9", "S11"]
+    assert opened.tables.camera_name.tolist() == [["c0", "c1", "c2", "c3"]] * 2
     assert {**META, "problem": "camera", "unit": "mm"}.items() <= opened.meta.items()
     for field in ("K", "R", "t"):
         assert torch.equal(
-            getattr(opened.cameras, field), torch.stack([getattr(r.cameras, field) for r in RIGS])
+            getattr(opened.tables.cameras, field),
+            torch.stack([getattr(r.cameras, field) for r in RIGS]),
         )
-    assert torch.equal(opened.points, torch.stack([r.points for r in RIGS]))
+    assert torch.equal(opened.tables.points, torch.stack([r.points for r in RIGS]))
     chunks = list(opened.chunks(16))
-    assert [len(chunk.rig) for chunk in chunks] == [16, 16, 4]
+    assert [len(chunk.sample.rig) for chunk in chunks] == [16, 16, 4]
     for field in ("rig", "draw", "pair"):
-        assert torch.equal(torch.cat([getattr(c, field) for c in chunks]), values[field])
-    assert torch.equal(torch.cat([c.truth_R for c in chunks]), values["truth"][0])
-    assert torch.equal(torch.cat([c.truth_t for c in chunks]), values["truth"][1])
+        assert torch.equal(torch.cat([getattr(c.sample, field) for c in chunks]), values[field])
+    assert torch.equal(torch.cat([c.sample.truth_R for c in chunks]), values["truth"][0])
+    assert torch.equal(torch.cat([c.sample.truth_t for c in chunks]), values["truth"][1])
     for name, estimate in values["estimates"].items():
         for field in ("R", "t", "estimated"):
             assert torch.equal(
                 torch.cat([getattr(c.estimates[name], field) for c in chunks]),
                 getattr(estimate, field),
             ), (name, field)
-    for name, summary in values["weights"].items():
-        assert torch.equal(torch.cat([c.weights[name] for c in chunks]), summary)
+    for field in ("entropy", "max", "effective"):
+        stored = torch.cat([getattr(c.weights, field) for c in chunks])
+        assert torch.equal(stored, getattr(values["weights"], field))
 
 
 def test_numpy_alone_reads_it_and_missing_is_nan(path):
@@ -65,31 +68,22 @@ def test_bytes_depend_on_the_content_alone_not_on_the_order_or_the_processes(tmp
     values = content(RIGS, draws=2)
     count = len(values["draw"])
     writers = [
-        PairWriter(tmp_path / "shared", count, NAMES) for _ in range(2)
+        PredictionWriter(tmp_path / "shared", count, NAMES, PAIRS) for _ in range(2)
     ]  # as two processes have them
     order = torch.randperm(count, generator=torch.Generator().manual_seed(0))
     for turn, rows in enumerate(order.split(5)):
-        writers[turn % 2].write(
-            rows,
-            {
-                n: RelativePoseEstimate(e.R[rows], e.t[rows], e.estimated[rows])
-                for n, e in values["estimates"].items()
-            },
-            tuple(x[rows] for x in values["truth"]),
-            *(values[key][rows] for key in ("rig", "draw", "pair")),
-            {key: value[rows] for key, value in values["weights"].items()},
-        )
-    writers[0].finish(tmp_path / "two.npz", RIGS, META)
+        write_rows(writers[turn % 2], rows, values)
+    writers[0].finish(tmp_path / "two.npz", RigTables.from_rigs(RIGS), META)
     assert (tmp_path / "two.npz").read_bytes() == path.read_bytes()
     assert not (tmp_path / "shared").exists()
 
 
 def test_a_missing_row_is_an_error_that_says_so(tmp_path):
     values = content(RIGS[:1], draws=1)
-    writer = PairWriter(tmp_path / "rows", 7, NAMES)
-    writer.write(torch.arange(6), **values)
-    with pytest.raises(GhptError, match="1 of 7 pairs have no prediction"):
-        writer.finish(tmp_path / "p.npz", RIGS[:1], META)
+    writer = PredictionWriter(tmp_path / "rows", 7, NAMES, PAIRS)
+    write_rows(writer, torch.arange(6), values)
+    with pytest.raises(GhptError, match="1 of 7 samples have no prediction"):
+        writer.finish(tmp_path / "p.npz", RigTables.from_rigs(RIGS[:1]), META)
     assert not (tmp_path / "p.npz").exists()
 
 
@@ -132,7 +126,7 @@ def test_arrays_that_do_not_belong_together_are_refused(tmp_path, path, member, 
 
     spoilt = changed(path, tmp_path, change)
     with pytest.raises(GhptDataError, match=field) as caught:
-        open_pairs(spoilt)
+        open_predictions(spoilt, PAIRS)
     assert str(spoilt) in str(caught.value)
 
 
@@ -150,14 +144,14 @@ def test_rows_that_name_what_is_not_there_are_refused(tmp_path, path, member, va
         path, tmp_path, lambda members: members.update({f"{member}.npy": array(value)})
     )
     with pytest.raises(GhptDataError, match=member):
-        open_pairs(spoilt).read(0, 1)
+        open_predictions(spoilt, PAIRS).read(0, 1)
 
 
 def test_one_problem_s_file_is_not_taken_for_the_other_s(tmp_path, path):
-    with pytest.raises(GhptDataError, match="not a readable"):
-        open_predictions(path)
-    with pytest.raises(GhptDataError, match="not a readable"):
-        open_pairs(write_all(tmp_path, name="poses.npz"))
+    with pytest.raises(GhptDataError, match="'camera', not 'pose'"):
+        open_predictions(path, POSES)
+    with pytest.raises(GhptDataError, match="'pose', not 'camera'"):
+        open_predictions(write_all(tmp_path, name="poses.npz"), PAIRS)
 
 
 def test_damage_is_refused(tmp_path, path):
@@ -165,8 +159,8 @@ def test_damage_is_refused(tmp_path, path):
     for length in range(0, len(whole), 997):
         path.write_bytes(whole[:length])
         with pytest.raises(GhptDataError):
-            open_pairs(path)
+            open_predictions(path, PAIRS)
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("meta.npy", bytes(5 << 20))
     with pytest.raises(GhptDataError, match="compressed"):
-        open_pairs(tmp_path / "bomb.npz")
+        open_predictions(tmp_path / "bomb.npz", PAIRS)

@@ -26,10 +26,10 @@ def test_sweep_shows_means_bands_and_the_cut():
 
 
 def test_sweep_table_has_mean_deviation_and_median():
-    lines = sweep_table(
-        {"weight": {10: [10.0, 12.0, 17.0]}, "eight_point": {10: [np.inf, 1.0, 3.0], 20: [2.0]}}
-    )
-    cells = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines.splitlines()]
-    assert cells[0] == ["M", "weight", "8-point"]
-    assert cells[2] == ["10", "13.0 ± 3.6 (12.0)", "– ± – (3.0)"]
-    assert cells[3] == ["20", "–", "2.0 ± 0.0 (2.0)"]
+    eight_point = {10: [np.inf, 1.0, 3.0], 20: [2.0]}
+    table = sweep_table({"weight": {10: [10.0, 12.0, 17.0]}, "eight_point": eight_point})
+    assert table.header == ["M", "weight", "8-point"]
+    assert table.rows == [
+        ["10", "13.0 ± 3.6 (12.0)", "– ± – (3.0)"],
+        ["20", "–", "2.0 ± 0.0 (2.0)"],
+    ]

@@ -8,7 +8,15 @@ from rich.console import Console
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.models.relative_pose.evaluation import ALONE, ERRORS, NAMES
 from ghpt.paper import published as paper
-from ghpt.report.pair_tables import comparison, dissection, of_paper, pair_report, print_pair_tables
+from ghpt.report.markdown import render_markdown
+from ghpt.report.pair_tables import (
+    comparison_table,
+    dissection_table,
+    pair_report_document,
+    pair_summary_document,
+    paper_numbers,
+)
+from ghpt.report.terminal import print_document
 
 
 def metrics(
@@ -47,9 +55,14 @@ def metrics(
     }
 
 
+def report(**changes) -> str:
+    return render_markdown(pair_report_document(metrics(**changes)))
+
+
 def printed(values: dict) -> list[str]:
     buffer = io.StringIO()
-    print_pair_tables(values, Console(file=buffer, width=80, color_system=None))
+    console = Console(file=buffer, width=80, color_system=None)
+    print_document(pair_summary_document(values), console)
     return buffer.getvalue().splitlines()
 
 
@@ -67,7 +80,7 @@ def test_the_pairs_that_the_paper_calls_diagonal_are_not():
 
 
 def test_paper_values_only_where_the_paper_has_them():
-    assert of_paper(metrics(), paper.FUNDAMENTAL)["1-3"]["E_2D"] == 3.7
+    assert paper_numbers(metrics(), paper.FUNDAMENTAL)["1-3"]["E_2D"] == 3.7
     for other in (
         {"data": "cmu3"},
         {"split": "validation"},
@@ -76,8 +89,8 @@ def test_paper_values_only_where_the_paper_has_them():
         {"views": 5},
         {"frames": 20},
     ):
-        assert of_paper(metrics(**other), paper.FUNDAMENTAL) == {}, other
-        assert "brackets" not in pair_report(metrics(**other))
+        assert paper_numbers(metrics(**other), paper.FUNDAMENTAL) == {}, other
+        assert "brackets" not in report(**other)
 
 
 @pytest.mark.parametrize("views", [2, 4, 5, 7])
@@ -101,15 +114,15 @@ def test_the_first_table_has_every_pair_with_the_papers_numbers_beside():
 
 
 def test_many_pairs_are_summed_up():
-    header, rows = comparison(metrics(views=7))
-    assert header == ["selection", "median", "worst", "its pair", "mean", "cov"]
-    assert rows[0] == ["weight", "11000", "–", "1-2", "–", "98.7"]
+    table = comparison_table(metrics(views=7))
+    assert table.header == ["selection", "median", "worst", "its pair", "mean", "cov"]
+    assert table.rows[0] == ["weight", "11000", "–", "1-2", "–", "98.7"]
     assert "the 10 worst of 21 pairs" in " ".join(printed(metrics(views=7)))
-    assert "| 6-7 " in pair_report(metrics(views=7))  # the report has all
+    assert "| 6-7 " in report(views=7)  # the report has all
 
 
 def test_report_has_every_number_of_every_name():
-    text = pair_report(metrics())
+    text = report()
     assert text.startswith(
         "# Relative camera poses on synthetic Human3.6M, test split, trained on synthetic"
     )
@@ -121,12 +134,12 @@ def test_report_has_every_number_of_every_name():
     ) == 1 + 2 * len(ERRORS)
     assert "nan" not in text.lower().replace("finan", "")
     assert "None" not in text
-    real = pair_report(metrics(source="/data/h36m"))
+    real = report(source="/data/h36m")
     assert "synthetic" not in real
     assert "/data/h36m" in real.splitlines()[0]
 
 
 def test_dissection_is_beside_the_papers():
-    header, rows = dissection(metrics())
-    assert len(header) == 5
-    assert rows[0] == ["1-3", "0.40 (1.2)", "– (10.8)", "0.40 (1.8)", "– (18.2)"]
+    table = dissection_table(metrics())
+    assert len(table.header) == 5
+    assert table.rows[0] == ["1-3", "0.40 (1.2)", "– (10.8)", "0.40 (1.8)", "– (18.2)"]

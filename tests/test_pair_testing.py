@@ -11,12 +11,13 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import toys
-from ghpt.commands.test import summary, test
-from ghpt.commands.train import train
+from ghpt.commands.test import summary
 from ghpt.config import plain
 from ghpt.errors import GhptConfigError
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.models.relative_pose.predictions import open_pairs
+from ghpt.models.predictions import open_predictions
+from ghpt.models.relative_pose.schema import PAIRS
+from toys import train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 SMALL = [
@@ -48,8 +49,6 @@ def settings(checkpoint: Path, **changes: Any) -> dict[str, Any]:
         toys.TRAIN
         | {
             "ckpt": str(checkpoint),
-            "hypotheses": None,
-            "frames": None,
             "camera_baselines": BASELINES,
             "baselines": {},
         }
@@ -58,7 +57,8 @@ def settings(checkpoint: Path, **changes: Any) -> dict[str, Any]:
 
 
 def test_files_table_and_events(checkpoint, tmp_path, capsys):
-    metrics = test(settings(checkpoint), tmp_path)
+    result = toys.run_test(settings(checkpoint), tmp_path)
+    metrics = result.metrics
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert (metrics["problem"], metrics["frames"], metrics["draws"]) == ("camera", 8, 2)
     assert list(metrics["selections"]) == [*AGGREGATIONS, "eight_point"]
@@ -75,7 +75,7 @@ def test_files_table_and_events(checkpoint, tmp_path, capsys):
     assert max(map(len, shown.splitlines())) <= 80
     assert "8-point" in shown
     assert "synthetic toy" in " ".join((tmp_path / "report.md").read_text().split())
-    assert f"{metrics['selections']['weight']['E_3D']:.1f} mm" in summary(metrics)
+    assert f"{metrics['selections']['weight']['E_3D']:.1f} mm" in summary(result)
     tags = EventAccumulator(str(tmp_path), size_guidance={"images": 0}).Reload().Tags()
     assert "rig" in tags["images"]
     assert {"E_3D/weight", "E_3D 1-2/eight_point", "weights/entropy", "final/weight"} <= set(
@@ -85,11 +85,11 @@ def test_files_table_and_events(checkpoint, tmp_path, capsys):
 
 
 def test_every_estimate_has_the_length_that_the_problem_s_scale_gives(checkpoint, tmp_path):
-    test(settings(checkpoint), tmp_path)
-    opened = open_pairs(tmp_path / "predictions.npz")
+    toys.run_test(settings(checkpoint), tmp_path)
+    opened = open_predictions(tmp_path / "predictions.npz", PAIRS)
     chunk = opened.read(0, len(opened))
-    a, b = (opened.cameras.centre[chunk.rig, chunk.pair[:, i]] for i in (0, 1))
-    torch.testing.assert_close(chunk.truth_t.norm(dim=-1), (a - b).norm(dim=-1))
+    a, b = (opened.tables.cameras.centre[chunk.sample.rig, chunk.sample.pair[:, i]] for i in (0, 1))
+    torch.testing.assert_close(chunk.sample.truth_t.norm(dim=-1), (a - b).norm(dim=-1))
     for name in ("most", "best", "eight_point"):
         estimate = chunk.estimates[name]
         assert estimate.estimated.all(), name
@@ -99,15 +99,15 @@ def test_every_estimate_has_the_length_that_the_problem_s_scale_gives(checkpoint
 
 
 def test_another_number_of_frames_can_be_tested(checkpoint, tmp_path):
-    metrics = test(settings(checkpoint, frames=20, hypotheses=4), tmp_path)
-    assert metrics["frames"] == 20
+    result = toys.run_test(settings(checkpoint, frames=20, hypotheses=4), tmp_path)
+    assert result.metrics["frames"] == 20
     with pytest.raises(GhptConfigError, match="is 'many', not an integer"):
-        test(settings(checkpoint, frames="many"), tmp_path)
+        toys.run_test(settings(checkpoint, frames="many"), tmp_path)
 
 
 def test_the_same_bytes_twice(checkpoint, tmp_path):
     for name in ("a", "b"):
-        test(settings(checkpoint), tmp_path / name)
+        toys.run_test(settings(checkpoint), tmp_path / name)
     one, two = (np.load(tmp_path / name / "predictions.npz") for name in ("a", "b"))
     assert one.files == two.files
     for member in one.files:
@@ -115,9 +115,8 @@ def test_the_same_bytes_twice(checkpoint, tmp_path):
 
 
 def test_baselines_of_the_other_problem_are_not_built(checkpoint, tmp_path):
-    metrics = test(
-        settings(checkpoint, baselines={"linear": {"_target_": "no.such.Class"}}), tmp_path
-    )
-    assert "linear" not in metrics["selections"]
-    with pytest.raises(GhptConfigError, match="camera_baselines: is 3, not a group"):
-        test(settings(checkpoint, camera_baselines=3), tmp_path)
+    other = {"linear": {"_target_": "no.such.Class"}}
+    result = toys.run_test(settings(checkpoint, baselines=other), tmp_path)
+    assert "linear" not in result.metrics["selections"]
+    with pytest.raises(GhptConfigError, match="camera_baselines: is 3, not a"):
+        toys.run_test(settings(checkpoint, camera_baselines=3), tmp_path)

@@ -49,14 +49,14 @@ def test_a_batch_holds_the_recordings_values_of_its_frames(samples):
         rig, draw, pair = pairs.locate(sample)
         labelled = pairs[[sample]]
         batch = labelled.observations
-        frames = pairs.frames_of(rig, draw)
+        frames = pairs.locate_frames(rig, draw)
         assert sum(len(positions) for _, positions in frames) == 12
         assert all(len(set(positions)) == len(positions) for _, positions in frames)
         expected = np.concatenate([data[r].key_points[positions] for r, positions in frames])
         np.testing.assert_array_equal(batch.key_points[0].transpose(0, 1).numpy(), expected)
         valid = np.concatenate([data[r].valid[positions] for r, positions in frames])
         np.testing.assert_array_equal(
-            batch.of_pair(batch.valid)[0].numpy(), valid[:, list(pair)].swapaxes(0, 1)
+            batch.select_pair(batch.valid)[0].numpy(), valid[:, list(pair)].swapaxes(0, 1)
         )
         cameras = data[frames[0][0]].cameras.index(list(pair))
         assert torch.equal(labelled.truth.cameras.t[0], cameras.t)
@@ -77,12 +77,12 @@ def test_training_samples_take_all_rigs_and_pairs_and_their_own_frames():
     assert {rig for rig, _, _ in places} == {0, 1}
     assert {pair for _, _, pair in places} == {(0, 1), (0, 2), (1, 2)}
     assert len({draw for _, draw, _ in places}) == 200
-    assert len({tuple(pairs.frames_of(0, draw)[0][1]) for draw in range(50)}) == 50
+    assert len({tuple(pairs.locate_frames(0, draw)[0][1]) for draw in range(50)}) == 50
 
 
 def test_frames_are_drawn_evenly():
     pairs = Pairs(recordings()[2:], PairSettings(10, 1, 5), seed=0, samples=3000)
-    drawn = np.concatenate([pairs.frames_of(0, draw)[0][1] for draw in range(3000)])
+    drawn = np.concatenate([pairs.locate_frames(0, draw)[0][1] for draw in range(3000)])
     count = np.bincount(drawn, minlength=30)
     assert count.sum() == 30_000
     assert (

@@ -120,7 +120,7 @@ def test_reads_the_real_calibration_and_bodies(shared_data: Path, tmp_path: Path
             frame=frames,
             key_points=np.full((*count, 2), 500.0),
             confidence=np.ones(count),
-            valid=np.ones(count, bool),
+            seen=np.ones(count, bool),
         )
     recording, rig = read(tmp_path, "train", ALL), panoptic_rig(ALL)
     for name in ("K", "R", "t"):
@@ -175,7 +175,7 @@ def test_unseen_has_no_confidence_and_no_number(root: Path) -> None:
     valid[4, 5] = False
     points = np.load(root / NAME / "keypoints" / "00_03.npz")["key_points"]
     points[4, 5], points[6, 7] = np.nan, np.inf
-    rewrite(root, "00_03", valid=valid, key_points=points)
+    rewrite(root, "00_03", seen=valid, key_points=points)
     recording = read(root, "train", (3, 6))
     assert np.argwhere(~recording.valid).tolist() == [[4, 0, 5], [6, 0, 7]]
     assert not recording.confidence[~recording.valid].any()
@@ -343,7 +343,7 @@ BAD = {
         detections(confidence=np.full((20, 17), np.nan)),
         "confidence: is not between 0 and 1",
     ),
-    "seen as number": (detections(valid=np.ones((20, 17))), "seen: holds float64, not booleans"),
+    "seen as number": (detections(seen=np.ones((20, 17))), "seen: holds float64, not booleans"),
 }
 
 

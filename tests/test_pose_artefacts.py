@@ -10,7 +10,6 @@ import pytest
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.paper.engine.artefact import Comparison, Results, Spread
-from ghpt.paper.engine.setup import Setup
 from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
 from ghpt.paper.pose import figures as pose_figures
 from ghpt.paper.published import (
@@ -20,12 +19,10 @@ from ghpt.paper.published import (
     QUANTITATIVE_HYPOTHESES,
     SOTA,
 )
+from sections import markdown, setup
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
-SETUP = Setup(CONF, {"human36m": None, "panoptic": None}, {"train": (), "test": ()}, {}, 0)
-REAL = Setup(
-    CONF, {"human36m": "/data/human36m", "panoptic": "/data/panoptic"}, SETUP.overrides, {}, 0
-)
+SETUP = setup()
+REAL = setup(roots={"human36m": "/data/human36m", "panoptic": "/data/panoptic"})
 ARTEFACTS = {
     i.label: i
     for part in (generalization, other_systems, base_dataset, pose_figures, view_weights)
@@ -112,7 +109,7 @@ def test_the_papers_own_numbers_have_no_miss_and_all_of_its_claims(label):
     }
     for number in section.comparisons:
         assert abs(number.difference) <= rounding.get(label, 1e-9), number
-    assert "miss" not in section.body
+    assert "miss" not in markdown(section)
     assert "synthetic" not in section.data
     synthetic = ARTEFACTS[label].section(Fake(same))
     assert "synthetic" in synthetic.data
@@ -132,7 +129,7 @@ def test_a_worse_model_misses_and_its_claims_fall(label):
     section = ARTEFACTS[label].section(Fake(worse, setup=REAL))
     assert any(number.miss for number in section.comparisons)
     assert not all(claim.holds for claim in section.claims)
-    assert "(miss)" in section.body or label == "remelli-comparison"
+    assert "(miss)" in markdown(section) or label == "remelli-comparison"
 
 
 def test_numbers_over_seeds_have_their_deviation():
@@ -140,7 +137,7 @@ def test_numbers_over_seeds_have_their_deviation():
         metrics["selections"]["weight"]["mpjpe_relative"] += 1
 
     section = ARTEFACTS["iskakov-comparison"].section(Fake(same, shifted))
-    assert "31.5 ± 0.7" in section.body
+    assert "31.5 ± 0.7" in markdown(section)
     assert Spread((31.0, 32.0)).deviation == pytest.approx(0.5**0.5)
     assert Spread((31.0,)).text() == "31.0"
 
@@ -169,7 +166,7 @@ def test_a_drop_to_novel_arrangements_is_of_the_trained_one():
 
     rows = [
         row
-        for row in ARTEFACTS["remelli-comparison"].section(Fake(drop)).body.splitlines()
+        for row in markdown(ARTEFACTS["remelli-comparison"].section(Fake(drop))).splitlines()
         if "ours (CMU" in row
     ]
     assert len(rows) == 4
@@ -180,7 +177,7 @@ def test_baselines_on_panoptic_are_the_mean_of_the_four_arrangements():
     def ransac(name, metrics):
         metrics["selections"]["ransac"]["mpjpe_relative"] = 10.0 * int(name[3])
 
-    body = ARTEFACTS["sota-comparison"].section(Fake(ransac)).body
+    body = markdown(ARTEFACTS["sota-comparison"].section(Fake(ransac)))
     row = next(line for line in body.splitlines() if line.startswith("| RANSAC on our"))
     assert row.split("|")[3].strip() == "25.0"
     assert f"{SOTA['RANSAC']}" in body
@@ -202,7 +199,7 @@ def test_other_systems_have_view_weights_of_the_novel_arrangements_beside_them()
         train, test = name.split(" on ")
         metrics["selections"]["view_weights"]["mpjpe_relative"] = 99.0 if train == test else 20.0
 
-    body = ARTEFACTS["sota-comparison"].section(Fake(view_weights)).body
+    body = markdown(ARTEFACTS["sota-comparison"].section(Fake(view_weights)))
     (row,) = (line for line in body.splitlines() if line.startswith("| view weights"))
     assert row.split("|")[3].strip() == "20.0"
     assert any(line.startswith("| adaptive RANSAC on our detections") for line in body.splitlines())
@@ -229,9 +226,10 @@ def test_view_weights_are_set_beside_the_papers_selection_and_the_best_classical
 
     section = ARTEFACTS["view-weights"].section(Fake(change))
     assert [claim.holds for claim in section.claims] == holds
-    assert {claim.where for claim in section.claims} == {"not in the paper"}
+    assert {claim.section for claim in section.claims} == {"not in the paper"}
     rows = [
-        [text.strip() for text in line.split("|")[1:-1]] for line in section.body.splitlines()[2:]
+        [text.strip() for text in line.split("|")[1:-1]]
+        for line in markdown(section).splitlines()[2:]
     ]
     assert len(rows) == 2 + 2 * 5
     assert rows[-1] == [
@@ -259,7 +257,7 @@ def test_every_test_has_view_weights_but_those_of_other_splits():
 
 
 def test_hyperparameters_are_those_of_the_configuration():
-    body = ARTEFACTS["hyperparameters"].section(Results([SETUP], [{}], Path())).body
+    body = markdown(ARTEFACTS["hyperparameters"].section(Results([SETUP], [{}], Path())))
     row = next(line for line in body.splitlines() if "alpha" in line)
     assert [task.strip() for task in row.split("|")[2:6]] == [
         "1.0, 0.01, 0.02",
@@ -267,8 +265,8 @@ def test_hyperparameters_are_those_of_the_configuration():
         "1.0, 0.01, 0.0",
         "1.0, 0.01, 0.0",
     ]
-    changed = Setup(CONF, SETUP.roots, {"train": ("model.hypotheses=77",), "test": ()}, {}, 0)
-    assert "77" in ARTEFACTS["hyperparameters"].section(Results([changed], [{}], Path())).body
+    changed = setup(train=("model.hypotheses=77",))
+    assert "77" in markdown(ARTEFACTS["hyperparameters"].section(Results([changed], [{}], Path())))
 
 
 def test_tasks_are_shared_between_items():
@@ -280,7 +278,7 @@ def test_tasks_are_shared_between_items():
     limitation = ARTEFACTS["limitation-table"].tasks(SETUP)
     assert limitation["test"].key == grid["h36m on h36m"].key
     assert len({task.dependencies["model"].key for task in grid.values()}) == 5
-    other = Setup(CONF, SETUP.roots, SETUP.overrides, {}, 1)
+    other = setup(1)
     assert generalization.grid(other)["cmu1 on h36m"].key != grid["cmu1 on h36m"].key
     data = [s.prepared("h36m", "test").key for s in (SETUP, other)]
     assert data[0] == data[1]  # seeds share the recordings

@@ -131,7 +131,7 @@ def test_uneven_processes_give_the_number_of_one(kind):
         share.update(part, truth.rows(rows), group[rows])
     shares[0].merge_state(shares[1])
     shares[0].merge_state(shares[2])
-    assert torch.equal(shares[0].counted, whole.counted)
+    assert torch.equal(shares[0].measured, whole.measured)
     assert torch.equal(shares[0].with_truth, whole.with_truth)
     torch.testing.assert_close(
         shares[0].compute(), whole.compute(), rtol=1e-12, atol=0, equal_nan=True

@@ -3,7 +3,7 @@ import torch
 
 from ghpt.metrics.pose_prior import PARTS, PosePrior, length_ratios
 from ghpt.observations import PoseEstimate
-from ghpt.skeleton import JOINT, MIRROR, SYMMETRIC_PARTS
+from ghpt.skeleton import JOINT, MIRROR, SYMMETRIC_BONES
 
 
 def frames(count: int, seed: int = 0):
@@ -25,7 +25,7 @@ def test_equals_numpy_variance():
         for p, part in enumerate(PARTS):
             ratios = []
             for i in np.flatnonzero(subject.numpy() == s):
-                (a, b), (c, d) = SYMMETRIC_PARTS[part]
+                (a, b), (c, d) = SYMMETRIC_BONES[part]
                 if estimated[i, [a, b, c, d]].all():
                     left = np.linalg.norm(points[i, a] - points[i, b])
                     ratios.append(left / np.linalg.norm(points[i, c] - points[i, d]))

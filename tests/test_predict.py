@@ -139,7 +139,7 @@ def test_the_same_command_again_predicts_nothing_and_gives_the_same_bytes(tmp_pa
     predict(settings, tmp_path / "out")
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").glob("poses.*")}
     calls = []
-    monkeypatch.setattr(module, "predict_shards", refusing(module.predicted, calls))
+    monkeypatch.setattr(module, "predict_shards", refusing(module.predict_shards, calls))
     predict(settings, tmp_path / "out")
     assert calls == [0]
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("poses.*")} == before

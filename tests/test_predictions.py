@@ -9,7 +9,9 @@ import torch
 
 from ghpt.errors import GhptDataError, GhptError
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.pose.predictions import WEIGHTS, PredictionWriter, open_predictions
+from ghpt.models.aggregation import WeightSummary
+from ghpt.models.pose.schema import POSES, PoseSample, PoseTables
+from ghpt.models.predictions import Predictions, PredictionWriter, open_predictions, with_nan
 from ghpt.observations import PoseEstimate, Recording, Truth
 
 NAMES = ("weight", "average", "linear")
@@ -40,29 +42,34 @@ def recording(subject: str, action: str) -> Recording:
     )
 
 
-RECORDINGS = [
-    recording(subject, action)
-    for subject, action in (("S9", "Eating"), ("S9", "Walking"), ("S11", "Eating"))
-]
+RECORDINGS = PoseTables.from_recordings(
+    [
+        recording(subject, action)
+        for subject, action in (("S9", "Eating"), ("S9", "Walking"), ("S11", "Eating"))
+    ]
+)
 
 
 def rows(index: torch.Tensor) -> dict:
     """What row i holds is a function of i alone, so any process can write any row."""
     points = index[:, None, None] * 100.0 + torch.arange(51).reshape(17, 3)
+    truth = Truth(points - 1, (index[:, None] + torch.arange(17)) % 7 > 0)
     here = (index[:, None] + torch.arange(17)) % 5 > 0
     return {
         "estimates": {name: PoseEstimate(points + 10 * i, here) for i, name in enumerate(NAMES)},
-        "truth": Truth(points - 1, (index[:, None] + torch.arange(17)) % 7 > 0),
-        "recording": index % 3,
-        "frame": 64 * index,
-        "weights": {name: index.float() + i for i, name in enumerate(WEIGHTS)},
+        "sample": PoseSample(with_nan(truth), truth.valid, index % 3, 64 * index),
+        "weights": WeightSummary(*(index.float() + i for i in range(3))),
     }
+
+
+def opened(path) -> Predictions:
+    return open_predictions(path, POSES)
 
 
 def write_all(tmp_path, count: int = 20, name: str = "predictions.npz", order=None):
     path = tmp_path / name
     index = torch.arange(count) if order is None else order
-    writer = PredictionWriter(tmp_path / "rows", count, NAMES)
+    writer = PredictionWriter(tmp_path / "rows", count, NAMES, POSES)
     for part in index.split(7):
         writer.write(part, **rows(part))
     writer.finish(path, RECORDINGS, META)
@@ -70,27 +77,28 @@ def write_all(tmp_path, count: int = 20, name: str = "predictions.npz", order=No
 
 
 def test_round_trip(tmp_path):
-    predictions = open_predictions(write_all(tmp_path))
+    predictions = opened(write_all(tmp_path))
     assert len(predictions) == 20
     assert predictions.names == NAMES
-    assert predictions.recording_action == ("Eating", "Walking", "Eating")
+    assert predictions.tables.recording_action.tolist() == ["Eating", "Walking", "Eating"]
     assert {**META, "unit": "mm"}.items() <= predictions.meta.items()
     chunks, expected = list(predictions.chunks(6)), rows(torch.arange(20))
-    assert [len(chunk.frame) for chunk in chunks] == [6, 6, 6, 2]
-    truth = expected["truth"]
-    assert torch.equal(torch.cat([c.truth.valid for c in chunks]), truth.valid)
-    points = torch.cat([c.truth.points for c in chunks])
-    assert torch.equal(points, truth.points * truth.valid[..., None])
-    assert torch.equal(torch.cat([c.frame for c in chunks]), expected["frame"])
-    assert torch.equal(torch.cat([c.recording for c in chunks]), expected["recording"])
+    assert [len(chunk.sample.frame) for chunk in chunks] == [6, 6, 6, 2]
+    truth = expected["sample"].as_truth()
+    assert torch.equal(torch.cat([c.sample.as_truth().valid for c in chunks]), truth.valid)
+    assert torch.equal(torch.cat([c.sample.as_truth().points for c in chunks]), truth.points)
+    for field in ("frame", "recording"):
+        stored = torch.cat([getattr(c.sample, field) for c in chunks])
+        assert torch.equal(stored, getattr(expected["sample"], field))
     for name, estimate in expected["estimates"].items():
         assert torch.equal(
             torch.cat([c.estimates[name].estimated for c in chunks]), estimate.estimated
         )
         points = torch.cat([c.estimates[name].points for c in chunks])
         assert torch.equal(points, estimate.points * estimate.estimated[..., None])
-    for name, values in expected["weights"].items():
-        assert torch.equal(torch.cat([c.weights[name] for c in chunks]), values)
+    for field in ("entropy", "max", "effective"):
+        stored = torch.cat([getattr(c.weights, field) for c in chunks])
+        assert torch.equal(stored, getattr(expected["weights"], field))
 
 
 def test_numpy_alone_reads_it_and_missing_is_nan(tmp_path):
@@ -116,7 +124,7 @@ def test_bytes_depend_on_the_content_alone(tmp_path):
 
 def test_two_writers_make_the_file_of_one(tmp_path):
     writers = [
-        PredictionWriter(tmp_path / "shared", 20, NAMES) for _ in range(2)
+        PredictionWriter(tmp_path / "shared", 20, NAMES, POSES) for _ in range(2)
     ]  # as two processes have them
     for start in range(0, 20, 4):
         for rank, writer in enumerate(writers):
@@ -130,9 +138,9 @@ def test_two_writers_make_the_file_of_one(tmp_path):
 def test_a_missing_row_is_an_error_and_keeps_the_old_file(tmp_path):
     path = tmp_path / "predictions.npz"
     path.write_bytes(b"old")
-    writer = PredictionWriter(tmp_path / "rows", 20, NAMES)
+    writer = PredictionWriter(tmp_path / "rows", 20, NAMES, POSES)
     writer.write(torch.arange(19), **rows(torch.arange(19)))
-    with pytest.raises(GhptError, match="1 of 20 frames have no prediction"):
+    with pytest.raises(GhptError, match="1 of 20 samples have no prediction"):
         writer.finish(path, RECORDINGS, META)
     assert path.read_bytes() == b"old"
 
@@ -143,10 +151,10 @@ def test_a_point_that_is_not_finite_is_not_estimated(tmp_path):
     spoilt = values["estimates"]["weight"].points.clone()
     spoilt[0, 1, 2] = torch.inf
     values["estimates"]["weight"] = PoseEstimate(spoilt, torch.ones(2, 17, dtype=torch.bool))
-    writer = PredictionWriter(tmp_path / "rows", 2, NAMES)
+    writer = PredictionWriter(tmp_path / "rows", 2, NAMES, POSES)
     writer.write(index, **values)
     writer.finish(tmp_path / "p.npz", RECORDINGS, META)
-    estimate = open_predictions(tmp_path / "p.npz").read(0, 2).estimates["weight"]
+    estimate = opened(tmp_path / "p.npz").read(0, 2).estimates["weight"]
     assert estimate.estimated.sum() == 33
     assert not estimate.estimated[0, 1]
 
@@ -182,6 +190,11 @@ def array(value) -> bytes:
         ("meta", np.array(["no", "json"]), "not a readable"),
         ("meta", np.array({"code": 1}, dtype=object), "not a readable"),
         ("recording_name", np.array([1, 2, 3]), "not a readable"),
+        (
+            "meta",
+            np.array('{"format_version": 1, "names": ["linear"], "problem": "camera"}'),
+            "problem",
+        ),
     ],
 )
 def test_arrays_that_do_not_belong_together_are_refused(tmp_path, member, value, field):
@@ -193,7 +206,7 @@ def test_arrays_that_do_not_belong_together_are_refused(tmp_path, member, value,
 
     path = changed(write_all(tmp_path), tmp_path, change)
     with pytest.raises(GhptDataError, match=field) as caught:
-        open_predictions(path)
+        opened(path)
     assert str(path) in str(caught.value)
 
 
@@ -201,7 +214,7 @@ def test_a_recording_out_of_range_is_refused(tmp_path):
     recordings = {"recording.npy": array(np.full(20, 3, np.int32))}
     path = changed(write_all(tmp_path), tmp_path, lambda members: members.update(recordings))
     with pytest.raises(GhptDataError, match="recording"):
-        open_predictions(path).read(0, 1)
+        opened(path).read(0, 1)
 
 
 def test_every_truncation_and_every_kind_of_damage_is_refused(tmp_path):
@@ -210,7 +223,7 @@ def test_every_truncation_and_every_kind_of_damage_is_refused(tmp_path):
     for length in range(0, len(whole), 97):
         path.write_bytes(whole[:length])
         with pytest.raises(GhptDataError):
-            open_predictions(path)
+            opened(path)
     generator = np.random.default_rng(0)
     accepted = 0
     for _ in range(400):
@@ -218,17 +231,17 @@ def test_every_truncation_and_every_kind_of_damage_is_refused(tmp_path):
         content[generator.integers(len(whole))] ^= 1 << int(generator.integers(8))
         path.write_bytes(content)
         try:
-            opened = open_predictions(path)
+            again = opened(path)
         except GhptDataError:
             continue
         accepted += 1  # dates and the like: but then all values must be the same
         path.write_bytes(whole)
-        original = open_predictions(path)
-        assert opened.meta == original.meta
-        assert opened._members == original._members
+        original = opened(path)
+        assert again.meta == original.meta
+        assert again.members == original.members
     assert accepted < 100
     with pytest.raises(GhptDataError, match="no such file"):
-        open_predictions(tmp_path / "absent.npz")
+        opened(tmp_path / "absent.npz")
 
 
 def test_a_compressed_file_is_refused_before_it_is_unpacked(tmp_path):
@@ -237,20 +250,20 @@ def test_a_compressed_file_is_refused_before_it_is_unpacked(tmp_path):
         archive.writestr("meta.npy", bytes(50 << 20))
     tracemalloc.start()
     with pytest.raises(GhptDataError, match="compressed"):
-        open_predictions(path)
+        opened(path)
     assert tracemalloc.get_traced_memory()[1] < 4 << 20
     tracemalloc.stop()
 
 
 def test_memory_does_not_grow_with_frames(tmp_path):
     def peak(count: int) -> int:
-        writer = PredictionWriter(tmp_path / "rows", count, NAMES)
+        writer = PredictionWriter(tmp_path / "rows", count, NAMES, POSES)
         values = rows(torch.arange(1000))
         tracemalloc.start()
         for start in range(0, count, 1000):
             writer.write(torch.arange(start, start + 1000), **values)
         writer.finish(tmp_path / "p.npz", RECORDINGS, META)
-        for _ in open_predictions(tmp_path / "p.npz").chunks(1000):
+        for _ in opened(tmp_path / "p.npz").chunks(1000):
             pass
         result = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()

@@ -15,8 +15,6 @@ import pytest
 import torch
 
 import toys
-from ghpt.commands.test import test
-from ghpt.commands.train import train
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.models.checkpoint import FIELD, load_model, read_checkpoint
 from ghpt.models.module import StochasticEstimator
@@ -25,6 +23,7 @@ from ghpt.paper.ablations.tables import ARTEFACTS
 from ghpt.paper.engine.setup import Setup, compose
 from ghpt.paper.engine.tasks import with_dependencies
 from signing import save_signed
+from toys import train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 ABLATED = {
@@ -93,8 +92,8 @@ class Wide(PoseTriangulation):
         super().__init__(**settings)
         self.factor = factor
 
-    def describe(self, hypotheses):
-        return self.factor * super().describe(hypotheses)
+    def featurize(self, hypotheses):
+        return self.factor * super().featurize(hypotheses)
 
 
 def function(size, clip, slope):
@@ -208,13 +207,13 @@ def test_a_model_of_one_s_own_trains_and_tests(tmp_path: Path, own: Path, name: 
         "hypotheses": None,
         "baselines": baselines,
     }
-    metrics = test(again | {"trust": ["mine.scorers"]}, tmp_path / "tested")
-    assert metrics["selections"]["weight"]["mpjpe_relative"] > 0
+    result = toys.run_test(again | {"trust": ["mine.scorers"]}, tmp_path / "tested")
+    assert result.metrics["selections"]["weight"]["mpjpe_relative"] > 0
     forget()
     with pytest.raises(
         GhptCheckpointError, match=r"needs classes of mine\.scorers.*'trust=\[mine\.scorers\]'"
     ):
-        test(again, tmp_path / "tested")
+        toys.run_test(again, tmp_path / "tested")
     assert not [name for name in sys.modules if name.split(".")[0] == "mine"]
 
 
@@ -270,6 +269,14 @@ def test_a_package_has_all_its_modules_trusted(
     path = checkpoint_of(loss={"_target_": "mine.losses.Expected"})
     model, _ = load_model(path, ["mine"])
     assert type(model.loss).__module__ == "mine.losses"
+
+
+def test_a_problem_of_one_s_own_is_derived_from_problem(
+    own: Path, checkpoint_of: Callable[..., Path]
+) -> None:
+    path = checkpoint_of(problem={"_target_": "mine.scorers.NoModule"})
+    with pytest.raises(GhptCheckpointError, match=r"is no ghpt\.models\.problem\.Problem"):
+        load_model(path, ["mine.scorers"])
 
 
 @pytest.mark.parametrize(

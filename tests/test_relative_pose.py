@@ -144,7 +144,7 @@ def test_mean_error_over_uneven_processes():
     shares[1].update(turns[90:], truth[90:])
     shares[0].merge_state(shares[1])
     assert shares[0].compute().mean.item() == pytest.approx(whole.compute().mean.item(), rel=1e-13)
-    assert shares[0].counted == 97
+    assert shares[0].measured == 97
     assert whole.compute().mean.item() == pytest.approx(
         rotation_deg(turns, truth).mean().item(), rel=1e-13
     )

@@ -9,9 +9,10 @@ import pytest
 from markdown_it import MarkdownIt
 from matplotlib.figure import Figure
 
-from ghpt.paper.engine.artefact import Artefact, Claim, Comparison, Section, Spread
-from ghpt.paper.engine.page import Entry, Page, write_page
-from ghpt.report.escape import code
+from ghpt.paper.engine.artefact import Artefact, Claim, Comparison, Section, Spread, figure_block
+from ghpt.paper.engine.page import Counts, Entry, Page, write_page
+from ghpt.report.document import Code, Document, Paragraph, Table, prose
+from ghpt.report.markdown import render_markdown
 
 
 def figure():
@@ -34,17 +35,20 @@ def page():
             Artefact("first", "table", "A table", dict, dict),
             Section(
                 "synthetic Human3.6M",
-                "A table of *x*:\n\n| a | b |\n|---|---|\n| 1 | 2 |",
-                {},
-                [good, bad],
-                claims,
-                "Because of this.",
+                [Paragraph(prose("A table of *x*:")), Table(["a", "b"], [["1", "2"]])],
+                comparisons=[good, bad],
+                claims=claims,
+                explanation="Because of this.",
             ),
             ["python train.py data=h36m"],
         ),
         Entry(
             Artefact("second", "figure", "A figure", dict, dict),
-            Section("Human3.6M from /data", "Look:\n\n![curve](curve.svg)", {"curve": figure()}),
+            Section(
+                "Human3.6M from /data",
+                [Paragraph("Look:"), figure_block("curve", "curve")],
+                {"curve": figure()},
+            ),
             [],
         ),
     ]
@@ -69,6 +73,10 @@ class Tags(HTMLParser):
 
     def handle_data(self, data):
         self.text += data
+
+
+def text_of(entry):
+    return render_markdown(Document("", entry.blocks()))
 
 
 def test_the_page_needs_no_other_file(page, tmp_path):
@@ -107,11 +115,11 @@ def test_a_table_that_the_paper_lacks_has_no_label_of_its(page):
     )
 
 
-def test_explanations_of_embedded_numbers_are_not_given_for_real_ones(page, tmp_path):
+def test_explanations_of_synthetic_numbers_are_not_given_for_real_ones(page, tmp_path):
     entry = page.entries[0]
-    real = Section("Human3.6M from /data", *list(vars(entry.section).values())[1:])
-    assert "Because of this." in entry.text()
-    assert "Because of this." not in Entry(entry.artefact, real, entry.commands).text()
+    real = replace(entry.section, data="Human3.6M from /data")
+    assert "Because of this." in text_of(entry)
+    assert "Because of this." not in text_of(replace(entry, section=real))
 
 
 def test_figures_are_vectors_and_the_same_bytes_twice(page, tmp_path):
@@ -147,7 +155,9 @@ def test_a_comparison_without_a_number_is_shown_as_a_dash(page, tmp_path):
     missing = [Comparison("theirs", None, Spread((1.0,))), Comparison("ours", 2.0, None)]
     lines = []
     for compared in ([*known, *missing], missing):
-        entry = Entry(page.entries[0].artefact, Section("x", "y", {}, compared), [])
+        entry = Entry(
+            page.entries[0].artefact, Section("x", [Paragraph("y")], comparisons=compared), []
+        )
         changed = replace(page, entries=[entry, page.entries[1]])
         write_page(changed, tmp_path)
         text = (tmp_path / "report.md").read_text()
@@ -163,7 +173,7 @@ def test_a_folder_s_name_is_shown_as_it_is(page, tmp_path):
     name = "/d/a|b<c>[red]`x`"
     section = replace(page.entries[0].section, data=f"Human3.6M from {name}")
     entry = Entry(page.entries[0].artefact, section, [f"python train.py data.root='{name}\n```'"])
-    about = {"data": name, "command": code(f"a `b` {name}")}
+    about = {"data": name, "command": Code(f"a `b` {name}")}
     write_page(replace(page, entries=[entry, page.entries[1]], about=about), tmp_path)
     markdown = MarkdownIt("gfm-like", {"linkify": False, "html": False}).render(
         (tmp_path / "report.md").read_text()
@@ -172,3 +182,28 @@ def test_a_folder_s_name_is_shown_as_it_is(page, tmp_path):
         tags = Tags(text)
         assert tags.text.count(name) == 4
         assert "c" not in tags.tags
+
+
+def test_a_comparison_without_a_number_and_a_claim_without_a_measure_do_not_count(page, tmp_path):
+    """The camera tables have both: they are not decidable, and end no report."""
+    section = replace(
+        page.entries[0].section,
+        comparisons=[Comparison("E_3D", 23.0, None), Comparison("E_2D", 2.0, Spread((4.0,)))],
+        claims=[Claim("of others", "4.1", None, "–"), Claim("ours", "4.2", True, "1 < 2")],
+    )
+    changed = replace(page, entries=[replace(page.entries[0], section=section)])
+    assert changed.counts == Counts(claims=1, claims_held=1, numbers=2, misses=1)
+    write_page(changed, tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert "1 of 1 claims hold; 1 of 2 numbers are not a miss." in text
+
+
+@pytest.mark.parametrize(
+    ("paper", "ours", "holds"),
+    [(10.0, 10.2, True), (10.0, 11.0, False), (None, 11.0, None), (10.0, None, None)],
+)
+def test_a_comparison_holds_where_it_is_decidable(paper, ours, holds):
+    comparison = Comparison("x", paper, None if ours is None else Spread((ours,)))
+    assert comparison.holds is holds
+    assert comparison.decidable == (holds is not None)
+    assert comparison.miss == (holds is False)

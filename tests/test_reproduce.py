@@ -7,7 +7,7 @@ import pytest
 
 from ghpt.commands import reproduce
 from ghpt.commands.overrides import spread_seeds
-from ghpt.commands.reproduce import ARTEFACTS, chosen
+from ghpt.commands.reproduce import ARTEFACTS, choose
 from ghpt.errors import GhptConfigError
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
@@ -126,14 +126,14 @@ def test_every_table_and_figure_of_the_paper_is_an_item():
     } == set(PAPER)
     assert sum(artefact.kind == "ablation" for artefact in ARTEFACTS.values()) >= 5
     assert sum(artefact.kind == "robustness" for artefact in ARTEFACTS.values()) >= 5
-    assert [artefact.label for artefact in chosen(["fig:pose-prior", "tab:sota-comparison"])] == [
+    assert [artefact.label for artefact in choose(["fig:pose-prior", "tab:sota-comparison"])] == [
         "sota-comparison",
         "pose-prior",
     ]
-    assert chosen("pose-prior") == chosen(["pose-prior"])
-    assert {artefact.kind for artefact in chosen(["ablation", "figure"])} == {"ablation", "figure"}
+    assert choose("pose-prior") == choose(["pose-prior"])
+    assert {artefact.kind for artefact in choose(["ablation", "figure"])} == {"ablation", "figure"}
     with pytest.raises(GhptConfigError, match="there is no 'nothing'"):
-        chosen(["nothing"])
+        choose(["nothing"])
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,9 @@ from ghpt.observations import LabelledRecording
 from ghpt.report.rig_comparison import (
     Similarity,
     align,
+    bone_variation,
     held_out_errors,
     rig_difference,
-    bone_variation,
     triangulate_recording,
     upright,
 )

@@ -9,16 +9,16 @@ from typing import Any
 
 import pytest
 
-from ghpt.commands.train import train
 from ghpt.files import write_json
 from ghpt.paper.engine.artefact import Results, Section
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import read_json
-from ghpt.paper.robustness.actions import curve
+from ghpt.paper.robustness.actions import measure_curve
 from ghpt.paper.robustness.curves import ARTEFACTS
-from toys import DATA, TRAIN
+from sections import markdown
+from sections import setup as whole_setup
+from toys import DATA, TRAIN, train
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 BY_LABEL = {artefact.label: artefact for artefact in ARTEFACTS}
 SIZES = {
     "trained_on": "cmu2",
@@ -82,7 +82,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dic
         config |= {"perturbations": perturbations}
         out = folder / name
         out.mkdir(exist_ok=True)
-        curve(config, {"model": folder / "model"}, out)
+        measure_curve(config, {"model": folder / "model"}, out)
         return read_json(out / "result.json")["levels"]
 
     return measure
@@ -128,13 +128,7 @@ def test_a_level_at_which_nothing_can_be_counted_has_no_number(measured):
 
 
 def setup(seed: int = 0) -> Setup:
-    return Setup(
-        CONF,
-        {"human36m": None, "panoptic": None},
-        {"train": (), "test": ()},
-        {"robustness": SIZES},
-        seed,
-    )
+    return whole_setup(seed, robustness=SIZES)
 
 
 def section(
@@ -191,37 +185,37 @@ def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
     found = section("robustness-outliers", errors, tmp_path, seeds=2)
     assert (
         "At 0 % the paper's selection (20.5 mm) beats the best classical estimator, LO-RANSAC (25.0 mm) by 18.0 %"
-        in (found.body)
+        in (markdown(found))
     )
     assert (
         "At 40 % the paper's selection (102.5 mm) loses to the best classical estimator, LO-RANSAC (50.0 mm) by"
-        in (found.body)
+        in (markdown(found))
     )
-    assert "It is ahead of all classical estimators at 0 %, of LO-RANSAC at 0 %." in found.body
-    assert "20.5 ± 0.7" in found.body
-    assert "**25.0 ± 0.0**" not in found.body
+    assert "It is ahead of all classical estimators at 0 %, of LO-RANSAC at 0 %." in markdown(found)
+    assert "20.5 ± 0.7" in markdown(found)
+    assert "**25.0 ± 0.0**" not in markdown(found)
     assert (
         "Against the best classical estimator of each of 3 levels the view weights win 1, tie 0 and lose 2: "
         "from -140.0 % (120.0 mm, LO-RANSAC 50.0) at 10 % to +4.0 % (24.0 mm, LO-RANSAC 25.0) at 0 %."
-        in found.body
+        in markdown(found)
     )
     papers, ours = found.claims
     assert not papers.holds
-    assert "20.5 to 102.5 mm" in papers.by
+    assert "20.5 to 102.5 mm" in papers.evidence
     assert not ours.holds
-    assert ours.where == "not in the paper"
+    assert ours.section == "not in the paper"
     assert section("robustness-outliers", equal, tmp_path / "equal").claims[1].holds
 
 
 def test_equal_errors_are_called_equal_and_coverage_is_told(tmp_path: Path):
     found = section("robustness-views", equal, tmp_path)
-    assert "view weights win 2, tie 0 and lose 0" in found.body
-    assert "is level with the best classical estimator, linear (30.0 mm), and" in found.body
+    assert "view weights win 2, tie 0 and lose 0" in markdown(found)
+    assert "is level with the best classical estimator, linear (30.0 mm), and" in markdown(found)
     assert (
         "It is ahead of all classical estimators at no level, of LO-RANSAC at every level."
-        in found.body
+        in markdown(found)
     )
-    assert "90.0 %" in found.body
+    assert "90.0 %" in markdown(found)
     assert found.data == "synthetic Panoptic"
 
 
@@ -229,7 +223,7 @@ def test_equal_errors_are_called_equal_and_coverage_is_told(tmp_path: Path):
 def test_every_figure_has_every_estimator_and_says_which_data(label: str, tmp_path: Path):
     found = section(label, equal, tmp_path)
     ((name, figure),) = found.figures.items()
-    assert f"]({name}.svg)" in found.body
+    assert f"](figures/{name}.svg)" in markdown(found)
     assert "synthetic" in figure.get_suptitle()
     for axes in figure.axes:
         assert {line.get_label() for line in axes.containers} == {
@@ -240,7 +234,7 @@ def test_every_figure_has_every_estimator_and_says_which_data(label: str, tmp_pa
             "LO-RANSAC",
         }
         assert axes.get_xlabel()
-    assert ("Absolute MPJPE" in found.body) == (label == "robustness-calibration")
+    assert ("Absolute MPJPE" in markdown(found)) == (label == "robustness-calibration")
 
 
 def test_what_is_unperturbed_is_measured_once(tmp_path: Path):
@@ -258,5 +252,5 @@ def test_an_estimator_without_a_number_has_a_dash(tmp_path: Path):
         return equal(seed, task, level) | ({"lo_ransac": None} if task == "noise" else {})
 
     found = section("robustness-noise", errors, tmp_path)
-    row = next(line for line in found.body.splitlines() if line.startswith("| 1 "))
+    row = next(line for line in markdown(found).splitlines() if line.startswith("| 1 "))
     assert row.split("|")[-2].strip() == "–"

@@ -12,19 +12,18 @@ import pytest
 
 import children
 import ghpt
-import ghpt.commands.test as testing
 import toys
 from ghpt import provenance as origin
 from ghpt.commands import predict as prediction
 from ghpt.commands.app import Command
 from ghpt.commands.outputs import Files
 from ghpt.commands.prediction.shards import MANIFEST, Shards
-from ghpt.commands.train import train
 from ghpt.data.people.sequence import Sequence
 from ghpt.models.estimators.classical import Linear
 from ghpt.signals import stop as handler
 from ghpt.signals import stopped_by_signals
 from predicting import config, sequence_of
+from toys import train
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STATUS = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 143}
@@ -229,7 +228,7 @@ def test_a_stopped_test_leaves_no_rows(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Linear, "__call__", stopped)
     with pytest.raises(SystemExit) as stop:
-        testing.test(settings, tmp_path / "test")
+        toys.run_test(settings, tmp_path / "test")
     assert stop.value.code == 143
     assert handlers == [handler]  # Lightning's would have several processes wait for each other
     assert not {".predictions", "predictions.npz", "metrics.json"} & set(

@@ -61,7 +61,7 @@ def test_round_trip_is_exact_with_takes_longer_than_a_chunk(
     for a, b in zip(store.open_store(tmp_path / "s"), takes, strict=True):
         assert_same(a, b)
     store.verify_store(tmp_path / "s")
-    assert store.read_manifest(tmp_path / "s")["provenance"] == {"source": "test", "3": [1, 2]}
+    assert store.read_manifest(tmp_path / "s").provenance == {"source": "test", "3": [1, 2]}
 
 
 def test_arrays_are_read_only_maps_of_the_file(tmp_path: Path) -> None:
@@ -81,7 +81,7 @@ def test_prepares_once_per_key(tmp_path: Path) -> None:
         return [recording(seed)]
 
     for seed in (0, 0, 1, 0):
-        (take,) = store.prepared(
+        (take,) = store.prepare(
             tmp_path, {"name": "synthetic", "seed": seed}, lambda s=seed: make(s), {}
         )
         assert_same(take, recording(seed))
@@ -103,7 +103,7 @@ def test_nothing_is_left_when_making_fails(tmp_path: Path) -> None:
         raise RuntimeError("stop")
 
     with pytest.raises(RuntimeError, match="stop"):
-        store.prepared(tmp_path, {"name": "x"}, make, {})
+        store.prepare(tmp_path, {"name": "x"}, make, {})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -113,7 +113,7 @@ def _make_slowly(root: Path, started: Path) -> None:
         started.touch()
         time.sleep(60)
 
-    store.prepared(root, {"name": "x"}, make, {})
+    store.prepare(root, {"name": "x"}, make, {})
 
 
 @pytest.mark.posix
@@ -126,14 +126,14 @@ def test_a_killed_preparation_is_swept_and_made_anew(tmp_path: Path) -> None:
     os.kill(child.pid, signal.SIGKILL)
     child.join()
     assert len(list(root.iterdir())) == 1
-    (take,) = store.prepared(root, {"name": "x"}, lambda: [recording(0)], {})
+    (take,) = store.prepare(root, {"name": "x"}, lambda: [recording(0)], {})
     assert_same(take, recording(0))
     assert len(list(root.iterdir())) == 1
 
 
 def _prepare(root: Path, start, results) -> None:
     start.wait()
-    takes = store.prepared(root, {"name": "x"}, lambda: [recording(0, frames=3000)], {})
+    takes = store.prepare(root, {"name": "x"}, lambda: [recording(0, frames=3000)], {})
     results.put(int(takes[0].frame.sum()))
 
 
@@ -159,19 +159,19 @@ def test_a_folder_that_another_process_made_meanwhile_stays(tmp_path: Path) -> N
 
     def make() -> list[LabelledRecording]:
         if not valid:
-            valid.append(store.prepared(tmp_path, {"name": "x"}, make_other, {})[0])
+            valid.append(store.prepare(tmp_path, {"name": "x"}, make_other, {})[0])
         return [recording(1)]
 
     def make_other() -> list[LabelledRecording]:
         return [recording(0)]
 
-    (take,) = store.prepared(tmp_path, {"name": "x"}, make, {})
+    (take,) = store.prepare(tmp_path, {"name": "x"}, make, {})
     assert_same(take, recording(0))
     assert_same(valid[0], recording(0))
     assert len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.parametrize("name", [*(f"{f}.bin" for f in store.FIELDS), "manifest.json"])
+@pytest.mark.parametrize("name", [*(f"{f.name}.bin" for f in store.FIELDS), "manifest.json"])
 def test_every_truncated_or_missing_file_is_refused(tmp_path: Path, name: str) -> None:
     store.write_store(tmp_path / "s", [recording(0)], {})
     file = tmp_path / "s" / name

@@ -6,7 +6,16 @@ from rich.console import Console
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.pose.evaluation import NAMES
 from ghpt.paper import published as paper
-from ghpt.report.tables import COLUMNS, display_name, main_rows, max_difference, print_table, report
+from ghpt.report.markdown import render_markdown
+from ghpt.report.tables import (
+    COLUMNS,
+    display_name,
+    main_rows,
+    max_difference,
+    report_document,
+    summary_document,
+)
+from ghpt.report.terminal import print_document
 
 MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 
@@ -38,6 +47,10 @@ def metrics(data="h36m", source="synthetic", split="test", trained="h36m", value
         "provenance": provenance,
         "selections": dict.fromkeys(NAMES, numbers),
     }
+
+
+def report(**changes) -> str:
+    return render_markdown(report_document(metrics(**changes)))
 
 
 def cells(values: dict) -> dict[str, dict[str, str]]:
@@ -89,34 +102,33 @@ def test_paper_values_only_where_the_paper_has_them():
     assert all(row["paper"] == "–" for row in cells(metrics(data="mine", trained=None)).values())
 
 
-def test_embedded_is_never_mistaken_for_real():
+def test_synthetic_is_never_mistaken_for_real():
     assert display_name("h36m", "synthetic") == "synthetic Human3.6M"
     assert display_name("cmu2", "/data/panoptic") == "Panoptic CMU2 from /data/panoptic"
-    text = report(metrics())
+    text = report()
     assert text.startswith("# Test on synthetic Human3.6M, test split, trained on synthetic Human")
     assert "These data are synthetic" in text
-    real = report(metrics(source="/data/h36m"))
+    real = report(source="/data/h36m")
     assert "synthetic" not in real
     assert "/data/h36m" in real.splitlines()[0]
 
 
 def test_report_fits_100_columns_and_every_row_has_every_column():
-    tables = [line for line in report(metrics()).splitlines() if line.startswith("|")]
+    tables = [line for line in report().splitlines() if line.startswith("|")]
     assert max(map(len, tables)) <= 100
-    blocks = report(metrics()).split("\n\n")
+    blocks = report().split("\n\n")
     for block in (block for block in blocks if block.startswith("|")):
         assert len({line.count("|") for line in block.splitlines()}) == 1
     assert (
         sum(line.startswith("| weight ") for line in tables) == 2
     )  # the main table and the one without damaged
-    assert "28.2" in report(metrics())
+    assert "28.2" in report()
 
 
 def test_terminal_table_fits_80_columns():
     buffer = io.StringIO()
-    print_table(
-        metrics(data="cmu4", trained="cmu2"), Console(file=buffer, width=80, color_system=None)
-    )
+    document = summary_document(metrics(data="cmu4", trained="cmu2"))
+    print_document(document, Console(file=buffer, width=80, color_system=None))
     lines = buffer.getvalue().splitlines()
     assert "synthetic Panoptic CMU4" in " ".join(lines)
     assert max(map(len, lines)) <= 80

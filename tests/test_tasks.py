@@ -2,10 +2,8 @@
 happens.
 """
 
-import multiprocessing
 import os
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -58,10 +56,7 @@ def test_only_what_changed_is_done_again(diary, tmp_path):
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
-def test_an_error_names_the_task_and_keeps_what_is_finished(diary, tmp_path, monkeypatch, jobs):
-    if hasattr(os, "fork"):  # the test above has the pool start its processes as it does
-        monkeypatch.setattr(multiprocessing, "get_context", multiprocessing.get_context)
-        fork_the_pool()
+def test_an_error_names_the_task_and_keeps_what_is_finished(diary, tmp_path, jobs):
     good = task(diary, 1)
     bad = task(diary, -1, good)  # after it: an error ends at once what is made beside it
     with pytest.raises(
@@ -85,18 +80,11 @@ def test_the_key_knows_config_needs_and_code(diary, monkeypatch):
 PROGRAM = """
 import sys
 from pathlib import Path
-import test_tasks
+from test_tasks import slow
 from ghpt.paper.engine.pool import perform_all
 if __name__ == "__main__":
-    test_tasks.fork_the_pool()
-    perform_all(test_tasks.slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
+    perform_all(slow(Path(sys.argv[1])), Path(sys.argv[2]), 2, show=False)
 """
-
-
-def fork_the_pool():
-    """Have the pool's processes be forks of this one, which import nothing anew."""
-    fork = multiprocessing.get_context("fork")
-    multiprocessing.get_context = lambda method: fork
 
 
 def slow(diary):
@@ -109,11 +97,11 @@ def test_a_stopped_run_leaves_no_process_and_goes_on_where_it_was(diary, tmp_pat
     program = tmp_path / "program.py"
     program.write_text(PROGRAM)
     run = children.start(program, diary, tmp_path / "tasks")
-    until(lambda: {2, 3} <= set(numbers(diary)))
+    children.wait_until(lambda: {2, 3} <= set(numbers(diary)), run)
     run.send_signal(getattr(signal, stop))
     assert run.wait(children.LIMIT) == status
     workers = {int(line.split()[1]) for line in diary.read_text().splitlines()}
-    until(lambda: not any(alive(worker) for worker in workers))
+    children.wait_until(lambda: not any(alive(worker) for worker in workers))
     first, *others = slow(diary)
     assert first.done(tmp_path / "tasks")
     assert not any(other.done(tmp_path / "tasks") for other in others)
@@ -130,10 +118,3 @@ def alive(process):
         )
     except OSError:
         return False
-
-
-def until(condition):
-    end = time.monotonic() + children.LIMIT
-    while not condition():
-        assert time.monotonic() < end, "it did not happen"
-        time.sleep(0.1)

@@ -12,11 +12,12 @@ from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.observations import RelativePoseEstimate
 from ghpt.paper.camera.extrinsics import (
-    PARTS,
-    from_pairs,
-    relative,
-    replaced,
-    seen_by,
+    RigDraws,
+    StoredExtrinsics,
+    poses_of_pairs,
+    relative_poses,
+    replace_part,
+    through_draws,
     with_true_scale,
 )
 from scenes import labelled_pairs
@@ -26,7 +27,7 @@ TRUTH = human36m_rig("S9").cameras
 
 def wrong() -> tuple[torch.Tensor, torch.Tensor]:
     """True relative poses turned by some degrees and moved by some centimetres, but for the first."""
-    R, t = relative(TRUTH)
+    R, t = relative_poses(TRUTH)
     turn = torch.from_numpy(
         Rotation.from_euler("xyz", [[0, 0, 0], [3, 0, 1], [0, 2, 0], [1, 1, 1]], True).as_matrix()
     )
@@ -35,7 +36,7 @@ def wrong() -> tuple[torch.Tensor, torch.Tensor]:
 
 @pytest.mark.parametrize("part", ["R", "t", "both"])
 def test_true_relative_poses_give_back_the_true_cameras(part):
-    found = replaced(TRUTH, relative(TRUTH), *PARTS[part])
+    found = replace_part(TRUTH, relative_poses(TRUTH), part)
     torch.testing.assert_close(found.R, TRUTH.R, rtol=0, atol=1e-12)
     torch.testing.assert_close(found.t, TRUTH.t, rtol=0, atol=1e-8)
     assert found.K is TRUTH.K
@@ -46,9 +47,9 @@ def test_true_relative_poses_give_back_the_true_cameras(part):
 )
 def test_only_the_wanted_part_of_the_relative_pose_is_estimated(part, use_R, use_t):
     estimate = wrong()
-    found = replaced(TRUTH, estimate, *PARTS[part])
-    R, t = relative(found)
-    true_R, true_t = relative(TRUTH)
+    found = replace_part(TRUTH, estimate, part)
+    R, t = relative_poses(found)
+    true_R, true_t = relative_poses(TRUTH)
     torch.testing.assert_close(R, estimate[0] if use_R else true_R, rtol=0, atol=1e-12)
     torch.testing.assert_close(t, estimate[1] if use_t else true_t, rtol=0, atol=1e-8)
     is_turned = bool((found.R[1:] - TRUTH.R[1:]).abs().amax() > 1e-3)
@@ -68,7 +69,7 @@ def test_rig_in_any_frame_and_unit_gives_back_the_true_cameras():
         R,
         0.002 * (TRUTH.t + R @ torch.tensor([100.0, -2000.0, 700.0], dtype=torch.float64)),
     )
-    found = replaced(TRUTH, with_true_scale(moved, TRUTH), True, True)
+    found = replace_part(TRUTH, with_true_scale(moved, TRUTH), "both")
     torch.testing.assert_close(found.R, TRUTH.R, rtol=0, atol=1e-12)
     torch.testing.assert_close(found.t, TRUTH.t, rtol=0, atol=1e-7)
 
@@ -80,25 +81,25 @@ def test_pairs_with_the_first_camera_are_taken_in_its_order():
     batch = labelled.observations
     R, t = labelled.truth.relative_pose()
     estimate = RelativePoseEstimate(R, t, torch.ones(len(pair), dtype=torch.bool))
-    found = replaced(TRUTH, from_pairs(estimate, batch, "truth"), True, True)
+    found = replace_part(TRUTH, poses_of_pairs(estimate, batch, "truth"), "both")
     torch.testing.assert_close(found.R, TRUTH.R, rtol=0, atol=1e-12)
     torch.testing.assert_close(found.t, TRUTH.t, rtol=0, atol=1e-8)
     missing = RelativePoseEstimate(R, t, torch.arange(len(pair)) != 1)
     with pytest.raises(GhptDataError, match="a pair has no estimate"):
-        from_pairs(missing, batch, "truth")
+        poses_of_pairs(missing, batch, "truth")
 
 
 def test_draws_take_turns_over_the_frames_of_their_rigs():
     rng = np.random.default_rng(0)
     recordings = [toys.recording(f"S{i}", f"S{i}", 6, 4, 0.0, rng) for i in range(2)]
     frames = Frames(recordings, np.array([0, 2, 4, 7, 9, 11]))
-    R, t = relative(recordings[0].cameras)
+    R, t = relative_poses(recordings[0].cameras)
     shifts = [[0, 10, 20], [30, 40, 50]]  # of a rig's cameras in its draws, mm
     rigs = [
-        {"recordings": [i], "draws": [(R.tolist(), (t + shift).tolist()) for shift in shifts[i]]}
+        RigDraws([i], [StoredExtrinsics.of((R, t + shift)) for shift in shifts[i]])
         for i in range(2)
     ]
-    batch = seen_by(frames, rigs, False, True)[range(6)].observations
+    batch = through_draws(frames, rigs, "t")[range(6)].observations
     true = frames[range(6)].observations
     torch.testing.assert_close(batch.key_points, true.key_points, rtol=0, atol=0)
     moved = (batch.cameras.t - true.cameras.t)[:, 1:]

@@ -31,7 +31,7 @@ def task(config, output):
             sys.exit(143)
         case "waits":
             (output / "begun").touch()
-            time.sleep(60)
+            time.sleep(3600)
     with atomic_write(output / "pid", "w") as handle:
         handle.write(str(os.getpid()))
     return {"pid": os.getpid()}

@@ -1,6 +1,8 @@
 """A small data set of random people seen by a random rig, for tests of everything above the data."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import fields
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -74,6 +76,25 @@ TRAIN = {
     "resume": False,
     "progress_bar": False,
 }
+
+
+def train(config: Mapping[str, Any], output: Path) -> dict[str, float]:
+    """Train as train.py does, with a plain configuration."""
+    from ghpt.commands.train import TrainSettings, train
+    from ghpt.config import settings
+
+    return train(settings(TrainSettings, config | {"output": str(output)}), output)
+
+
+def run_test(config: Mapping[str, Any], output: Path) -> Any:
+    """Test as test.py does; of the configuration, which may be a training's, what a test takes."""
+    from ghpt.commands.test import TestSettings, test
+    from ghpt.config import settings
+
+    names = {field.name for field in fields(TestSettings)}
+    values = {"hypotheses": None, "frames": None, "output": str(output)}
+    values |= {name: value for name, value in config.items() if name in names}
+    return test(settings(TestSettings, values), output)
 
 
 class ToyData(KeyPointDataModule):

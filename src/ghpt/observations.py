@@ -16,6 +16,7 @@ from ghpt.geometry.epipolar import normalise
 
 RecordingT = TypeVar("RecordingT", bound="Recording")
 BatchT = TypeVar("BatchT", bound="Batch")
+EstimateT = TypeVar("EstimateT", bound="Estimate")
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ class PairObservations(Samples):
     confidence: Float[Tensor, "B V M J"]
     valid: Bool[Tensor, "B V M J"]
 
-    def of_pair(self, values: Tensor) -> Tensor:
+    def select_pair(self, values: Tensor) -> Tensor:
         """Select from values [B, V, ...] those of the two views: [B, 2, ...]."""
         return select_views(values, self.pair)
 
@@ -161,10 +162,10 @@ class PairObservations(Samples):
 
         N = M x J; normalised image coordinates, float64. A point that one view misses is 0.
         """
-        pixels = self.of_pair(self.key_points).flatten(2, 3)
-        points = normalise(self.of_pair(self.K), pixels)
+        pixels = self.select_pair(self.key_points).flatten(2, 3)
+        points = normalise(self.select_pair(self.K), pixels)
         finite = torch.isfinite(points).all(-1).all(1)
-        both = self.of_pair(self.valid).flatten(2, 3).all(dim=1) & finite
+        both = self.select_pair(self.valid).flatten(2, 3).all(dim=1) & finite
         points = torch.where(both[:, None, :, None], points, 0.0)
         return points[:, 0], points[:, 1], both
 
@@ -207,7 +208,23 @@ class Labelled(Batch, Generic[ObservationsT, TruthT]):
 
 
 @dataclass(frozen=True)
-class PoseEstimate(Batch):
+class Estimate(Batch):
+    """What an aggregation or a classical estimator gives: tensors, and a mask ``estimated``."""
+
+    def valid(self) -> Bool[Tensor, "*B"]:
+        """Return where the estimate means something: estimated, and finite."""
+        raise NotImplementedError
+
+    def masked(self: EstimateT) -> EstimateT:
+        """Return the estimate with zeros where it is not valid, and not ``estimated`` there."""
+        valid = self.valid()
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        masked = {name: torch.where(expand_mask(valid, x), x, 0) for name, x in values.items()}
+        return replace(self, **masked | {"estimated": valid})
+
+
+@dataclass(frozen=True)
+class PoseEstimate(Estimate):
     """3D poses from any aggregation or classical estimator.
 
     A joint that is not ``estimated`` is finite but meaningless: it had too few views, and nothing
@@ -218,9 +235,13 @@ class PoseEstimate(Batch):
     """World frame, mm."""
     estimated: Bool[Tensor, "*B J"]
 
+    def valid(self) -> Bool[Tensor, "*B J"]:
+        """Return which joints are estimated and finite."""
+        return self.estimated & self.points.isfinite().all(-1)
+
 
 @dataclass(frozen=True)
-class RelativePoseEstimate(Batch):
+class RelativePoseEstimate(Estimate):
     """Relative camera poses ``x_b = R x_a + t`` from any aggregation or classical estimator.
 
     One that is not ``estimated`` is the identity with t = 0 and means nothing.
@@ -230,6 +251,23 @@ class RelativePoseEstimate(Batch):
     t: Float[Tensor, "*B 3"]
     """mm; of length 1 where nothing has given it a scale."""
     estimated: Bool[Tensor, "*B"]
+
+    def valid(self) -> Bool[Tensor, "*B"]:
+        """Return which poses are estimated, finite, and have a translation of some length."""
+        finite = self.R.isfinite().flatten(-2).all(-1) & self.t.isfinite().all(-1)
+        return self.estimated & finite & (self.t != 0).any(-1)
+
+    def masked(self) -> RelativePoseEstimate:
+        """Return the poses with the identity and t = 0 where they are not valid."""
+        valid = self.valid()
+        eye = torch.eye(3, dtype=self.R.dtype, device=self.R.device)
+        R = torch.where(valid[..., None, None], self.R, eye)
+        return RelativePoseEstimate(R, torch.where(valid[..., None], self.t, 0.0), valid)
+
+
+def expand_mask(mask: Bool[Tensor, "*B"], values: Tensor) -> Bool[Tensor, ...]:
+    """Return the mask with as many trailing dimensions of length 1 as ``values`` has more."""
+    return mask.reshape(*mask.shape, *[1] * (values.dim() - mask.dim()))
 
 
 def joints_with_enough_views(valid: Bool[Tensor, "*B V J"], least: int = 2) -> Bool[Tensor, "*B J"]:

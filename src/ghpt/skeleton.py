@@ -27,55 +27,58 @@ one.
 JOINT = {name: index for index, name in enumerate(JOINTS)}
 """Index on the J axis by name."""
 
-BONES = tuple(
-    (JOINT[a], JOINT[b])
-    for a, b in (
-        ("right_ankle", "right_knee"),
-        ("right_knee", "right_hip"),
-        ("right_hip", "pelvis"),
-        ("left_ankle", "left_knee"),
-        ("left_knee", "left_hip"),
-        ("left_hip", "pelvis"),
-        ("pelvis", "spine"),
-        ("spine", "thorax"),
-        ("thorax", "head_top"),
-        ("head_top", "nose"),
-        ("thorax", "right_shoulder"),
-        ("right_shoulder", "right_elbow"),
-        ("right_elbow", "right_wrist"),
-        ("thorax", "left_shoulder"),
-        ("left_shoulder", "left_elbow"),
-        ("left_elbow", "left_wrist"),
-    )
-)
-"""The 16 body parts between adjacent joints (paper, section 3.1), as index pairs."""
 
-SYMMETRIC_PARTS = {
-    part: tuple(
-        (JOINT[f"{side}_{a}"], JOINT[b if b == "thorax" or b == "pelvis" else f"{side}_{b}"])
-        for side in ("left", "right")
-    )
-    for part, (a, b) in {
-        "upper_arm": ("shoulder", "elbow"),
-        "lower_arm": ("elbow", "wrist"),
-        "shoulder": ("shoulder", "thorax"),
-        "hip": ("hip", "pelvis"),
-        "upper_leg": ("hip", "knee"),
-        "lower_leg": ("knee", "ankle"),
-    }.items()
+def _bone(start: str, end: str) -> tuple[int, int]:
+    return JOINT[start], JOINT[end]
+
+
+BONES = (
+    _bone("right_ankle", "right_knee"),
+    _bone("right_knee", "right_hip"),
+    _bone("right_hip", "pelvis"),
+    _bone("left_ankle", "left_knee"),
+    _bone("left_knee", "left_hip"),
+    _bone("left_hip", "pelvis"),
+    _bone("pelvis", "spine"),
+    _bone("spine", "thorax"),
+    _bone("thorax", "head_top"),
+    _bone("head_top", "nose"),
+    _bone("thorax", "right_shoulder"),
+    _bone("right_shoulder", "right_elbow"),
+    _bone("right_elbow", "right_wrist"),
+    _bone("thorax", "left_shoulder"),
+    _bone("left_shoulder", "left_elbow"),
+    _bone("left_elbow", "left_wrist"),
+)
+"""The 16 bones between adjacent joints (paper, section 3.1), as index pairs."""
+
+SYMMETRIC_BONES = {
+    "upper_arm": (_bone("left_shoulder", "left_elbow"), _bone("right_shoulder", "right_elbow")),
+    "lower_arm": (_bone("left_elbow", "left_wrist"), _bone("right_elbow", "right_wrist")),
+    "shoulder": (_bone("left_shoulder", "thorax"), _bone("right_shoulder", "thorax")),
+    "hip": (_bone("left_hip", "pelvis"), _bone("right_hip", "pelvis")),
+    "upper_leg": (_bone("left_hip", "left_knee"), _bone("right_hip", "right_knee")),
+    "lower_leg": (_bone("left_knee", "left_ankle"), _bone("right_knee", "right_ankle")),
 }
-"""The six (left, right) parts of the pose prior (paper, section 4.4): name -> ((a, b) left, (a, b)
-right).
-"""
+"""The six (left, right) pairs of bones of the pose prior (paper, section 4.4), by name."""
 
-MIRROR = tuple(
-    JOINT[name.replace("left", "right") if "left" in name else name.replace("right", "left")]
-    for name in JOINTS
-)
+
+def _mirror(name: str) -> str:
+    if name.startswith("left"):
+        return name.replace("left", "right")
+    return name.replace("right", "left")
+
+
+MIRROR = tuple(JOINT[_mirror(name)] for name in JOINTS)
 """For each joint, the joint on the other side of the body (itself on the midline)."""
 
-SIX_JOINTS = tuple(
-    JOINT[f"{side}_{joint}"] for joint in ("elbow", "wrist", "knee") for side in ("right", "left")
+SIX_JOINTS = (
+    JOINT["right_elbow"],
+    JOINT["left_elbow"],
+    JOINT["right_wrist"],
+    JOINT["left_wrist"],
+    JOINT["right_knee"],
+    JOINT["left_knee"],
 )
 """Elbows, wrists and knees: the joints on which Iskakov et al. report CMU -> Human3.6M."""
 

@@ -11,7 +11,7 @@ import warnings
 from pathlib import Path
 
 import toys
-from ghpt.commands.train import train
+from toys import train
 
 
 def main(folder: str, changes: str) -> None:
@@ -22,8 +22,6 @@ def main(folder: str, changes: str) -> None:
         config[part] = config[part] | wanted.get(part, {})
     train(config, Path(folder))
     if wanted.get("test"):
-        from ghpt.commands.test import test
-
         baselines = {"linear": {"_target_": "ghpt.models.estimators.classical.Linear"}}
         again = {
             **config,
@@ -31,7 +29,7 @@ def main(folder: str, changes: str) -> None:
             "hypotheses": None,
             "baselines": baselines,
         }
-        test(again, Path(folder))
+        toys.run_test(again, Path(folder))
 
 
 if __name__ == "__main__":

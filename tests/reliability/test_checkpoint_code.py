@@ -19,11 +19,11 @@ import ghpt.models.checkpoint
 import toys
 from auditing import watch
 from ghpt import files
-from ghpt.commands.train import train
 from ghpt.config import build, locate
 from ghpt.errors import GhptCheckpointError
 from ghpt.models.checkpoint import FIELD, load_model
 from signing import checkpoint_around, save_pickle, save_signed, signed, text
+from toys import train
 
 WATCHED = (
     "os.",
@@ -128,21 +128,17 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.data.formats.key_points.read_key_points": {"path": str(ckpt)},
         "ghpt.data.datasets.store.open_store": {"folder": folder},
         "ghpt.data.datasets.store.cache_root": {},
-        "ghpt.models.pose.predictions.open_predictions": {"path": str(ckpt)},
+        "ghpt.models.predictions.open_predictions": {"path": str(ckpt), "schema": None},
         "ghpt.models.checkpoint.read_checkpoint": {"path": str(ckpt)},
         "ghpt.models.checkpoint.load_model": {"path": str(ckpt), "trust": ["evil_module"]},
         # ours, which write and delete
         "ghpt.files.sweep_temporaries": {"folder": folder},
         "ghpt.files.atomic_write": {"path": f"{folder}/keep.txt"},
         "ghpt.files.atomic_folder": {"path": folder},
-        "ghpt.models.pose.evaluation.write_metrics": {"path": f"{folder}/keep.txt", "metrics": {}},
-        "ghpt.report.tables.write_report": {"path": f"{folder}/keep.txt", "metrics": {}},
+        "ghpt.files.write_json": {"path": f"{folder}/keep.txt", "content": {}},
+        "ghpt.report.markdown.write_markdown": {"path": f"{folder}/keep.txt", "document": {}},
         "ghpt.report.tensorboard.write_parts": {"folder": f"{folder}/events", "parts": {}},
-        "ghpt.models.pose.predictions.PredictionWriter": {
-            "folder": folder,
-            "count": 1,
-            "names": ["weight"],
-        },
+        "ghpt.models.rows.RowWriter": {"folder": folder, "count": 1, "layout": {}},
         "ghpt.data.datasets.store.write_store": {
             "folder": f"{folder}/store",
             "recordings": [],
@@ -163,9 +159,9 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         "ghpt.commands.app._quieten": {},
         "ghpt.commands.jobs.take_signals": {},
         "ghpt.commands.jobs.first_of_several_ends": {},
-        "ghpt.commands.train.make_trainer": {"settings": {"logger": False}},
-        "ghpt.commands.train.train": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
-        "ghpt.commands.test.test": {"config": {}, "output": {"_target_": "ghpt.files.Path"}},
+        "ghpt.commands.trainer.make_trainer": {"settings": {"logger": False}},
+        "ghpt.commands.train.train": {"settings": {}, "output": {"_target_": "ghpt.files.Path"}},
+        "ghpt.commands.test.test": {"settings": {}, "output": {"_target_": "ghpt.files.Path"}},
         "ghpt.paper.engine.tasks.read_json": {"path": {"_target_": "ghpt.files.Path"}},
         "ghpt.paper.engine.setup.compose": {
             "conf": {"_target_": "ghpt.files.Path"},

@@ -23,7 +23,7 @@ import torch
 import sizes
 import toys
 from ghpt import files
-from ghpt.commands.train import resumable, train
+from ghpt.commands.resume import Start, resumable
 from ghpt.config import build
 from ghpt.errors import GhptCheckpointError
 from ghpt.models import checkpoint as module_of_checkpoints
@@ -35,6 +35,7 @@ from ghpt.models.checkpoint import (
     read_checkpoint,
 )
 from signing import save_signed, signed
+from toys import train
 
 CONF = Path(__file__).resolve().parents[2] / "conf"
 LAST, PREVIOUS = "last.ckpt", "previous.ckpt"
@@ -284,20 +285,22 @@ def mutated(whole: bytes, chance: random.Random) -> bytes | None:
 def test_b6_the_previous_checkpoint_is_gone_on_from(
     stopped: Path, record_row: Callable[..., None]
 ) -> None:
-    config, model = settings(resume=True), build(toys.MODEL, "model")
+    config = {key: settings()[key] for key in ("model", "data", "seed")}
+    model = build(toys.MODEL, "model")
     path, chance, passed = stopped / LAST, random.Random(0), 0
     whole = path.read_bytes()
-    assert resumable(stopped, config, model) == (path, "")
+    assert resumable(stopped, config, model) == Start(path)
     for _ in range(sizes.DAMAGED_CHECKPOINTS):
         data = mutated(whole, chance)
         path.unlink(missing_ok=True)
         if data is not None:
             path.write_bytes(data)
-        start, said = resumable(stopped, config, model)
-        assert start.name == PREVIOUS
+        start = resumable(stopped, config, model)
+        assert start.checkpoint.name == PREVIOUS
         assert re.search(
-            r"last\.ckpt: .+\. Going on from previous\.ckpt, which holds training step 6\.$", said
-        ), said
+            r"last\.ckpt: .+\. Going on from previous\.ckpt, which holds training step 6\.$",
+            start.warning,
+        ), start.warning
         passed += 1
     figure = f"{passed} damaged last checkpoints: each refused, the previous one taken"
     record_row("B6", figure, passed, sizes.DAMAGED_CHECKPOINTS)

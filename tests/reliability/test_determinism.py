@@ -10,9 +10,8 @@ import torch
 
 import children
 import toys
-from ghpt.commands.test import test as run_test
-from ghpt.commands.train import train
 from ghpt.models.checkpoint import read_checkpoint
+from toys import train
 
 SCRIPT = Path(__file__).with_name("run_toy.py")
 BASELINES = {
@@ -68,7 +67,7 @@ def predictions_of(checkpoint, folder, threads, **data):
     before = torch.get_num_threads()
     torch.set_num_threads(threads)
     try:
-        run_test(config, folder)
+        toys.run_test(config, folder)
     finally:
         torch.set_num_threads(before)
     return arrays(folder)

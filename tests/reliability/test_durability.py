@@ -17,9 +17,8 @@ from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, wri
 from ghpt.data.formats.stored_npz import members_of
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import WRITERS, Scene
-from ghpt.files import atomic_write
+from ghpt.files import atomic_write, write_json
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO
-from ghpt.models.pose.evaluation import write_metrics
 from ghpt.models.rows import RowWriter
 from ghpt.paper.engine.tasks import Task, perform
 from ghpt.skeleton import JOINTS
@@ -112,9 +111,8 @@ def save_checkpoint(folder: Path) -> None:
 
 
 def save_rows(folder: Path) -> None:
-    writer = RowWriter(folder / ".rows", 3, "frames", ["linear"], {"x": ("<f4", (2,))})
-    weights = {name: torch.zeros(3) for name in ("entropy", "max", "effective")}
-    writer.write(torch.tensor([2, 0, 1]), {"x": torch.ones(3, 2)}, weights)
+    writer = RowWriter(folder / ".rows", 3, {"x": ("<f4", (2,))})
+    writer.write(torch.tensor([2, 0, 1]), {"x": torch.ones(3, 2)})
     writer.finish(folder / "predictions.npz", {}, {}, members_of)
 
 
@@ -164,7 +162,7 @@ def save_poses(name: str) -> Any:
 SAVERS = {
     "a checkpoint": save_checkpoint,
     "predictions of a test": save_rows,
-    "metrics": lambda folder: write_metrics(folder / "metrics.json", {"a": 1}),
+    "metrics": lambda folder: write_json(folder / "metrics.json", {"a": 1}),
     "a rig": save_rig,
     "key points": save_key_points,
     "prepared recordings": save_store,

@@ -162,11 +162,10 @@ def test_rows_are_not_written_through_a_memory_map(tmp_path, no_space):
     """A full disk would end the process with SIGBUS."""
     import torch
 
-    writer = RowWriter(tmp_path / ".rows", 3, "frames", ["linear"], {"x": ("<f4", (2,))})
-    weights = {name: torch.zeros(3) for name in ("entropy", "max", "effective")}
+    writer = RowWriter(tmp_path / ".rows", 3, {"x": ("<f4", (2,))})
     no_space("x")
     with pytest.raises(OSError, match=r"No space left on device: '.*\.rows/x'"):
-        writer.write(torch.arange(3), {"x": torch.ones(3, 2)}, weights)
+        writer.write(torch.arange(3), {"x": torch.ones(3, 2)})
 
 
 def test_the_manifest_is_named(tmp_path, monkeypatch):

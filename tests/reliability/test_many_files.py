@@ -16,7 +16,7 @@ from ghpt.data.formats.key_points import read_key_points
 before, start = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
 people = read_key_points(sys.argv[1], "body_25")
 seconds = time.process_time() - start
-print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, len(people.row), people.key_points.nbytes)
+print(seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before, len(people.row), people.points.pixels.nbytes)
 """
 
 

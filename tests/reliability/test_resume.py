@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import toys
-from ghpt.commands.train import train
 from ghpt.errors import GhptCheckpointError
 from ghpt.models.callbacks import SaveLast
 from ghpt.models.module import StochasticEstimator
+from toys import train
 
 
 class Crash(Exception):

@@ -79,20 +79,18 @@ def test_b1_and_b2_kill_training_and_resume(tmp_path, record_row):
         wanted = {**changes, "train": changes["train"] | {"resume": resume}}
         return children.start(SCRIPT, folder, json.dumps(wanted))
 
-    assert start(tmp_path / "whole", False).wait(timeout=300) == 0
+    assert start(tmp_path / "whole", False).wait(timeout=children.LIMIT) == 0
     expected = read_checkpoint(tmp_path / "whole" / "last.ckpt")["state_dict"]
     runs = sizes.KILLED_TRAININGS
     same = 0
     for number in range(runs):
         folder = tmp_path / str(number)
         child = start(folder, False)
-        while not (folder / "last.ckpt").exists():
-            assert child.poll() is None, "training ended before its first save"
-            time.sleep(0.01)
+        children.wait_until((folder / "last.ckpt").exists, child)
         time.sleep(rng.uniform(0, 0.8))
         child.kill()
         child.wait()
-        assert start(folder, True).wait(timeout=300) == 0
+        assert start(folder, True).wait(timeout=children.LIMIT) == 0
         found = read_checkpoint(folder / "last.ckpt")["state_dict"]
         same += all(torch.equal(found[k], v) for k, v in expected.items())
         assert not [p for p in folder.iterdir() if p.name.endswith(".tmp")]

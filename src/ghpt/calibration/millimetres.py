@@ -1,6 +1,4 @@
-"""What makes millimetres of a calibrated rig: a body height, measured bones, a known distance, or an
-assumption.
-"""
+"""What makes millimetres of a rig: a body height, measured bones, a distance, or an assumption."""
 
 from __future__ import annotations
 

@@ -116,7 +116,7 @@ def of_all_views(setup: Setup) -> Iterator[Candidate]:
 
 
 def of_one_view(setup: Setup, view: int) -> Iterator[Candidate]:
-    """Yield the mistakes of one camera, each undone, but for shifts, rates, exchanges and its pose."""
+    """Yield the mistakes of one camera that its setup alone tells how to undo, each undone."""
     for mistake in MISTAKES:
         if mistake.of_one and mistake.undo is not None:
             for value in mistake.values:

@@ -23,7 +23,7 @@ from ghpt.calibration.observations import (
     usable,
 )
 from ghpt.calibration.pairs import PairEstimation, PairTable
-from ghpt.calibration.resection import Resection, PlacedRig
+from ghpt.calibration.resection import PlacedRig, Resection
 from ghpt.calibration.uncertainty import uncertainty
 from ghpt.errors import GhptDataError, check_positive
 from ghpt.geometry.cameras import Cameras

@@ -227,7 +227,6 @@ class _Job:
         elsewhere = os.getpid() != self.process
         if elsewhere:
             take_signals()
-        _quieten()
         output = Path(HydraConfig.get().runtime.output_dir)
         settings = None
         result = None
@@ -239,6 +238,7 @@ class _Job:
                 if self.sweep and values.get("resume") is False and not values.get("overwrite"):
                     values["resume"] = "auto"
                 command = self.loaded()
+                _quieten()  # not before: the import of Lightning sets its levels anew
                 settings = _settings_of(command, values)
                 files = command.files(settings)
                 folder = stack.enter_context(_output_folder(output, files, values))

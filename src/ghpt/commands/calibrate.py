@@ -26,6 +26,7 @@ from ghpt.calibration.mistakes import SEVERAL_PEOPLE
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
@@ -35,7 +36,6 @@ from ghpt.commands.inputs import (
     resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.train import display_path
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.sequence import Sequence

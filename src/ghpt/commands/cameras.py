@@ -20,6 +20,7 @@ from ghpt.calibration.check.setup import Setup, setup_of
 from ghpt.commands.app import Command
 from ghpt.commands.calibrate import people_findings
 from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     find_recording,
@@ -28,7 +29,6 @@ from ghpt.commands.inputs import (
     own_sequence,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.train import display_path
 from ghpt.config import Target, build, suggest
 from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.data.people.sequence import Sequence

@@ -16,7 +16,7 @@ from ghpt.calibration.check.units import decide_unit
 from ghpt.commands.outputs import OutputSettings
 from ghpt.config import Target, build, settings, suggest
 from ghpt.data.datasets.datamodule import KeyPointDataModule
-from ghpt.data.datasets.store import prepared
+from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import Detections, read_key_points
 from ghpt.data.formats.names import Name
@@ -103,7 +103,7 @@ def find_recording(inputs: InputSettings) -> tuple[KeyPointDataModule, Recording
     data = build(inputs.data, "data")
     provenance = {"source": data.source, "split": data.evaluate}
     key = data.cache_key(data.evaluate)
-    stored = prepared(data.cache, key, lambda: data.generate(data.evaluate), provenance)
+    stored = prepare(data.cache, key, lambda: data.generate(data.evaluate), provenance)
     recordings = {recording.name: recording for recording in stored}
     name = inputs.recording
     if not name:

@@ -6,7 +6,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import torch
 from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
@@ -29,34 +30,33 @@ from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
 from ghpt.commands.prediction.gaps import Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
-from ghpt.commands.prediction.report import prediction_report, print_prediction, print_verdict
+from ghpt.commands.prediction.report import report_document, summary_document, verdict_document
+from ghpt.commands.prediction.result import PredictionResult
 from ghpt.commands.prediction.run import RunSettings, predict_shards
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.prediction.statistics import (
-    Coverage,
     Estimate,
-    Evaluation,
-    ScaledErrors,
     evaluate,
     measure_coverage,
     pose_estimate,
 )
-from ghpt.commands.prediction.verdict import Judge, Level, Measures, Verdict
-from ghpt.commands.train import display_path
+from ghpt.commands.prediction.verdict import Judge, Level, Measures
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Chunks, Evidence, Scene
 from ghpt.export.scene import origin_note
-from ghpt.files import atomic_write, sweep_temporaries, write_json
+from ghpt.files import sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.predictors import Classical, Learned
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About
+from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NAMES
+from ghpt.report.terminal import print_document
 from ghpt.skeleton import JOINTS
 
 SHARDS = ".shards"
@@ -133,39 +133,6 @@ class PoseEstimator:
     weights: torch.nn.Module | None
     identity: dict[str, Any]
     """What its results depend on, as plain data."""
-
-
-@dataclass(frozen=True)
-class PredictionResult:
-    """What prediction.json holds."""
-
-    data: str
-    source: str
-    cameras: tuple[str, ...]
-    estimator: str
-    estimator_text: str
-    rate_hz: float | None
-    fill_frames: int | None
-    smooth_hz: float | None
-    coverage: Coverage
-    scales: ScaledErrors
-    unit_mm: float
-    evaluation: Evaluation
-    formats: list[str]
-    provenance: dict[str, Any]
-    verdict: Verdict | None = None
-
-    def plain(self) -> dict[str, Any]:
-        """Return the result as plain data; the coverage is not a group of its own."""
-        values: dict[str, Any] = {}
-        for key, value in asdict(self).items():
-            if key == "coverage":
-                values |= value
-            elif key == "verdict":
-                values |= {key: self.verdict.numbers()} if self.verdict else {}
-            else:
-                values[key] = value
-        return values
 
 
 def files(settings: PredictSettings) -> Files:
@@ -460,14 +427,12 @@ def _evidence(sequence: Sequence, shards: Shards) -> Iterator[Evidence]:
 
 def _write_report(result: PredictionResult, output: Path) -> None:
     """Write prediction.json and report.md, and print the tables and the verdict."""
-    values = result.plain()
-    write_json(output / "prediction.json", values)
-    with atomic_write(output / "report.md", "w") as handle:
-        handle.write(prediction_report(values))
-    print_prediction(values)
+    write_json(output / "prediction.json", result.plain())
+    write_markdown(output / "report.md", report_document(result))
+    print_document(summary_document(result))
     written = ", ".join(WRITERS[name].file for name in result.formats)
     _log.info("Written: %s and report.md in %s.", written, display_path(output))
-    print_verdict(values["verdict"])
+    print_document(verdict_document(result))
 
 
 COMMAND = Command(

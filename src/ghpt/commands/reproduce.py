@@ -1,38 +1,37 @@
-"""Every table and figure of the paper again: the tasks that are missing, then the report from all
-of them.
-"""
+"""Every table and figure of the paper again: the tasks that are missing, then a report of all."""
 
 from __future__ import annotations
 
 import logging
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypedDict
 
 import yaml
 
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.jobs import Job
-from ghpt.commands.outputs import Files
-from ghpt.commands.train import display_path
-from ghpt.config import check_type, suggest
+from ghpt.commands.outputs import Files, OutputSettings
+from ghpt.config import suggest
 from ghpt.errors import GhptConfigError, check
 from ghpt.paper.ablations import tables as ablations
 from ghpt.paper.camera import tables as camera_tables
 from ghpt.paper.engine.artefact import Artefact, Results
-from ghpt.paper.engine.page import Entry, Page, write_page
+from ghpt.paper.engine.page import Counts, Entry, Page, write_page
 from ghpt.paper.engine.pool import perform_all
+from ghpt.paper.engine.settings import DataFolders, Overrides, Sizes
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
 from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
 from ghpt.paper.pose import figures as pose_figures
 from ghpt.paper.robustness import curves as robustness
 from ghpt.provenance import provenance
-from ghpt.report.escape import code
+from ghpt.report.document import Code, Text
 from ghpt.report.tables import display_name
 
 _PARTS = (
@@ -53,213 +52,202 @@ MOST_JOBS = 8
 _log = logging.getLogger(__name__)
 
 
-class Data(TypedDict):
-    """Where the real data sets are; see conf/reproduce.yaml."""
+@dataclass(frozen=True, kw_only=True)
+class ReproduceSettings(OutputSettings):
+    """conf/reproduce.yaml."""
 
-    root: str | None
-    human36m: str | None
-    panoptic: str | None
-
-
-class Overrides(TypedDict):
-    """Of every training and of every test, in the words of their command lines."""
-
-    train: list[str]
-    test: list[str]
-
-
-class Settings(TypedDict):
-    """What `reproduce` needs of the configuration."""
-
-    only: list[str] | str | None
+    only: tuple[str, ...] | str | None
+    """Labels or kinds of artefacts, None: all."""
     seed: int
+    """The first seed."""
     seeds: int
+    """How many; means and deviations are over them."""
     jobs: int | None
+    """Processes at once; None: as many as there are processors, at most ``MOST_JOBS``."""
     overrides: Overrides
-    data: Data
-    sizes: dict[str, Any]
+    data: DataFolders
+    sizes: Sizes
     tasks: str
+    """The folder of finished tasks."""
     progress_bar: bool
 
+    def __post_init__(self) -> None:
+        check(self.seeds >= 1, "seeds", f"is {self.seeds}", "It must be >= 1.")
+        enough = self.jobs is None or self.jobs >= 1
+        check(enough, "jobs", f"is {self.jobs}", "It must be >= 1, or null.")
 
-def files(config: dict[str, Any]) -> Files:
-    """What `reproduce` reads and writes. Raises GhptConfigError for settings that cannot work."""
-    check_type(config, Settings, "")
-    roots = [Path(root).expanduser() for root in config["data"].values() if root]
-    return Files(tuple(roots), ("report.md", "report.html", "report.json"))
+    @property
+    def all_seeds(self) -> tuple[int, ...]:
+        return tuple(range(self.seed, self.seed + self.seeds))
 
 
-def reproduce(config: dict[str, Any], output: Path, conf: Path) -> dict[str, Any]:
-    """Compute what is missing of the artefacts that are asked for, and write their report into
-    ``output``.
+def files(settings: ReproduceSettings) -> Files:
+    """Return what `reproduce` reads and writes."""
+    folders = (settings.data.root, settings.data.human36m, settings.data.panoptic)
+    roots = tuple(Path(folder).expanduser() for folder in folders if folder)
+    return Files(roots, ("report.md", "report.html", "report.json"))
 
-    ``conf`` is the folder of train.yaml and test.yaml. Returns what the report says of itself.
-    Raises GhptConfigError for a label that there is not, and whatever a task raises, with its name;
-    what was finished by then is kept.
+
+def reproduce(settings: ReproduceSettings, output: Path, conf: Path) -> Counts:
+    """Run what is missing of the artefacts asked for, and write their report into ``output``.
+
+    ``conf`` is the folder of train.yaml and test.yaml. Raises GhptConfigError for a label that
+    there is not, and whatever a task raises, with its name; what was finished by then is kept.
     """
-    check_type(config, Settings, "")
-    check(config["seeds"] >= 1, "seeds", f"is {config['seeds']}", "It must be >= 1.")
-    check(
-        config["jobs"] is None or config["jobs"] >= 1,
-        "jobs",
-        f"is {config['jobs']}",
-        "It must be >= 1, or null.",
-    )
-    return _reproduce(config, seeds_of(config), output, conf)
+    return _reproduce(settings, settings.all_seeds, output, conf)
 
 
-def gather(jobs: Sequence[Job[dict[str, Any], dict[str, Any]]], conf: Path) -> None:
-    """After a sweep over seeds or artefacts: one report of them all in the sweep's folder, from the
-    tasks that they kept.
+def gather(jobs: Sequence[Job[ReproduceSettings, Counts]], conf: Path) -> None:
+    """After a sweep over seeds or artefacts, write one report of all into the sweep's folder.
 
-    Where the jobs differ in anything else there is nothing to gather, and each has its own report.
+    It is made from the tasks that the jobs kept. Where the jobs differ in anything else there is
+    nothing to gather, and each has its own report.
     """
-    configs = [job.settings for job in jobs if not job.failed and job.settings is not None]
-    if not configs or any(_but_shares(config) != _but_shares(configs[0]) for config in configs):
+    finished = [job.settings for job in jobs if not job.failed and job.settings is not None]
+    shared = [_without_share(settings) for settings in finished]
+    if not shared or any(settings != shared[0] for settings in shared):
         return
-    seeds = sorted({seed for config in configs for seed in seeds_of(config)})
-    everything = any(config["only"] is None for config in configs)
-    only = (
-        None
-        if everything
-        else [artefact.label for config in configs for artefact in chosen(config["only"])]
-    )
-    with_all = {"only": only, "seed": seeds[0], "seeds": len(seeds)}
-    _reproduce(configs[0] | with_all, seeds, Path(configs[0]["output"]), conf)
+    seeds = sorted({seed for settings in finished for seed in settings.all_seeds})
+    only: tuple[str, ...] | None = None
+    if all(settings.only is not None for settings in finished):
+        chosen = [artefact for settings in finished for artefact in choose(settings.only)]
+        only = tuple(artefact.label for artefact in chosen)
+    gathered = replace(finished[0], only=only, seed=seeds[0], seeds=len(seeds))
+    _reproduce(gathered, seeds, Path(gathered.output), conf)
 
 
-def seeds_of(config: dict[str, Any]) -> list[int]:
-    return list(range(config["seed"], config["seed"] + config["seeds"]))
-
-
-def _but_shares(config: dict[str, Any]) -> dict[str, Any]:
-    """What the jobs of a sweep that belong together have in common."""
-    return {key: value for key, value in config.items() if key not in ("only", "seed", "seeds")}
+def _without_share(settings: ReproduceSettings) -> ReproduceSettings:
+    """Return what the jobs of a sweep that belong together have in common."""
+    return replace(settings, only=None, seed=0, seeds=1)
 
 
 def _reproduce(
-    config: dict[str, Any], seeds: Sequence[int], output: Path, conf: Path
-) -> dict[str, Any]:
+    settings: ReproduceSettings, seeds: Sequence[int], output: Path, conf: Path
+) -> Counts:
     start = time.perf_counter()
-    artefacts = chosen(config["only"])
-    setups = [
-        Setup(conf, _roots(config["data"]), config["overrides"], config["sizes"], seed)
-        for seed in seeds
-    ]
+    artefacts = choose(settings.only)
+    roots = _roots(settings.data)
+    setups = [Setup(conf, roots, settings.overrides, settings.sizes, seed) for seed in seeds]
     tasks = {artefact.label: [artefact.tasks(setup) for setup in setups] for artefact in artefacts}
-    wanted = [
-        task for of_item in tasks.values() for of_seed in of_item for task in of_seed.values()
-    ]
-    folder = Path(config["tasks"])
-    jobs = config["jobs"] or min(processors(), MOST_JOBS)
-    try:
-        done = perform_all(wanted, folder, jobs, config["progress_bar"])
-    except (KeyboardInterrupt, SystemExit):
-        _log.warning(
-            "Stopped. What was finished is in %s; the same command goes on.", display_path(folder)
-        )
-        raise
-    entries = [
-        Entry(
-            artefact,
-            artefact.section(Results(setups, tasks[artefact.label], folder)),
-            _commands(tasks[artefact.label][0]),
-        )
-        for artefact in artefacts
-    ]
-    page = Page(
-        entries, _about(config, setups, done, start), yaml.safe_dump(config, sort_keys=False)
-    )
+    done = _perform(settings, tasks.values())
+    folder = Path(settings.tasks)
+    entries = []
+    for artefact in artefacts:
+        own = tasks[artefact.label]
+        section = artefact.section(Results(setups, own, folder))
+        entries.append(Entry(artefact, section, _commands(own[0])))
+    minutes = (time.perf_counter() - start) / 60
+    about = _about(setups, done, minutes)
+    config = yaml.safe_dump(asdict(settings), sort_keys=False)
+    page = Page(entries, about, config)
     write_page(page, output)
-    held = sum(claim.holds for claim in page.claims)
-    misses = sum(len(entry.misses) for entry in entries)
-    numbers = sum(len(entry.section.comparisons) for entry in entries)
-    _log.info(
-        "%d of %d claims hold, %d of %d numbers miss the paper's.",
-        held,
-        len(page.claims),
-        misses,
-        numbers,
-    )
+    counts = page.counts
+    _log.info("%s the paper's.", summary(counts))
     _log.info("Report: %s, and report.html", display_path(output / "report.md"))
-    return {"claims": len(page.claims), "held": held, "numbers": numbers, "misses": misses}
+    return counts
 
 
-def summary(told: dict[str, Any]) -> str:
-    """What `reproduce` returned, in words."""
-    return f"{told['held']} of {told['claims']} claims hold, {told['misses']} of {told['numbers']} numbers miss"
+def _perform(settings: ReproduceSettings, tasks: Iterable[Sequence[Mapping[str, Task]]]) -> int:
+    """Run the tasks that are missing. Returns how many that were."""
+    wanted = [task for of_artefact in tasks for of_seed in of_artefact for task in of_seed.values()]
+    jobs = settings.jobs or min(processors(), MOST_JOBS)
+    folder = Path(settings.tasks)
+    try:
+        return perform_all(wanted, folder, jobs, settings.progress_bar)
+    except (KeyboardInterrupt, SystemExit):
+        message = "Stopped. What was finished is in %s; the same command goes on."
+        _log.warning(message, display_path(folder))
+        raise
 
 
-def chosen(only: Sequence[str] | str | None) -> list[Artefact]:
-    """The artefacts of these labels, with or without ``tab:`` or ``fig:``, or kinds, in the report's
-    order; None: all.
+def summary(counts: Counts) -> str:
+    """Return in words what `reproduce` returned."""
+    return (
+        f"{counts.claims_held} of {counts.claims} claims hold, "
+        f"{counts.misses} of {counts.numbers} numbers miss"
+    )
+
+
+def choose(only: Sequence[str] | str | None) -> list[Artefact]:
+    """Return the artefacts of some labels or kinds in the report's order; None: all.
+
+    A label may have ``tab:`` or ``fig:`` before it. Raises GhptConfigError for one that there is
+    not.
     """
     if only is None:
         return list(ARTEFACTS.values())
-    wanted = [
-        word.removeprefix("tab:").removeprefix("fig:")
-        for word in ([only] if isinstance(only, str) else only)
-    ]
+    words = [only] if isinstance(only, str) else only
+    wanted = {word.removeprefix("tab:").removeprefix("fig:") for word in words}
     existing = {*ARTEFACTS, *(artefact.kind for artefact in ARTEFACTS.values())}
-    for word in wanted:
-        if word not in existing:
-            raise GhptConfigError("only", f"there is no {word!r}", suggest(word, existing))
-    return [
-        artefact for artefact in ARTEFACTS.values() if {artefact.label, artefact.kind} & set(wanted)
-    ]
+    for word in sorted(wanted - existing):
+        raise GhptConfigError("only", f"there is no {word!r}", suggest(word, existing))
+    return [artefact for artefact in ARTEFACTS.values() if {artefact.label, artefact.kind} & wanted]
 
 
 def processors() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Return how many processors this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
-def _roots(data: Data) -> dict[str, str | None]:
-    """Each data set's folder. Raises GhptConfigError where ``data.root`` does not hold it."""
-    roots = {}
-    for name in ("human36m", "panoptic"):
-        below = None if data["root"] is None else str(Path(data["root"]).expanduser() / name)
-        roots[name] = data[name] or below
-        if data[name] is None and below is not None and not Path(below).is_dir():
-            hint = f"Put the data set there, or name its folder alone: data.{name}=/path (the other stays synthetic)."
-            raise GhptConfigError("data.root", f"{data['root']} has no folder {name}", hint)
-    return roots
-
-
-def _commands(tasks: dict[str, Task]) -> list[str]:
-    """What makes these tasks by hand: trainings, then tests."""
-    found: dict[str, None] = {}
-    for task in tasks.values():
-        for before in (*task.dependencies.values(), task):
-            if before.command:
-                found[before.command] = None
-    return sorted(found, key=lambda command: "train.py" not in command)
-
-
-def _about(
-    config: dict[str, Any], setups: Sequence[Setup], done: int, start: float
-) -> dict[str, Any]:
-    origin = provenance(config["seed"])
-    minutes = (time.perf_counter() - start) / 60
-    seeds = [setup.seed for setup in setups]
+def _roots(data: DataFolders) -> dict[str, str | None]:
+    """Return each data set's folder. Raises GhptConfigError where ``data.root`` lacks it."""
     return {
-        "data": ", ".join(
-            display_name(data, setups[0].source(data)) for data in ("h36m", "panoptic")
-        ),
-        "seeds": f"{len(seeds)} ({', '.join(map(str, seeds))}), of training and hypotheses; the data are the same",
-        "made by": f"ghpt {origin['ghpt']}, commit {origin['commit'] or 'unknown'}, torch {origin['torch']}, "
-        f"numpy {origin['numpy']}, Python {origin['python']}",
-        "command": code(origin["command"]),
-        "run time": f"{minutes:.1f} minutes on {processors()} processors, for {done} tasks that were not there before",
+        "human36m": data.human36m or _below(data.root, "human36m"),
+        "panoptic": data.panoptic or _below(data.root, "panoptic"),
     }
 
 
-def command(conf: Path) -> Command:
-    """The command, of the configurations in the folder ``conf``."""
-    task = partial(reproduce, conf=conf)
-    after = partial(gather, conf=conf)
+def _below(root: str | None, name: str) -> str | None:
+    if root is None:
+        return None
+    folder = Path(root).expanduser() / name
+    if not folder.is_dir():
+        hint = (
+            f"Put the data set there, or name its folder alone: data.{name}=/path (the other stays "
+            "synthetic)."
+        )
+        raise GhptConfigError("data.root", f"{root} has no folder {name}", hint)
+    return str(folder)
+
+
+def _commands(tasks: Mapping[str, Task]) -> list[str]:
+    """Return the commands that do these tasks by hand: trainings, then tests."""
+    commands: dict[str, None] = {}
+    for task in tasks.values():
+        for one in (*task.dependencies.values(), task):
+            if one.command:
+                commands[one.command] = None
+    return sorted(commands, key=lambda command: "train.py" not in command)
+
+
+def _about(setups: Sequence[Setup], done: int, minutes: float) -> dict[str, Text]:
+    """Return what the report says of its run."""
+    first = setups[0]
+    origin = provenance(first.seed)
+    seeds = ", ".join(str(setup.seed) for setup in setups)
+    data = ", ".join(display_name(name, first.source(name)) for name in ("h36m", "panoptic"))
+    return {
+        "data": data,
+        "seeds": f"{len(setups)} ({seeds}), of training and hypotheses; the data are the same",
+        "made by": f"ghpt {origin['ghpt']}, commit {origin['commit'] or 'unknown'}, "
+        f"torch {origin['torch']}, numpy {origin['numpy']}, Python {origin['python']}",
+        "command": Code(str(origin["command"])),
+        "run time": f"{minutes:.1f} minutes on {processors()} processors, for {done} tasks that "
+        "were not there before",
+    }
+
+
+def command(conf: Path) -> Command[ReproduceSettings, Counts]:
+    """Return the command, of the configurations in the folder ``conf``."""
     return Command(
-        name="reproduce", settings=dict, task=task, summary=summary, files=files, after=after
+        name="reproduce",
+        settings=ReproduceSettings,
+        task=partial(reproduce, conf=conf),
+        summary=summary,
+        files=files,
+        after=partial(gather, conf=conf),
     )
 
 

@@ -2,116 +2,141 @@
 
 import logging
 import shutil
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NotRequired, TypedDict
+from typing import Any
 
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
+from ghpt.commands.display import display_path
 from ghpt.commands.lost import told
-from ghpt.commands.outputs import Files, input_paths
-from ghpt.commands.train import display_path, make_trainer, progress
-from ghpt.config import build, check_type
+from ghpt.commands.outputs import Files, OutputSettings, input_paths
+from ghpt.commands.trainer import make_trainer, progress
+from ghpt.config import Target, build
 from ghpt.errors import GhptCheckpointError
-from ghpt.files import sweep_temporaries
+from ghpt.files import sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
-from ghpt.models.pose.evaluation import write_metrics
-from ghpt.models.pose.problem import PoseTriangulation
-from ghpt.models.relative_pose.problem import RelativePose
+from ghpt.models.collect import CollectPredictions
+from ghpt.models.predictions import Predictions, open_predictions
+from ghpt.models.problem import BaselineSettings, Problem
 from ghpt.provenance import provenance
-from ghpt.report.pairs import PAIRS
-from ghpt.report.poses import POSES
-from ghpt.report.report import Report
-from ghpt.report.tables import title
+from ghpt.report.markdown import write_markdown
+from ghpt.report.tables import NONE, title
+from ghpt.report.terminal import print_document
 
-REPORTS: dict[type, Report] = {PoseTriangulation: POSES, RelativePose: PAIRS}
 _log = logging.getLogger(__name__)
 
 
-class Settings(TypedDict):
-    """What `test` needs of the configuration, whatever the problem; see also ``Report.settings``."""
+@dataclass(frozen=True, kw_only=True)
+class TestSettings(OutputSettings):
+    """The settings of `test`."""
+
+    __test__ = False  # not one for pytest
 
     ckpt: str | None
-    trust: NotRequired[list[str]]
+    """The checkpoint of a training; there is no default."""
+    trust: tuple[str, ...] = ()
+    """Packages whose classes the checkpoint may name."""
     hypotheses: int | None
-    data: dict[str, Any]
-    trainer: dict[str, Any]
+    """Hypotheses of a sample; None: as many as in training."""
+    frames: int | None
+    """Frames of a pair of cameras; None: as many as in training."""
+    data: Target
+    trainer: Target
+    view_weights: Target | None = None
+    baselines: Target = field(default_factory=dict)
+    camera_baselines: Target = field(default_factory=dict)
     seed: int
     progress_bar: bool
 
+    def estimators(self) -> BaselineSettings:
+        """Return what is tested beside the model."""
+        return BaselineSettings(self.baselines, self.camera_baselines, self.view_weights)
 
-def files(config: dict[str, Any]) -> Files:
-    """What a test reads and writes. Raises GhptConfigError for settings that cannot work."""
-    check_type(config, Settings, "")
+
+@dataclass(frozen=True)
+class TestResult:
+    """What a test measured; of several processes, the first one alone has it."""
+
+    __test__ = False  # not one for pytest
+
+    problem: Problem
+    predictions: Predictions[Any, Any, Any]
+    metrics: dict[str, Any]
+    """The content of metrics.json."""
+
+    @property
+    def error(self) -> float | None:
+        """The problem's headline number under ``weight``, mm; None where nothing was compared."""
+        return self.metrics["selections"]["weight"][self.problem.headline]
+
+
+def files(settings: TestSettings) -> Files:
+    """Return what a test reads and writes."""
     names = ("predictions.npz", "metrics.json", "report.md")
-    return Files(input_paths(config), names, growing=(".predictions",))
+    root = settings.data.get("root")
+    return Files(input_paths(settings.ckpt, root), names, growing=(".predictions",))
 
 
-def test(config: dict[str, Any], output: Path) -> dict[str, Any]:
-    """Test ``config["ckpt"]`` on ``config["data"]``; returns what metrics.json holds.
+def test(settings: TestSettings, output: Path) -> TestResult | None:
+    """Test a checkpoint on a data set, and show the result.
 
     Writes predictions.npz, metrics.json, report.md and TensorBoard events into ``output`` and
-    prints the table.
+    prints the table. Returns None on all processes but the first.
     """
-    measured = measure(config, output)
-    if measured is None:
-        return {}
-    report, predictions, metrics = measured
-    report.write_report(output / "report.md", metrics)
-    report.write_events(output, predictions, metrics)
-    report.print_table(metrics)
-    _log.info(
-        "Report: %s, beside it metrics.json and predictions.npz.",
-        display_path(output / "report.md"),
-    )
+    result = measure(settings, output)
+    if result is None:
+        return None
+    report = result.problem.report()
+    page = output / "report.md"
+    write_markdown(page, report.document(result.metrics))
+    report.write_events(output, result.predictions, result.metrics)
+    print_document(report.summary(result.metrics))
+    _log.info("Report: %s, beside it metrics.json and predictions.npz.", display_path(page))
     _log.info("Figures: tensorboard --logdir %s", display_path(output))
-    return metrics
+    return result
 
 
-def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str, Any]] | None:
-    """The part of `test` that computes: writes predictions.npz and metrics.json into ``output``.
+test.__test__ = False  # type: ignore[attr-defined]  # not one for pytest
 
-    Returns the problem's report, the opened predictions and the metrics; None on all processes but
-    the first.
+
+def measure(settings: TestSettings, output: Path) -> TestResult | None:
+    """Write predictions.npz and metrics.json: the part of `test` that computes.
+
+    Returns None on all processes but the first.
     """
-    check_type(config, Settings, "")
-    if not config["ckpt"]:
-        raise GhptCheckpointError(
-            "ckpt", "is missing", "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m"
-        )
+    if not settings.ckpt:
+        hint = "Name one: python test.py ckpt=runs/cmu2/last.ckpt data=h36m"
+        raise GhptCheckpointError("ckpt", "is missing", hint)
     changes = {
-        "hypotheses": config["hypotheses"],
-        "seed": config["seed"],
-        "problem.frames": config.get("frames"),
+        "hypotheses": settings.hypotheses,
+        "seed": settings.seed,
+        "problem.frames": settings.frames,
     }
-    model, trained = load_model(config["ckpt"], config.get("trust") or (), **changes)
-    kinds = type(model.problem).__mro__  # a class derived from one of ours has its report
-    report = next((REPORTS[kind] for kind in kinds if kind in REPORTS), None)
-    if report is None:
-        raise GhptCheckpointError(
-            config["ckpt"], f"is of a {type(model.problem).__name__}", "It has no report."
-        )
-    check_type(config, report.settings, "")
-    data = build(config["data"], "data")
-    data.bind(model.problem)
-    origin = provenance(config["seed"]) | {
-        "checkpoint": str(config["ckpt"]),
+    model, trained = load_model(settings.ckpt, settings.trust, **changes)
+    problem = model.problem
+    data = build(settings.data, "data")
+    data.bind(problem)
+    origin = provenance(settings.seed) | {
+        "checkpoint": settings.ckpt,
         "training": trained["provenance"],
     }
     meta = {
         "data": data.name,
         "source": data.source,
         "split": data.evaluate,
-        "seed": config["seed"],
+        "seed": settings.seed,
         "hypotheses": model.hypotheses,
         "provenance": origin,
     }
-    estimators = report.estimators(config, model)
+    baselines = problem.baselines(settings.estimators(), model)
+    collect = CollectPredictions(output, problem, baselines, meta)
     trainer = make_trainer(
-        config["trainer"],
+        settings.trainer,
         default_root_dir=output,
         logger=False,
-        callbacks=[report.collect(output, estimators, meta), *progress(config)],
-        enable_progress_bar=config["progress_bar"],
+        callbacks=[collect, *progress(settings.progress_bar)],
+        enable_progress_bar=settings.progress_bar,
     )
     sweep_temporaries(output)
     shutil.rmtree(output / ".predictions", ignore_errors=True)  # what a killed test left
@@ -119,25 +144,21 @@ def measure(config: dict[str, Any], output: Path) -> tuple[Report, Any, dict[str
         trainer.test(model, datamodule=data, verbose=False)
     if not trainer.is_global_zero:
         return None
-    predictions = report.open(output / "predictions.npz")
-    metrics = report.evaluate(predictions)
-    write_metrics(output / "metrics.json", metrics)
-    return report, predictions, metrics
+    predictions = open_predictions(collect.path, problem.schema)
+    metrics = problem.metrics(predictions)
+    write_json(output / "metrics.json", metrics)
+    return TestResult(problem, predictions, metrics)
 
 
-def summary(metrics: dict[str, Any]) -> str:
-    """What `test` returned, in words."""
-    weight = metrics["selections"]["weight"]
-    error = next(
-        weight[report.headline] for report in REPORTS.values() if report.headline in weight
-    )
-    return f"{title(metrics)}: {'–' if error is None else f'{error:.1f} mm'}"
+def summary(result: TestResult | None) -> str:
+    """Return the result in one line."""
+    if result is None:
+        return ""
+    error = NONE if result.error is None else f"{result.error:.1f} mm"
+    return f"{title(result.metrics)}: {error}"
 
 
-test.__test__ = False  # not one for pytest
-
-
-COMMAND = Command(name="test", settings=dict, task=test, summary=summary, files=files)
+COMMAND = Command(name="test", settings=TestSettings, task=test, summary=summary, files=files)
 
 
 if __name__ == "__main__":

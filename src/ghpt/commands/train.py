@@ -1,194 +1,181 @@
-"""Training: from a configuration to a checkpoint that test.py can use on any cameras."""
+"""Training: from settings to a checkpoint that test.py can use on any cameras."""
 
 import logging
-import os
-import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, TypedDict
+from typing import Any, Literal
 
-import lightning as L
 import torch
-from lightning.fabric.utilities.exceptions import MisconfigurationException
 
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
-from ghpt.commands.lost import OwnSignals, told
-from ghpt.commands.outputs import Files, input_paths
-from ghpt.config import build, check_arguments, check_plain, check_type
-from ghpt.errors import GhptCheckpointError, GhptConfigError
+from ghpt.commands.display import display_path, shell_override
+from ghpt.commands.lost import told
+from ghpt.commands.outputs import Files, OutputSettings, input_paths
+from ghpt.commands.resume import Start, resumable
+from ghpt.commands.trainer import make_trainer, progress
+from ghpt.config import Target, build, check_plain
+from ghpt.errors import GhptConfigError
 from ghpt.files import adopt, set_aside, sweep_temporaries
-from ghpt.models.callbacks import LogHyperparameters, Progress, SaveLast, best_checkpoint
-from ghpt.models.checkpoint import (
-    FIELD,
-    FORMAT_VERSION,
-    LAST,
-    PREVIOUS,
-    AtomicCheckpointIO,
-    check_fit,
-    read_checkpoint,
-)
+from ghpt.models.callbacks import LogHyperparameters, SaveLast, best_checkpoint
+from ghpt.models.checkpoint import FORMAT_VERSION, LAST, PREVIOUS, AtomicCheckpointIO
+from ghpt.models.module import StochasticEstimator
 from ghpt.models.registry import check_registered, packages_to_trust
 from ghpt.provenance import provenance
 from ghpt.report.logger import ForgivingTensorBoard
 from ghpt.report.tables import display_name
 
-_STATE = {
-    "epoch": int,
-    "global_step": int,
-    "loops": dict,
-    "callbacks": dict,
-    "optimizer_states": list,
-    "lr_schedulers": list,
-    "pytorch-lightning_version": str,
-}
-"""What Lightning needs of a checkpoint to go on from it."""
 BEST = "best.ckpt"
+_VALIDATION = "validation/"
 _log = logging.getLogger(__name__)
 
 
-class Settings(TypedDict):
-    """What `train` needs of the configuration."""
+@dataclass(frozen=True, kw_only=True)
+class TrainSettings(OutputSettings):
+    """The settings of `train`."""
 
-    data: dict[str, Any]
-    model: dict[str, Any]
-    trainer: dict[str, Any]
+    data: Target
+    model: Target
+    trainer: Target
     seed: int
     save_every: int
+    """Optimiser steps between writes of ``last.ckpt``."""
     resume: bool | Literal["auto"]
+    """Whether to go on from a checkpoint in the output; ``auto``: where there is one."""
     progress_bar: bool
 
+    def decisive(self) -> dict[str, Any]:
+        """Return the settings that a checkpoint is of, as plain data."""
+        return {"model": self.model, "data": self.data, "seed": self.seed}
 
-def files(config: dict[str, Any]) -> Files:
-    """What a training reads and writes. Raises GhptConfigError for settings that cannot work."""
-    check_type(config, Settings, "")
-    if config["resume"]:  # the checkpoints prove by their own digests that ghpt wrote them
-        return Files(reads=input_paths(config), writes=(BEST,))
+
+def files(settings: TrainSettings) -> Files:
+    """Return what a training reads and writes."""
+    reads = input_paths(settings.data.get("root"))
+    if settings.resume:  # the checkpoints prove by their own digests that ghpt wrote them
+        return Files(reads=reads, writes=(BEST,))
     checkpoints = (LAST, PREVIOUS, BEST)
-    return Files(reads=input_paths(config), writes=checkpoints, keeps=checkpoints)
+    return Files(reads=reads, writes=checkpoints, keeps=checkpoints)
 
 
-def train(config: dict[str, Any], output: Path) -> dict[str, float]:
-    """Train ``config["model"]`` on ``config["data"]``; returns the validation errors (mm).
+def train(settings: TrainSettings, output: Path) -> dict[str, float]:
+    """Train a model, and return its validation errors (mm) by name.
 
     Writes ``last.ckpt``, ``previous.ckpt``, ``best.ckpt`` and TensorBoard events into ``output``.
     With ``resume`` it goes on from ``last.ckpt`` there, or from ``previous.ckpt`` if that is
-    damaged, to the same numbers as an uninterrupted run; ``auto`` does so where there is one. Exits
-    with 130 on SIGINT, and with 143 on SIGTERM and SIGHUP.
+    damaged, to the same numbers as an uninterrupted run. Exits with 130 on SIGINT, and with 143 on
+    SIGTERM and SIGHUP.
     """
-    check_type(config, Settings, "")
     torch.set_float32_matmul_precision("high")
-    seed = config["seed"]
-    data = build(config["data"], "data")
-    model = build(config["model"], "model")
+    data = build(settings.data, "data")
+    model = build(settings.model, "model")
     _check_optimizer(model)
-    _warn_of_classes(config["model"])
+    _warn_of_classes(settings.model)
     data.bind(model.problem)
-    identity = {
-        "format_version": FORMAT_VERSION,
-        "config": {"model": config["model"], "data": config["data"], "seed": seed},
-        "provenance": provenance(seed) | {"data": data.name, "source": data.source},
-    }
-    check_plain(identity, "config")
+    identity = _identity(settings, data)
     last = output / LAST
-    resume = config["resume"]
-    if resume == "auto":
-        resume = last.exists() or (output / PREVIOUS).exists()
-    start, warning = resumable(output, config, model) if resume else (None, "")
-    saver = SaveLast(last, config["save_every"], identity, resumed=start == last)
-    about = {
-        "data": data.name,
-        "source": data.source,
-        "train_samples": data.train_samples,
-        "seed": seed,
-    }
+    start = _start(settings, output, model)
+    saver = SaveLast(last, settings.save_every, identity, resumed=start.checkpoint == last)
     trainer = make_trainer(
-        config["trainer"],
+        settings.trainer,
         default_root_dir=output,
         logger=ForgivingTensorBoard(output),
         plugins=[AtomicCheckpointIO()],
         callbacks=[
             saver,
             best_checkpoint(output),
-            LogHyperparameters(about | _flat(config["model"], "model")),
-            *progress(config),
+            LogHyperparameters(_hyperparameters(settings, data)),
+            *progress(settings.progress_bar),
         ],
-        enable_progress_bar=config["progress_bar"],
+        enable_progress_bar=settings.progress_bar,
         num_sanity_val_steps=0,
     )
     sweep_temporaries(output)
-    if trainer.is_global_zero and start is not None:
-        adopt(start)
-        if start != last:
-            set_aside(last)
-    if warning and trainer.is_global_zero:
-        _log.warning(warning)
+    if trainer.is_global_zero:
+        _begin(start, last)
+    ckpt_path = start.checkpoint and str(start.checkpoint)
     try:
         with told(trainer):
-            trainer.fit(model, datamodule=data, ckpt_path=start and str(start), weights_only=True)
+            trainer.fit(model, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
     except (SystemExit, Exception) as stop:
         if trainer.is_global_zero and (saver.saved is not None or isinstance(stop, SystemExit)):
             _say_stopped(last, saver.saved)
         raise
-    errors = {
-        k: float(v) for k, v in trainer.callback_metrics.items() if k.startswith("validation/")
-    }
+    measured = trainer.callback_metrics.items()
+    errors = {name: float(value) for name, value in measured if name.startswith(_VALIDATION)}
     if trainer.is_global_zero:
-        _say_finished(last, data, config["model"], model.problem.measures, errors)
+        _say_finished(last, data, settings.model, model.problem.measures, errors)
     return errors
 
 
-def summary(errors: dict[str, float]) -> str:
-    """What `train` returned, in words."""
-    numbers = (
-        f"{name.removeprefix('validation/')} {error:.1f} mm" for name, error in errors.items()
-    )
+def summary(errors: Mapping[str, float]) -> str:
+    """Return the validation errors in one line."""
+    numbers = [f"{name.removeprefix(_VALIDATION)} {mm:.1f} mm" for name, mm in errors.items()]
     return ", ".join(numbers) or "nothing was left to do"
 
 
-def make_trainer(settings: dict[str, Any], **ours: Any) -> L.Trainer:
-    """Lightning's Trainer of the yaml's settings and ``ours``. Raises GhptConfigError for what it
-    does not take.
-    """
-    settings = build(settings, "trainer")
-    ours["callbacks"] = [*ours.get("callbacks", ()), OwnSignals()]
-    for key in set(settings) & set(ours):
-        raise GhptConfigError(
-            f"trainer.{key}", "is not for the configuration: ghpt sets it", "Leave it out."
-        )
-    check_arguments(L.Trainer, settings, "trainer")
-    try:
-        return L.Trainer(**settings, **ours, use_distributed_sampler=False)
-    except (TypeError, ValueError, MisconfigurationException) as error:
-        raise GhptConfigError(
-            "trainer", str(error).rstrip("."), "See lightning.Trainer's arguments."
-        ) from error
+def _identity(settings: TrainSettings, data: Any) -> dict[str, Any]:
+    """Return what the checkpoints say of themselves. Raises GhptConfigError if it is not plain."""
+    origin = provenance(settings.seed) | {"data": data.name, "source": data.source}
+    identity = {
+        "format_version": FORMAT_VERSION,
+        "config": settings.decisive(),
+        "provenance": origin,
+    }
+    check_plain(identity, "config")
+    return identity
 
 
-def progress(config: dict[str, Any]) -> list[L.Callback]:
-    return [Progress()] if config["progress_bar"] else []
+def _hyperparameters(settings: TrainSettings, data: Any) -> dict[str, Any]:
+    """Return what TensorBoard shows beside the final errors."""
+    about = {
+        "data": data.name,
+        "source": data.source,
+        "train_samples": data.train_samples,
+        "seed": settings.seed,
+    }
+    return about | dict(_leaves(settings.model, "model"))
 
 
-def display_path(path: Path) -> str:
-    """A path as short as it can be typed here."""
-    relative = os.path.relpath(path)
-    return str(path) if relative.startswith("..") else relative
+def _leaves(config: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield ``("a.b", value)`` of nested settings, lists as text: what TensorBoard takes."""
+    if isinstance(config, Mapping):
+        for name, value in config.items():
+            if not name.startswith("_"):
+                yield from _leaves(value, f"{path}.{name}")
+    else:
+        plain = isinstance(config, bool | int | float | str)
+        yield path, config if plain else str(config)
 
 
-def shell_override(key: str, value: object) -> str:
-    """``key=value`` as a shell and Hydra's grammar take it."""
-    text = f"{key}={value}"
-    return text if re.fullmatch(r"[\w=./+-]+", text) else f"\"{key}='{value}'\""
+def _start(settings: TrainSettings, output: Path, model: StochasticEstimator) -> Start:
+    """Return where the training begins. Raises GhptCheckpointError, see ``resumable``."""
+    resume = settings.resume
+    if resume == "auto":
+        resume = (output / LAST).exists() or (output / PREVIOUS).exists()
+    return resumable(output, settings.decisive(), model) if resume else Start()
 
 
-def _check_optimizer(model: Any) -> None:
-    """The optimiser's own checks, before the data are prepared."""
+def _begin(start: Start, last: Path) -> None:
+    """Make the checkpoint that is gone on from this run's own, and put a damaged one aside."""
+    if start.checkpoint is not None:
+        adopt(start.checkpoint)
+        if start.checkpoint != last:
+            set_aside(last)
+    if start.warning:
+        _log.warning(start.warning)
+
+
+def _check_optimizer(model: StochasticEstimator) -> None:
+    """Let the optimiser check its settings before the data are prepared."""
     try:
         model.configure_optimizers()
     except (TypeError, ValueError) as error:
         raise GhptConfigError("model.optimizer", str(error), "Change this setting.") from error
 
 
-def _warn_of_classes(model: dict[str, Any]) -> None:
+def _warn_of_classes(model: Target) -> None:
     """Say before the training, not after it, that its checkpoint will not be taken."""
     try:
         check_registered(model)
@@ -196,117 +183,33 @@ def _warn_of_classes(model: dict[str, Any]) -> None:
         _log.warning("test.py and predict.py will not take this model: %s", error)
 
 
-def resumable(output: Path, config: dict[str, Any], model: Any) -> tuple[Path, str]:
-    """The checkpoint in ``output`` to go on from, and a warning if it is not the last.
-
-    Raises GhptCheckpointError if neither the last nor the previous one can be used, and if the one
-    that can was made with other settings.
-    """
-    last = output / LAST
-    previous = output / PREVIOUS
-    try:
-        _check_resumable(last, config, model)
-        return last, ""
-    except OtherSettings:
-        raise
-    except GhptCheckpointError as error:
-        if not previous.exists():
-            raise
-        reason = f"{display_path(last)}: {error.problem}"
-    try:
-        step = _check_resumable(previous, config, model)
-    except OtherSettings:
-        raise
-    except GhptCheckpointError as error:
-        problem = f"{reason}; {previous.name}: {error.problem}"
-        hint = "There is nothing to go on from: train without resume=true, in another output."
-        raise GhptCheckpointError(output, problem, hint) from None
-    return previous, f"{reason}. Going on from {previous.name}, which holds training step {step}."
-
-
-class OtherSettings(GhptCheckpointError):
-    """A checkpoint that is whole, and of another training."""
-
-
-def _check_resumable(path: Path, config: dict[str, Any], model: Any) -> int:
-    """A checkpoint's training step. Raises GhptCheckpointError if it cannot be gone on from."""
-    checkpoint = read_checkpoint(path)
-    saved = checkpoint[FIELD].get("config")
-    hint = "Give one that train.py wrote."
-    if not isinstance(saved, dict):
-        raise GhptCheckpointError(path, "does not say what it is of", hint)
-    for part in ("model", "data", "seed"):
-        if part not in saved or _what(saved[part]) != _what(config[part]):
-            problem = f"was made with other settings of {part!r}"
-            raise OtherSettings(path, problem, "Resume with the same ones.")
-    for name, kind in _STATE.items():
-        state = checkpoint.get(name)
-        if type(state) is not kind or (name == "optimizer_states" and not state):
-            raise GhptCheckpointError(path, f"holds no state of a training ({name})", hint)
-    try:
-        check_fit(model, checkpoint["state_dict"])
-    except ValueError as error:
-        raise GhptCheckpointError(path, f"does not fit its own model ({error})", hint) from None
-    return checkpoint["global_step"]
-
-
-def _what(settings: Any) -> Any:
-    """What decides the numbers: not how the batches are loaded, which one may have to change to go
-    on.
-    """
-    return (
-        {k: v for k, v in settings.items() if k != "workers"}
-        if isinstance(settings, dict)
-        else settings
-    )
-
-
-def _flat(config: Any, above: str) -> dict[str, Any]:
-    """``{"a.b": value}``, lists as text: what TensorBoard takes as hyper-parameters."""
-    if not isinstance(config, dict):
-        return {above: config if isinstance(config, bool | int | float | str) else str(config)}
-    return {
-        k: v
-        for name, value in config.items()
-        if name[0] != "_"
-        for k, v in _flat(value, f"{above}.{name}").items()
-    }
-
-
 def _say_finished(
-    last: Path,
-    data: Any,
-    model: dict[str, Any],
-    measures: str,
-    errors: dict[str, float],
+    last: Path, data: Any, model: Target, measures: str, errors: Mapping[str, float]
 ) -> None:
     _log.info("Validation on %s, %s:", display_name(data.name, data.source), measures)
     _log.info("  %s", summary(errors))
     _log.info("Checkpoint: %s", display_path(last))
-    where = (
-        "data=h36m"
-        if data.root is None
-        else f"data={data.name} {shell_override('data.root', data.root)}"
-    )
+    words = ["python test.py", shell_override("ckpt", display_path(last))]
+    if data.root is None:
+        words.append("data=h36m")
+    else:
+        words += [f"data={data.name}", shell_override("data.root", data.root)]
     trust = ",".join(packages_to_trust(model))
-    command = ["python test.py", shell_override("ckpt", display_path(last)), where]
     if trust:
-        command.append(f"'trust=[{trust}]'")
-    _log.info("Test it: %s", " ".join(command))
+        words.append(f"'trust=[{trust}]'")
+    _log.info("Test it: %s", " ".join(words))
 
 
 def _say_stopped(last: Path, step: int | None) -> None:
     if step is None:
         _log.warning("Stopped before the first checkpoint of this run.")
-    else:
-        _log.warning("Stopped. %s holds training step %d.", display_path(last), step)
-        _log.warning(
-            "Go on with the same command and %s resume=true",
-            shell_override("output", display_path(last.parent)),
-        )
+        return
+    _log.warning("Stopped. %s holds training step %d.", display_path(last), step)
+    output = shell_override("output", display_path(last.parent))
+    _log.warning("Go on with the same command and %s resume=true", output)
 
 
-COMMAND = Command(name="train", settings=dict, task=train, summary=summary, files=files)
+COMMAND = Command(name="train", settings=TrainSettings, task=train, summary=summary, files=files)
 
 
 if __name__ == "__main__":

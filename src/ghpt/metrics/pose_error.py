@@ -1,10 +1,11 @@
-"""MPJPE (paper, eq. mpjpe) in three frames, with the coverage that says what it was averaged over."""
+"""MPJPE (paper, eq. mpjpe) in three frames, with the coverage of what it is averaged over."""
 
 from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import one_hot
 from torchmetrics import Metric
 
 from ghpt.geometry.rotations import procrustes
@@ -16,31 +17,34 @@ Kind = Literal["absolute", "relative", "aligned"]
 
 
 def joint_errors(
-    estimate: PoseEstimate, truth: Truth, kind: Kind
+    estimate: PoseEstimate,
+    truth: Truth,
+    kind: Kind,
 ) -> tuple[Float[Tensor, "*B J"], Bool[Tensor, "*B J"]]:
-    """Distance of each estimated joint to its true place, mm, float64, and which of them count.
+    """Return the distance of each estimated joint to its true position, and which are measured.
 
-    A joint counts if it is estimated and has a truth. ``relative``: only where the pelvis counts
-    too, and the pelvis itself counts with an error of 0, as is the field's habit. ``aligned``: only
-    where at least three joints count, the fewest that fix a similarity. An error that does not
-    count is 0.
+    Distances are in mm, float64. A joint is measured if it is estimated and has a truth.
+    ``relative``: only where the pelvis is measured too, and the pelvis itself has an error of 0, as
+    is the field's habit. ``aligned``: only where at least three joints are measured, the fewest
+    that fix a similarity. An error that is not measured is 0.
     """
     points = estimate.points.double()
     true_points = truth.points.double()
-    counted = estimate.estimated & truth.valid
+    measured = estimate.estimated & truth.valid
     if kind == "relative":
         points = points - points[..., PELVIS, None, :]
         true_points = true_points - true_points[..., PELVIS, None, :]
-        counted = counted & counted[..., PELVIS, None]
+        measured = measured & measured[..., PELVIS, None]
     elif kind == "aligned":
-        counted = counted & (counted.sum(-1, keepdim=True) >= 3)
-        points = procrustes(points, true_points, counted)
+        enough = measured.sum(-1, keepdim=True) >= 3
+        measured = measured & enough
+        points = procrustes(points, true_points, measured)
     errors = torch.linalg.vector_norm(points - true_points, dim=-1)
-    return torch.where(counted, errors, 0.0), counted
+    return torch.where(measured, errors, 0.0), measured
 
 
 class PoseErrors(NamedTuple):
-    """What ``MPJPE`` computes: means over all counted joint-frames, mm; NaN where none counts."""
+    """What ``MPJPE`` computes: means over all measured joint-frames, mm; NaN where there is none."""
 
     mean: Float[Tensor, ""]
     six_joints: Float[Tensor, ""]
@@ -49,12 +53,11 @@ class PoseErrors(NamedTuple):
     per_group: Float[Tensor, " G"] | Float[Tensor, ""]
     """torchmetrics takes the dimension away when there is one group."""
     coverage: Float[Tensor, ""]
-    """Counted joint-frames / joint-frames with a truth, in [0, 1]."""
+    """Measured joint-frames / joint-frames with a truth, in [0, 1]."""
 
 
 class MPJPE(Metric):
-    """Mean per-joint position error over all counted joint-frames, overall and in each of
-    ``groups`` groups.
+    """Mean per-joint position error over all measured joint-frames, overall and in groups.
 
     Each joint-frame weighs the same, so a frame with half of its joints missing weighs half: an
     estimator cannot change the mean by how its misses are spread over frames, only its
@@ -64,22 +67,17 @@ class MPJPE(Metric):
 
     full_state_update = False
     error_sum: Tensor
-    counted: Tensor
+    measured: Tensor
     with_truth: Tensor
 
     def __init__(self, kind: Kind, groups: int, joints: int) -> None:
         super().__init__()
         self.kind = kind
         self.groups = groups
-        self.add_state(
-            "error_sum", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum"
-        )
-        self.add_state(
-            "counted", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum"
-        )
-        self.add_state(
-            "with_truth", torch.zeros(groups, joints, dtype=torch.float64), dist_reduce_fx="sum"
-        )
+        zeros = torch.zeros(groups, joints, dtype=torch.float64)
+        self.add_state("error_sum", zeros, dist_reduce_fx="sum")
+        self.add_state("measured", zeros.clone(), dist_reduce_fx="sum")
+        self.add_state("with_truth", zeros.clone(), dist_reduce_fx="sum")
 
     def update(
         self,
@@ -88,19 +86,21 @@ class MPJPE(Metric):
         group: Int[Tensor, " B"],
     ) -> None:
         """Add B frames; ``group`` is each frame's group (its action, say), 0 ... groups-1."""
-        errors, counted = joint_errors(estimate, truth, self.kind)
+        errors, measured = joint_errors(estimate, truth, self.kind)
         # A product, not index_add_, whose order of summation varies on a GPU.
-        member = torch.nn.functional.one_hot(group.long(), self.groups).double().mT
+        member = one_hot(group.long(), self.groups).double().mT
         self.error_sum += member @ errors
-        self.counted += member @ counted.double()
+        self.measured += member @ measured.double()
         self.with_truth += member @ truth.valid.double()
 
     def compute(self) -> PoseErrors:
         six = list(SIX_JOINTS)
+        error_sum = self.error_sum
+        measured = self.measured
         return PoseErrors(
-            mean=self.error_sum.sum() / self.counted.sum(),
-            six_joints=self.error_sum[:, six].sum() / self.counted[:, six].sum(),
-            per_joint=self.error_sum.sum(0) / self.counted.sum(0),
-            per_group=self.error_sum.sum(1) / self.counted.sum(1),
-            coverage=self.counted.sum() / self.with_truth.sum(),
+            mean=error_sum.sum() / measured.sum(),
+            six_joints=error_sum[:, six].sum() / measured[:, six].sum(),
+            per_joint=error_sum.sum(0) / measured.sum(0),
+            per_group=error_sum.sum(1) / measured.sum(1),
+            coverage=measured.sum() / self.with_truth.sum(),
         )

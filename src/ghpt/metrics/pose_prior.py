@@ -1,39 +1,39 @@
-"""The human pose prior S^2 (paper, section 4.4): how constant the body's left/right symmetry is in
-time.
-"""
+"""The human pose prior S^2 (paper, section 4.4): how constant the body's symmetry is in time."""
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
+from torch.nn.functional import one_hot
 from torchmetrics import Metric
 
 from ghpt.observations import PoseEstimate
-from ghpt.skeleton import SYMMETRIC_PARTS
+from ghpt.skeleton import SYMMETRIC_BONES
 
-PARTS = tuple(SYMMETRIC_PARTS)
-"""The six parts, in the order of the P axis."""
+PARTS = tuple(SYMMETRIC_BONES)
+"""The six pairs of bones, in the order of the P axis."""
 
 
 def length_ratios(estimate: PoseEstimate) -> tuple[Float[Tensor, "*B P"], Bool[Tensor, "*B P"]]:
-    """Length of the left part / length of the right, float64, for each of ``PARTS``, and which are
-    defined.
+    """Return left length / right length of each of ``PARTS``, float64, and which are defined.
 
-    A ratio is defined where all joints of both sides are estimated and the right part has a length;
+    A ratio is defined where all joints of both sides are estimated and the right bone has a length;
     elsewhere it is 1.
     """
-    ends = torch.tensor(list(SYMMETRIC_PARTS.values()), device=estimate.points.device)
-    points = estimate.points.double()[..., ends, :]
-    left, right = torch.linalg.vector_norm(points[..., 0, :] - points[..., 1, :], dim=-1).unbind(-1)
-    defined = estimate.estimated[..., ends].flatten(-2).all(-1) & (right > 0)
-    return torch.where(defined, left / torch.where(defined, right, 1.0), 1.0), defined
+    joints = torch.tensor(list(SYMMETRIC_BONES.values()), device=estimate.points.device)
+    ends = estimate.points.double()[..., joints, :]
+    bones = ends[..., 0, :] - ends[..., 1, :]
+    left, right = torch.linalg.vector_norm(bones, dim=-1).unbind(-1)
+    estimated = estimate.estimated[..., joints].flatten(-2).all(-1)
+    defined = estimated & (right > 0)
+    safe_right = torch.where(defined, right, 1.0)
+    return torch.where(defined, left / safe_right, 1.0), defined
 
 
 class PosePrior(Metric):
-    """S^2, the unbiased variance over frames of the left/right length ratio, for each subject and
-    part.
+    """S^2, the unbiased variance over frames of the left/right length ratio.
 
-    The sums are of (ratio - 1) and its square, float64: near 0 for a body, so nothing cancels, and
-    they add up over batches and processes.
+    It is computed for each subject and pair of bones. The sums are of (ratio - 1) and its square,
+    float64: near 0 for a body, so nothing cancels, and they add up over batches and processes.
     """
 
     full_state_update = False
@@ -52,12 +52,14 @@ class PosePrior(Metric):
     def update(self, estimate: PoseEstimate, subject: Int[Tensor, " B"]) -> None:
         """Add B frames; ``subject`` is each frame's subject, 0 ... subjects-1."""
         ratios, defined = length_ratios(estimate)
-        member = torch.nn.functional.one_hot(subject.long(), self.subjects).double().mT
+        excess = ratios - 1
+        member = one_hot(subject.long(), self.subjects).double().mT
         self.count += member @ defined.double()
-        self.excess += member @ (ratios - 1)
-        self.excess_squared += member @ (ratios - 1).square()
+        self.excess += member @ excess
+        self.excess_squared += member @ excess.square()
 
     def compute(self) -> Float[Tensor, "S P"]:
-        """S^2 for each subject and part; NaN with fewer than two frames."""
-        variance = (self.excess_squared - self.excess.square() / self.count) / (self.count - 1)
+        """Return S^2 for each subject and part; NaN with fewer than two frames."""
+        mean_square = self.excess.square() / self.count
+        variance = (self.excess_squared - mean_square) / (self.count - 1)
         return torch.where(self.count >= 2, variance.clamp_min(0), torch.nan)

@@ -1,6 +1,8 @@
-"""Hypothesis selection (paper, sections 3 and 4): every selection is a vector of weights over the
-pool.
-"""
+"""Aggregation of hypotheses (paper, sections 3 and 4): each one is weights over the pool."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -9,6 +11,7 @@ from torch import Tensor
 
 from ghpt import randomness
 from ghpt.errors import GhptConfigError
+from ghpt.observations import Batch
 
 AGGREGATIONS = ("weight", "average", "most", "least", "stochastic", "random", "best", "worst")
 """Names as in metrics.json; best and worst look at the truth and are not available in use."""
@@ -17,8 +20,7 @@ AGGREGATIONS = ("weight", "average", "most", "least", "stochastic", "random", "b
 def cap_logit_std(
     logits: Float[Tensor, "B H"], logit_std_cap: float | None
 ) -> Float[Tensor, "B H"]:
-    """Centre each pool's logits and shrink them where their standard deviation exceeds
-    ``logit_std_cap`` (None: as they are).
+    """Centre each pool's logits and limit their standard deviation (None: return them as they are).
 
     Not in the paper, whose scores lie between 0 and 1 and so cannot differ much either. Without a
     limit the weights collapse onto one or two hypotheses, and a scorer is surest of itself on poses
@@ -27,19 +29,20 @@ def cap_logit_std(
     if logit_std_cap is None:
         return logits
     centred = logits - logits.mean(dim=-1, keepdim=True)
-    return centred * (
-        logit_std_cap
-        / centred.square().mean(dim=-1, keepdim=True).clamp_min(logit_std_cap**2).sqrt()
-    )
+    variance = centred.square().mean(dim=-1, keepdim=True)
+    std = variance.clamp_min(logit_std_cap**2).sqrt()
+    return centred * (logit_std_cap / std)
 
 
 def softmax_weights(
     logits: Float[Tensor, "B H"], temperature: float, noise: Float[Tensor, "B H"] | None = None
 ) -> Float[Tensor, "B H"]:
-    """The (Gumbel-)softmax of eq:gumbel-softmax; with ``noise`` from Gumbel(0, 1) in training,
-    without it at test.
+    """Return the (Gumbel-)softmax of eq:gumbel-softmax.
+
+    ``noise`` is from Gumbel(0, 1) in training, None at test.
     """
-    return torch.softmax((logits if noise is None else logits + noise) / temperature, dim=-1)
+    noisy = logits if noise is None else logits + noise
+    return torch.softmax(noisy / temperature, dim=-1)
 
 
 def aggregation_weights(
@@ -59,11 +62,13 @@ def aggregation_weights(
         return softmax_weights(logits, temperature)
     if name == "average":
         return torch.full_like(logits, 1 / count)
+    own_keys = randomness.key(0, name, keys)
     if name == "stochastic":  # the largest of logits plus Gumbel noise is a draw from their softmax
-        noise = randomness.gumbel(randomness.key(0, "stochastic", keys), (count,))
+        noise = randomness.gumbel(own_keys, (count,))
         index = (logits / temperature + noise).argmax(dim=-1)
     elif name == "random":
-        index = (randomness.uniform(randomness.key(0, "random", keys), (1,)) * count).long()[:, 0]
+        uniform = randomness.uniform(own_keys, (1,))
+        index = (uniform * count).long()[:, 0]
     elif name == "most":
         index = logits.argmax(dim=-1)
     elif name == "least":
@@ -77,3 +82,24 @@ def aggregation_weights(
             "selection", f"{name!r} is unknown", f"Existing: {', '.join(AGGREGATIONS)}."
         )
     return F.one_hot(index, count).to(logits.dtype)
+
+
+@dataclass(frozen=True)
+class WeightSummary(Batch):
+    """How concentrated the weights over each pool are."""
+
+    entropy: Float[Tensor, " B"]
+    """Nats."""
+    max: Float[Tensor, " B"]
+    """The largest weight."""
+    effective: Float[Tensor, " B"]
+    """1 / sum of squares: the hypotheses in effect."""
+
+
+def summarize(weights: Float[Tensor, "B H"]) -> WeightSummary:
+    """Return how concentrated weights are that sum to 1."""
+    return WeightSummary(
+        entropy=torch.special.entr(weights).sum(dim=-1),
+        max=weights.amax(dim=-1),
+        effective=1 / weights.square().sum(dim=-1),
+    )

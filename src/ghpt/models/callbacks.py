@@ -98,19 +98,18 @@ class SaveLast(Callback):
 
 
 class LogHyperparameters(Callback):
-    """At the end of training, the settings and the final validation errors side by side in
-    TensorBoard.
-    """
+    """Shows the settings beside the final validation errors in TensorBoard."""
 
     def __init__(self, values: dict[str, Any]) -> None:
         self.values = values
 
     def on_fit_end(self, trainer: L.Trainer, module: L.LightningModule) -> None:
-        errors = {
-            k: v.item() for k, v in trainer.callback_metrics.items() if k.startswith("validation/")
-        }
-        if trainer.logger and errors:
-            final = {k.replace("validation/", "final/"): v for k, v in errors.items()}
+        """Write them, at the end of training."""
+        final = {}
+        for name, value in trainer.callback_metrics.items():
+            if name.startswith("validation/"):
+                final[name.replace("validation/", "final/")] = value.item()
+        if trainer.logger and final:
             trainer.logger.log_hyperparams(self.values, final)
 
 
@@ -118,12 +117,13 @@ class Progress(RichProgressBar):
     """Lightning's bar, short enough for 80 columns."""
 
     def get_metrics(self, trainer: L.Trainer, module: L.LightningModule) -> dict[str, Any]:
+        """Return the newest validation error of ``weight``."""
         error = trainer.progress_bar_metrics.get("validation/weight")
         return {} if error is None else {"mm": f"{error:.1f}"}
 
 
 def best_checkpoint(folder: Path) -> ModelCheckpoint:
-    """``best.ckpt``: the lowest validation error of the weighted selection."""
+    """Return the callback that keeps ``best.ckpt``: the lowest validation error of ``weight``."""
     return ModelCheckpoint(
         dirpath=folder,
         filename="best",

@@ -38,10 +38,10 @@ _HINT = "It is damaged or not a ghpt checkpoint; use another one."
 
 
 class AtomicCheckpointIO(CheckpointIO):
-    """Temporary file in the checkpoint's own folder, synced, read back, moved into place.
+    """Writes a temporary file in the checkpoint's own folder, reads it back, moves it into place.
 
-    (Lightning's own goes through the system's temporary folder, which copies without a sync where
-    that is another file system: a kill then destroys both the new and the old checkpoint.)
+    Lightning's own goes through the system's temporary folder, which copies without a sync where
+    that is another file system: a kill then destroys both the new and the old checkpoint.
     ``storage_options={"previous": path}`` keeps what the new checkpoint replaces under that name.
     """
 
@@ -110,7 +110,7 @@ def _read(path: Path, map_location: Any = "cpu") -> Any:
 
 
 def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, Any]:
-    """The checkpoint as a dict, in which ``FIELD`` is plain data and the weights are tensors.
+    """Return the checkpoint as a dict, in which ``FIELD`` is plain data and weights are tensors.
 
     Raises GhptCheckpointError if it is missing, damaged, foreign or of another version.
     """
@@ -147,8 +147,7 @@ def read_checkpoint(path: str | Path, map_location: Any = "cpu") -> dict[str, An
 def load_model(
     path: str | Path, trust: Sequence[str] = (), **changes: Any
 ) -> tuple[StochasticEstimator, dict[str, Any]]:
-    """The model that a checkpoint describes, with its weights, and what the checkpoint says of
-    itself.
+    """Return the model that a checkpoint describes, and what the checkpoint says of itself.
 
     ``changes`` replace settings of the model (such as ``hypotheses``, or ``problem.frames``); None
     leaves one as it is. A checkpoint can only name the classes of ``ghpt.models.registry``, and
@@ -164,7 +163,7 @@ def load_model(
     try:
         config = ours["config"]["model"]
         for name, value in changes.items():
-            config = config if value is None else _changed(config, name.split("."), value)
+            config = config if value is None else _with_setting(config, name.split("."), value)
         if not packages_to_trust(config):
             # On this device no numbers are kept: a file cannot ask for more memory than it fills.
             with torch.device("meta"):
@@ -202,7 +201,7 @@ def check_fit(model: Any, weights: Mapping[str, Tensor]) -> None:
 
 
 def _are_weights(values: Any) -> bool:
-    """Whether this is a dict of names and plain tensors."""
+    """Return whether this is a dict of names and plain tensors."""
     if not isinstance(values, dict):
         return False
     for name, value in values.items():
@@ -214,14 +213,15 @@ def _are_weights(values: Any) -> bool:
 
 
 def _one_line(error: Exception) -> str:
-    """An error's first line, of printable characters and no great length: it may quote the file."""
+    """Return an error's first line, printable and of no great length: it may quote the file."""
     text = str(error).split("\n")[0] or type(error).__name__
     if not isinstance(error, ValueError):
         text = f"{type(error).__name__}: {text}"
     return "".join(c if c.isprintable() else "?" for c in text)[:300]
 
 
-def _changed(config: dict[str, Any], path: list[str], value: Any) -> dict[str, Any]:
-    """The configuration with one setting changed."""
+def _with_setting(config: dict[str, Any], path: list[str], value: Any) -> dict[str, Any]:
+    """Return the configuration with one setting changed."""
     name, *rest = path
-    return config | {name: _changed(config[name], rest, value) if rest else value}
+    new = _with_setting(config[name], rest, value) if rest else value
+    return config | {name: new}

@@ -1,4 +1,4 @@
-"""The three losses of section 3: expected error, entropy, and the error of the selected hypothesis."""
+"""The three losses of section 3: expected error, entropy, and the error of the estimate."""
 
 from typing import NamedTuple
 
@@ -28,7 +28,7 @@ class StochasticLoss(nn.Module):
 
     def __init__(self, alpha: float, beta: float, gamma: float, relative_errors: bool) -> None:
         super().__init__()
-        for name, value in (("alpha", alpha), ("beta", beta), ("gamma", gamma)):
+        for name, value in {"alpha": alpha, "beta": beta, "gamma": gamma}.items():
             check(value >= 0, f"model.loss.{name}", f"is {value}", "It must be >= 0.")
         self.alpha = alpha
         self.beta = beta
@@ -41,25 +41,29 @@ class StochasticLoss(nn.Module):
         errors: Float[Tensor, "B H"],
         estimate_error: Float[Tensor, " B"],
     ) -> LossTerms:
-        """``weights`` sum to 1; ``errors`` of each hypothesis, ``estimate_error`` of the selected
-        one (mm).
+        """Return the loss of each item.
+
+        ``weights`` sum to 1; ``errors`` (mm) are those of the hypotheses, ``estimate_error`` that
+        of the estimate.
         """
         if self.relative_errors:
-            errors = errors / errors.amax(dim=-1, keepdim=True).clamp_min(
-                torch.finfo(errors.dtype).tiny
-            )
+            largest = errors.amax(dim=-1, keepdim=True)
+            errors = errors / largest.clamp_min(torch.finfo(errors.dtype).tiny)
         stochastic = (weights * errors).sum(dim=-1)
         # entr(0) is 0 but its gradient is infinite, and softmax turns that into NaN where a weight
         # underflows.
-        entropy = torch.special.entr(weights.clamp_min(torch.finfo(weights.dtype).tiny)).sum(dim=-1)
+        positive = weights.clamp_min(torch.finfo(weights.dtype).tiny)
+        entropy = torch.special.entr(positive).sum(dim=-1)
         total = self.alpha * stochastic + self.beta * entropy + self.gamma * estimate_error
         return LossTerms(total, stochastic, entropy, estimate_error)
 
 
 def mean_over_all(
-    values: Float[Tensor, " B"], counted: Bool[Tensor, " B"], total: Tensor, world: int
+    values: Float[Tensor, " B"], has_truth: Bool[Tensor, " B"], total: Tensor, world: int
 ) -> Tensor:
-    """The mean over the counted items of all processes, so scaled that averaging gradients over
-    ``world`` processes gives its gradient; ``total`` is the count over all processes.
+    """Return this process's part of the mean over the items with a truth of all processes.
+
+    It is so scaled that averaging gradients over ``world`` processes gives the mean's gradient;
+    ``total`` is the number of items over all processes.
     """
-    return torch.where(counted, values, 0.0).sum() * world / total.clamp_min(1)
+    return torch.where(has_truth, values, 0.0).sum() * world / total.clamp_min(1)

@@ -1,4 +1,4 @@
-"""The loop of the framework as a LightningModule: generate, featurize, score, aggregate, compare."""
+"""The loop as a LightningModule: generate, featurize, score, aggregate, compare."""
 
 from collections.abc import Callable, Iterable
 from typing import Any
@@ -32,9 +32,9 @@ class StochasticEstimator(L.LightningModule):
 
     ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like
     ``StochasticLoss``. ``logit_std_cap`` limits how much a pool's logits differ
-    (``cap_logit_std``). ``selection``: the hypothesis of the estimation loss, ``weight`` or
-    ``stochastic`` (straight through). All randomness is a function of (seed, optimiser step,
-    sample): see ``ghpt.randomness``.
+    (``cap_logit_std``). ``selection``: the aggregation of the estimation loss, ``weight`` or
+    ``stochastic`` (straight through). All randomness is a function of seed, optimiser step and
+    sample: see ``ghpt.randomness``.
     """
 
     def __init__(
@@ -50,38 +50,23 @@ class StochasticEstimator(L.LightningModule):
         selection: str,
         seed: int,
     ) -> None:
+        possible = 1 <= hypotheses <= MOST_HYPOTHESES
+        hint = f"Draw at least 1 and at most {MOST_HYPOTHESES} (the paper: 200)."
+        check(possible, "model.hypotheses", f"is {hypotheses}", hint)
+        hint = "It must be > 0 (the paper: 1.5)."
+        check(temperature > 0, "model.temperature", f"is {temperature}", hint)
+        capped = logit_std_cap is None or logit_std_cap > 0
+        hint = "It must be > 0, or null for no limit."
+        check(capped, "model.logit_std_cap", f"is {logit_std_cap}", hint)
+        exists = selection in ("weight", "stochastic")
+        hint = "Existing: weight, stochastic."
+        check(exists, "model.selection", f"is {selection!r}", hint)
         super().__init__()
-        check(
-            1 <= hypotheses <= MOST_HYPOTHESES,
-            "model.hypotheses",
-            f"is {hypotheses}",
-            f"Draw at least 1 and at most {MOST_HYPOTHESES} (the paper: 200).",
-        )
-        check(
-            temperature > 0,
-            "model.temperature",
-            f"is {temperature}",
-            "It must be > 0 (the paper: 1.5).",
-        )
-        check(
-            logit_std_cap is None or logit_std_cap > 0,
-            "model.logit_std_cap",
-            f"is {logit_std_cap}",
-            "It must be > 0, or null for no limit.",
-        )
-        check(
-            selection in ("weight", "stochastic"),
-            "model.selection",
-            f"is {selection!r}",
-            "Existing: weight, stochastic.",
-        )
         self.problem = problem
         self.loss = loss
         self.optimizer = optimizer
-        with torch.random.fork_rng(
-            devices=[]
-        ):  # the initial weights too are a function of the seed alone
-            torch.manual_seed(seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)  # the initial weights too are a function of the seed alone
             self.scorer = scorer(problem.feature_size)
         self.hypotheses = hypotheses
         self.temperature = temperature
@@ -131,8 +116,10 @@ class StochasticEstimator(L.LightningModule):
         self.scorer.standardise.fit(torch.cat(features))
 
     def on_fit_start(self) -> None:
+        """Take the feature statistics, unless they came with a checkpoint."""
         if not self.scorer.standardise.fitted:
-            batches = self.trainer.datamodule.all_training_batches()
+            data = self.trainer.datamodule  # type: ignore[attr-defined]  # not declared
+            batches = data.all_training_batches()
             self.fit_statistics(batch.observations.to(self.device) for batch in batches)
 
     def terms(self, pool: Pool, keys: Int[Tensor, " B"]) -> LossTerms:
@@ -153,6 +140,7 @@ class StochasticEstimator(L.LightningModule):
         return self.loss(weights, pool.errors, estimate_error.to(weights.dtype))
 
     def training_step(self, batch: Labelled[Any, Any], batch_idx: int) -> Tensor:
+        """Return the mean loss. Raises GhptError where it is not finite."""
         step = self.global_step
         observations = batch.observations
         pool = self.sample(observations, "hypotheses", batch.truth, step)
@@ -160,7 +148,7 @@ class StochasticEstimator(L.LightningModule):
         total = pool.has_truth.sum()
         world = self.trainer.world_size
         if world > 1:
-            total = self.all_gather(total).sum()
+            total = torch.as_tensor(self.all_gather(total)).sum()
         means = LossTerms(*(mean_over_all(term, pool.has_truth, total, world) for term in terms))
         if not torch.isfinite(means.total):
             raise GhptError(
@@ -172,28 +160,36 @@ class StochasticEstimator(L.LightningModule):
         return means.total
 
     def validation_step(self, batch: Labelled[Any, Any], batch_idx: int) -> None:
+        """Add a batch to the mean error of each of a few aggregations."""
         pool = self.sample(batch.observations, "validation", batch.truth)
-        for name, metric in self.validation.items():
+        for name, metric in self._validation_means().items():
             error, _ = self.problem.error(pool.estimate(name), batch.truth)
             metric.update(error.double(), pool.has_truth.double())
 
     def on_validation_epoch_end(self) -> None:
-        for name, metric in self.validation.items():
-            self.log(
-                f"validation/{name}",
-                metric.compute().float(),
-                prog_bar=name == "weight",
-                sync_dist=False,
-            )
+        """Log the mean errors of the epoch."""
+        for name, metric in self._validation_means().items():
+            mean = metric.compute().float()
+            self.log(f"validation/{name}", mean, prog_bar=name == "weight", sync_dist=False)
             metric.reset()
 
-    def test_step(self, batch: Labelled[Any, Any], batch_idx: int) -> Pool:
+    def _validation_means(self) -> dict[str, MeanMetric]:
+        means = self.validation.items()
+        return {name: mean for name, mean in means if isinstance(mean, MeanMetric)}
+
+    def test_step(  # type: ignore[override]  # what takes it is the callback of predictions
+        self, batch: Labelled[Any, Any], batch_idx: int
+    ) -> Pool:
+        """Return the pool of a batch."""
         return self.sample(batch.observations, "test", batch.truth)
 
     def configure_optimizers(self) -> torch.optim.Optimizer:
+        """Return the optimiser of the scorer's weights."""
         return self.optimizer(self.scorer.parameters())
 
 
 def _mean() -> MeanMetric:
-    """A weighted mean in float64 that is right with uneven processes; NaN when nothing was counted."""
-    return MeanMetric(nan_strategy="disable").set_dtype(torch.float64)
+    """Return a weighted mean in float64 that is right with uneven processes, NaN of nothing."""
+    mean = MeanMetric(nan_strategy="disable")
+    mean.set_dtype(torch.float64)
+    return mean

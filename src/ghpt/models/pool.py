@@ -10,7 +10,12 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.models.aggregation import aggregation_weights, cap_logit_std
+from ghpt.models.aggregation import (
+    WeightSummary,
+    aggregation_weights,
+    cap_logit_std,
+    summarize,
+)
 from ghpt.models.problem import Hypotheses, Problem
 from ghpt.observations import Batch
 
@@ -84,15 +89,6 @@ class Pool:
         """Return the pool whose softmax has another temperature."""
         return replace(self, temperature=temperature)
 
-    def weight_summary(self) -> dict[str, Float[Tensor, " B"]]:
-        """Return how concentrated the weights of ``weight`` are: see ``WEIGHT_SUMMARIES``."""
-        weights = self.weights()
-        return {
-            "entropy": torch.special.entr(weights).sum(dim=-1),
-            "max": weights.amax(dim=-1),
-            "effective": 1 / weights.square().sum(dim=-1),
-        }
-
-
-WEIGHT_SUMMARIES = ("entropy", "max", "effective")
-"""Entropy (nats), the largest weight, and 1 / sum of squares (hypotheses in effect)."""
+    def weight_summary(self) -> WeightSummary:
+        """Return how concentrated the weights of ``weight`` are."""
+        return summarize(self.weights())

@@ -1,62 +1,133 @@
-"""One loop, many problems: what the LightningModule asks of a problem, and nothing more.
+"""One loop, many problems: what the loop, training and testing ask of a problem, and nothing more.
 
-observations -> generate -> hypotheses -> featurize -> features -> scorer -> logits -> weights
-                                |                                                         |
-                    error (against truth)  <-----------  aggregate  <---------------------+
+    observations -> generate -> hypotheses -> featurize -> features -> scorer -> logits -> weights
+                                    |                                                         |
+                        error (against truth)  <-----------  aggregate  <---------------------+
+
+A problem is a class derived from ``Problem``, in a package of ghpt's or of the user's own.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, TypeVar
 
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.observations import Batch
+from ghpt.config import Target
+from ghpt.data.datasets.frames import SampleSet, Sampling, draw_frames
+from ghpt.models.mean_error import mean_errors
+from ghpt.models.predictions import Predictions, Schema, Tables, TrueJoints
+from ghpt.observations import Batch, Estimate, Labelled, LabelledRecording
+from ghpt.report.report import Report
 
 HypothesesT = TypeVar("HypothesesT", bound="Hypotheses")
 
 
 @dataclass(frozen=True)
 class Hypotheses(Batch):
-    """H hypotheses for each of B items. Every field has leading dimensions B H, save ``shared``."""
+    """H hypotheses for each of B samples. Every field begins with B H, save the ``shared`` ones."""
 
     shared: ClassVar[tuple[str, ...]] = ()
-    """Names of the fields that all hypotheses of an item share; leading dimension B."""
+    """Names of the fields that all hypotheses of a sample share; they begin with B."""
 
     def first(self: HypothesesT, count: int) -> HypothesesT:
-        """Return the first ``count`` hypotheses of each item."""
+        """Return the first ``count`` hypotheses of each sample."""
         own = [field.name for field in fields(self) if field.name not in self.shared]
         return replace(self, **{name: getattr(self, name)[:, :count] for name in own})
 
 
-@runtime_checkable
-class Problem(Protocol):
-    """Hypotheses and estimates are the problem's own types; only the problem looks inside."""
+@dataclass(frozen=True)
+class BaselineSettings:
+    """The groups of test.yaml that say what is tested beside a model."""
 
-    measures: str
+    baselines: Target
+    """Classical estimators of poses."""
+    camera_baselines: Target
+    """Classical estimators of relative camera poses."""
+    view_weights: Target | None = None
+    """How a model of poses weights the views; None: not at all."""
+
+
+class Problem(ABC):
+    """What is estimated, from what, and how it is compared with the truth.
+
+    The types of observations, hypotheses, estimates and truth are the problem's own: only the
+    problem looks inside. The first five methods are the loop, and every problem has its own. The
+    others say where its samples come from and what a test run stores and shows; what is here
+    serves problems whose samples are frames of a recording.
+    """
+
+    measures: ClassVar[str]
     """What ``error`` is, for people; mm."""
+    schema: ClassVar[Schema[Any, Any, Any]]
+    """What a test run stores."""
+    headline: ClassVar[str] = "error"
+    """The number of ``metrics`` that sums up a run, mm."""
     feature_size: int
     """D, the length of the feature vector that the scorer sees."""
 
+    @abstractmethod
     def generate(self, observations: Any, count: int, keys: Int[Tensor, " B"]) -> Any:
-        """Return ``count`` random hypotheses for each item: a pure function of item and key."""
+        """Return ``count`` random hypotheses for each sample: a function of sample and key."""
 
+    @abstractmethod
     def featurize(self, hypotheses: Any) -> Float[Tensor, "B H D"]:
         """Return what the scorer sees of each hypothesis: float32, finite, never the cameras."""
 
+    @abstractmethod
     def aggregate(self, hypotheses: Any, weights: Float[Tensor, "B H"]) -> Any:
         """Return the estimate under weights that sum to 1; differentiable in the weights.
 
         One-hot weights select a hypothesis.
         """
 
+    @abstractmethod
     def as_estimates(self, hypotheses: Any) -> Any:
         """Return all hypotheses as estimates with leading dimensions B H."""
 
+    @abstractmethod
     def error(self, estimate: Any, truth: Any) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
-        """Return each estimate's error, and which items have a truth to compare with.
+        """Return each estimate's error, and which samples can be compared with a truth.
 
-        An item that has none gets 0.
+        A sample that cannot gets 0.
         """
+
+    def dataset(self, recordings: Sequence[LabelledRecording], sampling: Sampling) -> SampleSet:
+        """Return the samples that are drawn from the recordings of a split."""
+        return draw_frames(recordings, sampling)
+
+    def baselines(
+        self, settings: BaselineSettings, model: Any
+    ) -> Mapping[str, Callable[[Any], Any]]:
+        """Return the estimators that are tested beside the aggregations, by name."""
+        return {}
+
+    def from_baseline(self, estimate: Any, observations: Any) -> Estimate:
+        """Return a baseline's estimate as one of this problem."""
+        return estimate
+
+    def record(self, batch: Labelled[Any, Any], dataset: Any) -> Batch:
+        """Return what ``schema`` stores of each sample of a batch."""
+        return TrueJoints.from_truth(batch.truth)
+
+    def tables(self, dataset: Any) -> Tables:
+        """Return what ``schema`` stores of a data set once."""
+        return Tables()
+
+    def meta(self) -> dict[str, Any]:
+        """Return what the stored predictions say of the problem's settings, as plain data."""
+        return {}
+
+    def metrics(self, predictions: Predictions[Any, Any, Any]) -> dict[str, Any]:
+        """Return the content of metrics.json; ``selections`` has an entry for each estimator."""
+        return mean_errors(predictions, self.error)
+
+    def report(self) -> Report:
+        """Return what shows the metrics; imported here, since drawing is slow to import."""
+        from ghpt.report.mean_error import REPORT
+
+        return REPORT

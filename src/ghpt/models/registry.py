@@ -25,7 +25,6 @@ from ghpt.models.relative_pose.problem import RelativePose
 from ghpt.models.relative_pose.scale import BodyHeight, KnownScale, Scale, BoneLengths
 from ghpt.models.scorer import Scorer
 
-_METHODS = ("generate", "featurize", "aggregate", "as_estimates", "error")
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", re.ASCII)
 _NEVER_TRUSTED = frozenset(sys.stdlib_module_names) | {"__main__", "ghpt", "torch"}
 """Packages that are not the user's own. What is harmless of ghpt and torch is in ``PARTS``."""
@@ -37,10 +36,10 @@ class Untrusted(GhptConfigError):
 
 @dataclass
 class Part:
-    """A key of a model's configuration that holds a class."""
+    """A key of a model's configuration that names a class."""
 
     kind: type
-    """What a class must be derived from (``Problem``: what methods it must have)."""
+    """What a class must be derived from."""
     partial: bool = False
     """Whether the model gives the last arguments itself (``_partial_: true``)."""
     classes: dict[str, type] = field(default_factory=dict)
@@ -114,7 +113,7 @@ def check_trust(trust: Sequence[str]) -> None:
 
 
 def packages_to_trust(config: Mapping[str, Any]) -> list[str]:
-    """The modules of the user's own classes in a model's configuration, by name."""
+    """Return the modules of the user's own classes in a model's configuration, by name."""
     targets = [node["_target_"] for _, node, _ in _nodes(config, "model")]
     return sorted({target.rpartition(".")[0] for target in targets if _is_users(target)})
 
@@ -124,7 +123,7 @@ def _nodes(
     path: str,
     inside: bool = False,
 ) -> Iterator[tuple[str, Mapping[str, Any], bool]]:
-    """Each node with ``_target_``: its path, itself, whether it is inside a class of the user's."""
+    """Yield each node with ``_target_``: path, node, whether it is inside a class of the user's."""
     if isinstance(config, Mapping):
         if "_target_" in config:
             yield path, config, inside
@@ -137,13 +136,13 @@ def _nodes(
 
 
 def _classes(config: Mapping[str, Any], trust: Sequence[str]) -> dict[str, type]:
-    """The class of every name in a model's configuration."""
+    """Return the class of every name in a model's configuration."""
     nodes = _nodes(config, "model")
     return {node["_target_"]: _class(node, path, inside, trust) for path, node, inside in nodes}
 
 
 def _is_users(target: Any) -> bool:
-    """Whether a name can be that of a class of the user's own."""
+    """Return whether a name can be that of a class of the user's own."""
     if not (isinstance(target, str) and "." in target and _NAME.fullmatch(target)):
         return False
     return target.split(".")[0] not in _NEVER_TRUSTED
@@ -154,7 +153,7 @@ def _is_within(module: str, packages: Sequence[str]) -> bool:
 
 
 def _class(node: Mapping[str, Any], path: str, inside: bool, trust: Sequence[str]) -> type:
-    """The class of a node.
+    """Return the class of a node.
 
     What is ``inside`` a class of the user's is that class's business: it may be any registered
     class, and any of the trusted packages.
@@ -195,11 +194,7 @@ def _users_class(node: Mapping[str, Any], path: str, kind: type, trust: Sequence
     if not _is_within(found.__module__, trust):
         problem = f"{target} is defined elsewhere, in {found.__module__}"
         raise GhptConfigError(key, problem, "Train with the name of the module that defines it.")
-    if kind is Problem:
-        fits = all(callable(getattr(found, name, None)) for name in _METHODS)
-    else:
-        fits = issubclass(found, kind)
-    if not fits:
+    if not issubclass(found, kind):
         name = f"{kind.__module__}.{kind.__qualname__}"
         raise GhptConfigError(key, f"{target} is no {name}", "Derive it from that class.")
     return found

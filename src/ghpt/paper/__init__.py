@@ -1,3 +1,1 @@
-"""The paper's tables and figures again: tasks that are computed once and kept, artefacts made of them,
-one report.
-"""
+"""The paper's tables and figures again: tasks, artefacts that are made of them, and one report."""

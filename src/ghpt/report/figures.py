@@ -1,8 +1,10 @@
-"""Figures of a test run, drawn without pyplot, so that nothing is shared with a user's own plots."""
+"""Figures of a test run, drawn without pyplot: a user's own plots share nothing with them."""
+
+from __future__ import annotations
 
 import textwrap
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Iterable, Mapping
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -17,9 +19,14 @@ from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.report.tables import title
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 
+LineStyle = Literal["-", "--", "-.", ":"] | tuple[float, tuple[float, ...]]
+
 # Okabe and Ito's palette: told apart by all kinds of colour vision, and left from right by dashes
 # too.
-LEFT, RIGHT, MIDDLE, TRUTH = "#0072B2", "#D55E00", "#000000", "#BBBBBB"
+LEFT = "#0072B2"
+RIGHT = "#D55E00"
+MIDDLE = "#000000"
+TRUTH = "#BBBBBB"
 SELECTION_COLOURS = dict(
     zip(
         AGGREGATIONS,
@@ -31,83 +38,93 @@ SELECTION_HATCHES = dict(
     zip(AGGREGATIONS, ("", "//", "...", "\\\\", "xx", "--", "", "oo"), strict=True)
 )
 """The same in print without colours."""
-_SIDES = tuple(
-    "left" if "left" in a + b else "right" if "right" in a + b else "middle"
-    for a, b in ((JOINTS[i], JOINTS[j]) for i, j in BONES)
-)
-_STYLES = {"left": (LEFT, "solid"), "right": (RIGHT, (0, (3, 1))), "middle": (MIDDLE, "solid")}
+_SIDE_COLOURS = {"left": LEFT, "right": RIGHT, "middle": MIDDLE}
+_SIDE_STYLES: dict[str, LineStyle] = {"left": "-", "right": (0, (3, 1)), "middle": "-"}
+_MARGIN = 80
+"""mm about the poses."""
+
+
+def _side(bone: tuple[int, int]) -> str:
+    """Return the side of the body that a bone is on."""
+    names = "".join(JOINTS[joint] for joint in bone)
+    return next((side for side in ("left", "right") if side in names), "middle")
+
+
+_BONES = {side: np.array([bone for bone in BONES if _side(bone) == side]) for side in _SIDE_COLOURS}
+"""The bones of each side, as pairs of joints."""
 
 
 def skeletons(
     truth: Float[np.ndarray, "17 3"],
     poses: Mapping[str, Float[np.ndarray, "17 3"]],
-    up: Float[np.ndarray, "3"],
+    up: Float[np.ndarray, 3],
     heading: str,
 ) -> Figure:
-    """One row: the truth, then each pose over the truth in grey, all centred at the pelvis and on
-    one scale.
+    """Draw in one row the truth, then each pose over the truth in grey, on one scale.
 
-    World frame, mm; a joint of a pose is NaN where it is missing, the truth is whole. The view is
-    orthographic, from the front of the true person and turned by 30 degrees; ``up`` points away
-    from the ground.
+    World frame, mm; a joint of a pose is NaN where it is missing, the truth is whole. All are
+    centred at the pelvis. The view is orthographic, from the front of the true person and turned by
+    30 degrees; ``up`` points away from the ground.
     """
-    figure = Figure(figsize=(2.2 * (len(poses) + 1), 4.2), layout="constrained")
     view = _view(truth, up)
-    true = truth - truth[PELVIS]
-    shown = {"truth": true}
+    drawn = {"truth": (truth - truth[PELVIS]) @ view.T}
+    errors = {}
     for name, pose in poses.items():
         centre = truth[PELVIS] if np.isnan(pose[PELVIS]).any() else pose[PELVIS]
-        shown[name] = pose - centre
-    every_joint = np.concatenate([pose @ view.T for pose in shown.values()])
-    low = np.nanmin(every_joint, axis=0) - 80
-    high = np.nanmax(every_joint, axis=0) + 80
-    panels = figure.subplots(1, len(shown), squeeze=False)[0]
-    for axes, (name, pose) in zip(panels, shown.items(), strict=True):
-        caption = ""
-        if name != "truth":
-            axes.add_collection(
-                LineCollection(_segments(true @ view.T), colors=TRUTH, linewidths=4)
-            )
-            errors = np.linalg.norm(pose - true, axis=-1)
-            caption = "\nmissing" if np.isnan(errors).all() else f"\n{np.nanmean(errors):.1f} mm"
-        _draw(axes, pose @ view.T)
-        axes.set(
-            xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal", xticks=[], yticks=[]
-        )
-        axes.set_title(name + caption, fontsize=11)
+        drawn[name] = (pose - centre) @ view.T
+        errors[name] = np.linalg.norm(pose - centre - truth + truth[PELVIS], axis=-1)
+    every_joint = np.concatenate(list(drawn.values()))
+    low = np.nanmin(every_joint, axis=0) - _MARGIN
+    high = np.nanmax(every_joint, axis=0) + _MARGIN
+    figure = Figure(figsize=(2.2 * len(drawn), 4.2), layout="constrained")
+    panels = figure.subplots(1, len(drawn), squeeze=False)[0]
+    for axes, (name, pose) in zip(panels, drawn.items(), strict=True):
+        if name in errors:
+            _draw_bones(axes, drawn["truth"], _BONES.values(), color=TRUTH, linewidth=4)
+        _draw_pose(axes, pose)
+        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), aspect="equal")
+        axes.set(xticks=[], yticks=[])
+        caption = f"{name}\n{_error_text(errors[name])}" if name in errors else name
+        axes.set_title(caption, fontsize=11)
         axes.spines[:].set_visible(False)
-    _scale_bar(panels[0], low)
-    handles = [
-        Line2D([], [], color=c, linestyle=s, linewidth=2, label=side)
-        for side, (c, s) in _STYLES.items()
-    ]
-    if poses:
-        handles.append(Line2D([], [], color=TRUTH, linewidth=4, label="truth"))
+    _draw_scale(panels[0], low)
+    handles = _side_handles(with_truth=bool(poses))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(wrapped(heading, 55 * len(shown) // 2), fontsize=10)
+    figure.suptitle(wrapped(heading, 55 * len(drawn) // 2), fontsize=10)
     return figure
 
 
+def _error_text(errors: Float[np.ndarray, 17]) -> str:
+    return "missing" if np.isnan(errors).all() else f"{np.nanmean(errors):.1f} mm"
+
+
+def _side_handles(with_truth: bool) -> list[Line2D]:
+    """Return the entries of the legend."""
+    handles = []
+    for side, colour in _SIDE_COLOURS.items():
+        style = _SIDE_STYLES[side]
+        handles.append(Line2D([], [], color=colour, linestyle=style, linewidth=2, label=side))
+    if with_truth:
+        handles.append(Line2D([], [], color=TRUTH, linewidth=4, label="truth"))
+    return handles
+
+
 def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
-    """The paper's fig:pose-prior: S^2 of a subject's six parts under the eight selections, on a log
-    scale.
-    """
+    """Draw fig:pose-prior: S² of a subject's six parts under the eight selections, log scale."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
     selections = [name for name in AGGREGATIONS if name in metrics["selections"]]
     width = 0.84 / len(selections)
-    for i, name in enumerate(selections):
+    for index, name in enumerate(selections):
         prior = metrics["selections"][name]["pose_prior"][subject]
         heights = [np.nan if prior[part] is None else prior[part] for part in PARTS]
-        place = np.arange(len(PARTS)) + (i - (len(selections) - 1) / 2) * width
-        colour = SELECTION_COLOURS[name]
-        hatch = SELECTION_HATCHES[name]
+        offset = (index - (len(selections) - 1) / 2) * width
         axes.bar(
-            place,
+            np.arange(len(PARTS)) + offset,
             heights,
             width,
-            color=colour,
-            hatch=hatch,
+            color=SELECTION_COLOURS[name],
+            hatch=SELECTION_HATCHES[name],
             edgecolor="black",
             linewidth=0.4,
             label=name,
@@ -125,30 +142,32 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
 
 
 def image(figure: Figure, dpi: int = 100) -> UInt8[np.ndarray, "H W 3"]:
-    """The figure's pixels, RGB."""
+    """Return the figure's pixels, RGB."""
     figure.set_dpi(dpi)
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
-def up_axis(truth: Float[np.ndarray, "N 17 3"]) -> Float[np.ndarray, "3"]:
-    """The signed axis of the world along which the people stand: data sets differ (z up, y down)."""
-    trunk = np.nanmean(truth[:, THORAX] - truth[:, PELVIS], axis=0, dtype=np.float64)
-    axis = int(np.abs(trunk).argmax())
-    return np.sign(trunk[axis]) * np.eye(3)[axis]
+def up_axis(truth: Float[np.ndarray, "N 17 3"]) -> Float[np.ndarray, 3]:
+    """Return the signed axis of the world along which people stand: data sets differ (z, -y)."""
+    trunks = truth[:, THORAX] - truth[:, PELVIS]
+    mean = np.asarray(np.nanmean(trunks, axis=0, dtype=np.float64))
+    axis = int(np.abs(mean).argmax())
+    return np.sign(mean[axis]) * np.eye(3)[axis]
 
 
 def wrapped(text: str, width: int) -> str:
-    """Paths in a title may be long."""
+    """Return the text in lines of at most ``width`` letters: paths in a title may be long."""
     return "\n".join(textwrap.fill(line, width) for line in text.splitlines())
 
 
-def _view(truth: Float[np.ndarray, "17 3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "2 3"]:
-    """Rows: where image right and image up are in the world."""
+def _view(truth: Float[np.ndarray, "17 3"], up: Float[np.ndarray, 3]) -> Float[np.ndarray, "2 3"]:
+    """Return two rows: where image right and image up are in the world."""
     across = truth[JOINT["left_hip"]] - truth[JOINT["right_hip"]]
     across = across - (across @ up) * up
-    if not np.linalg.norm(across) > 1:  # lying on the side, or a missing hip: any direction will do
+    # Lying on the side, or with a missing hip, any direction will do.
+    if not np.linalg.norm(across) > 1:
         across = np.roll(up, 1)
     across = across / np.linalg.norm(across)
     front = np.cross(across, up)
@@ -159,25 +178,25 @@ def _view(truth: Float[np.ndarray, "17 3"], up: Float[np.ndarray, "3"]) -> Float
     return np.stack((right, np.cos(tilt) * up - np.sin(tilt) * toward))
 
 
-def _segments(
-    points: Float[np.ndarray, "17 2"], sides: Collection[str] = tuple(_STYLES)
-) -> Float[np.ndarray, "L 2 2"]:
-    segments = points[
-        np.array([bone for bone, side in zip(BONES, _SIDES, strict=True) if side in sides])
-    ]
-    return segments[~np.isnan(segments).any((1, 2))]
-
-
-def _draw(axes: Axes, points: Float[np.ndarray, "17 2"]) -> None:
-    for side, (colour, style) in _STYLES.items():
-        axes.add_collection(
-            LineCollection(
-                _segments(points, [side]), colors=colour, linestyles=[style], linewidths=2
-            )
-        )
+def _draw_pose(axes: Axes, points: Float[np.ndarray, "17 2"]) -> None:
+    for side, bones in _BONES.items():
+        style = _SIDE_STYLES[side]
+        _draw_bones(axes, points, [bones], color=_SIDE_COLOURS[side], linestyle=style, linewidth=2)
     axes.plot(points[:, 0], points[:, 1], "o", color=MIDDLE, markersize=3)
 
 
-def _scale_bar(axes: Axes, low: Float[np.ndarray, "2"]) -> None:
-    axes.plot([low[0] + 20, low[0] + 520], [low[1] + 30] * 2, color=MIDDLE, linewidth=1.5)
-    axes.text(low[0] + 540, low[1] + 30, "500 mm", ha="left", va="center", fontsize=8)
+def _draw_bones(
+    axes: Axes, points: Float[np.ndarray, "17 2"], bones: Iterable[np.ndarray], **style: Any
+) -> None:
+    """Draw the bones whose two joints are there."""
+    segments = points[np.concatenate(list(bones))]
+    whole = segments[~np.isnan(segments).any((1, 2))]
+    axes.add_collection(LineCollection(list(whole), **style))
+
+
+def _draw_scale(axes: Axes, low: Float[np.ndarray, 2]) -> None:
+    """Draw a bar of 500 mm."""
+    x = low[0] + 20
+    y = low[1] + 30
+    axes.plot([x, x + 500], [y, y], color=MIDDLE, linewidth=1.5)
+    axes.text(x + 520, y, "500 mm", ha="left", va="center", fontsize=8)

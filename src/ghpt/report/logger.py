@@ -16,10 +16,8 @@ from ghpt.files import errors_name
 _log = logging.getLogger(__name__)
 
 
-class _QuietThread(event_file_writer._AsyncWriterThread):  # type: ignore[misc]
-    """What writes the events. Its failure is raised again at the next event, where it is forgiven
-    and said.
-    """
+class _QuietThread(event_file_writer._AsyncWriterThread):
+    """Writes the events. Its failure is raised again at the next event, and logged there."""
 
     def run(self) -> None:
         with suppress(Exception):
@@ -30,13 +28,14 @@ event_file_writer._AsyncWriterThread = _QuietThread
 
 
 def _forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the method with its errors counted and logged instead of raised."""
+
     @functools.wraps(method)
     def wrapped(self: "ForgivingTensorBoard", *args: Any, **kwargs: Any) -> Any:
         try:
             return method(self, *args, **kwargs)
-        except (
-            Exception
-        ) as error:  # a full disk, a lost mount: the numbers matter less than the run
+        except Exception as error:
+            # A full disk, a lost mount: the numbers matter less than the run.
             self.failures += 1
             if self.failures == 1:
                 _log.warning("TensorBoard logging fails (%s); training goes on without it", error)
@@ -46,9 +45,9 @@ def _forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class ForgivingTensorBoard(TensorBoardLogger):
-    """Event files directly in ``folder``, and no hparams.yaml: the checkpoint has all settings.
+    """Writes event files directly into ``folder``, and no hparams.yaml.
 
-    A failure is counted in ``failures`` and said once.
+    The checkpoint has all settings. A failure is counted in ``failures`` and logged once.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -57,8 +56,9 @@ class ForgivingTensorBoard(TensorBoardLogger):
 
     @property
     def experiment(self) -> Any:
-        """The writer. An event file that cannot even be begun stops the training: its folder is of
-        no use.
+        """The writer.
+
+        An event file that cannot even be begun stops the training: its folder is of no use.
         """
         with errors_name(Path(self.log_dir)):
             return super().experiment

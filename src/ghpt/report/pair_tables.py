@@ -1,21 +1,17 @@
-"""Tables of a test run of the camera problem: report.md, and those in the terminal."""
+"""What a test run of the camera problem reports: in the terminal, and in report.md."""
 
 from __future__ import annotations
 
+import math
 import statistics
-from collections.abc import Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
-from ghpt.files import atomic_write
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.relative_pose.evaluation import ALONE, ERRORS
 from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
-from ghpt.report.escape import code, escaped, plain
-from ghpt.report.tables import NONE, Rows, markdown, title, trained_on
+from ghpt.report.document import Block, Document, Heading, Paragraph, Strong, Table, Text, prose
+from ghpt.report.tables import NONE, Metrics, origin_text, title, training_data
 
 NAMES = {
     "eight_point": "8-point",
@@ -39,7 +35,7 @@ COLUMNS = 6
 """The most pairs that have a column each in the terminal."""
 MANY = 10
 """The most that have one in report.md, and a row in the terminal: of more it shows the worst."""
-_WORDS = {
+_DESCRIPTIONS = {
     "E_R": "rotation, as quaternions",
     "E_t": "translation",
     "E_2D": "points in the target's image",
@@ -47,231 +43,248 @@ _WORDS = {
     "rotation_deg": "angle between the rotations",
     "translation_deg": "angle between the translations",
 }
-_CAPTION = """medians over draws; E_R in 1e-3, E_t and E_3D in mm, E_2D in pixels
-rot, dir: degrees between the rotations, the directions of t"""
+_TERMINAL = ("pair", "E_R", "E_t", "E_2D", "E_3D", "rot", "dir")
+"""The columns of the errors in the terminal."""
+_CAPTION = "medians over draws; E_R in 1e-3, E_t and E_3D in mm, E_2D in pixels"
+_ANGLES = "rot, dir: degrees between the rotations, the directions of t"
 _PAPER = "; in brackets: the paper, real data"
+_ABOUT = (
+    "Errors of section 4.5 of the paper: E_R of the rotation (difference of quaternions, in 10⁻³), "
+    "E_t of the translation (mm), E_2D (pixels) and E_3D (mm) of random points of the capture "
+    "volume; and angles between the rotations and between the directions of the translations. Each "
+    "is the median over all draws, in which a draw without an estimate counts as infinitely bad. "
+    "Best and worst look at the truth."
+)
 _ABOUT_THE_PAPER = (
-    "In brackets: the paper, tab:fundamental-evaluation, on the real data set. It calls (1, 3) and (2, 4) diagonal; in "
-    "the data set's order of cameras, in which we read it, these stand side by side, and 1-4 and 2-3 face each other."
+    "In brackets: the paper, tab:fundamental-evaluation, on the real data set. It calls (1, 3) and "
+    "(2, 4) diagonal; in the data set's order of cameras, in which we read it, these stand side by "
+    "side, and 1-4 and 2-3 face each other."
 )
 
 
-def pair_order(metrics: Mapping[str, Any]) -> list[str]:
-    """The pairs' names, those of four cameras in the order of tab:fundamental-evaluation."""
-    pairs = list(next(iter(metrics["selections"].values()))["pairs"])
+def pair_order(metrics: Metrics) -> list[str]:
+    """Return the pairs' names, those of four cameras in the order of tab:fundamental-evaluation."""
+    first = next(iter(metrics["selections"]))
+    pairs = list(_pairs(metrics, first))
     paper = [f"{a}-{b}" for a, b in FUNDAMENTAL]
     return paper if set(pairs) == set(paper) else pairs
 
 
-def of_paper(metrics: Mapping[str, Any], table: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
-    """A table of the paper by pair name; empty unless the run is one on Human3.6M's test split,
-    trained there, with as many frames.
-    """
-    here = (trained_on(metrics)[0], metrics["data"], metrics["split"]) == ("h36m", "h36m", "test")
-    alike = (len(metrics["cameras"]), metrics["frames"]) == (4, FUNDAMENTAL_FRAMES)
-    return {f"{a}-{b}": errors for (a, b), errors in table.items()} if here and alike else {}
+def _pairs(metrics: Metrics, name: str) -> Mapping[str, Any]:
+    """Return the numbers of a selection by pair."""
+    return metrics["selections"][name]["pairs"]
 
 
-def pair_rows(metrics: Mapping[str, Any], name: str) -> Rows:
-    """A row for each pair: its name and the six errors of a selection, for ``weight`` with the
-    paper's in brackets.
+def paper_numbers(metrics: Metrics, table: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
+    """Return a table of the paper by pair name.
+
+    It is empty unless the run is one on Human3.6M's test split, trained there, with as many frames.
     """
-    paper = of_paper(metrics, FUNDAMENTAL) if name == "weight" else {}
+    data = (training_data(metrics)[0], metrics["data"], metrics["split"])
+    size = (len(metrics["cameras"]), metrics["frames"])
+    if data != ("h36m", "h36m", "test") or size != (4, FUNDAMENTAL_FRAMES):
+        return {}
+    return {f"{a}-{b}": errors for (a, b), errors in table.items()}
+
+
+def pair_rows(metrics: Metrics, name: str) -> list[list[str]]:
+    """Return a row for each pair: its name and the six errors of a selection.
+
+    Those of ``weight`` have the paper's in brackets.
+    """
+    paper = paper_numbers(metrics, FUNDAMENTAL) if name == "weight" else {}
     rows = []
     for pair in _worst_first(metrics, name):
-        numbers = metrics["selections"][name]["pairs"][pair]
+        numbers = _pairs(metrics, name)[pair]
         printed = paper.get(pair, {})
-        rows.append(
-            [pair, *(_with_paper(error, numbers[error], printed.get(error)) for error in ERRORS)]
-        )
+        errors = [_beside_paper(error, numbers[error], printed.get(error)) for error in ERRORS]
+        rows.append([pair, *errors])
     return rows
 
 
-def print_pair_tables(metrics: Mapping[str, Any], console: Console | None = None) -> None:
-    """Print the errors of ``weight`` on each pair, then E_3D of every name, in 80 columns."""
-    console = console or Console()
+def pair_summary_document(metrics: Metrics) -> Document:
+    """Return the errors of ``weight`` on each pair, then E_3D of every name, for 80 columns."""
     rows = pair_rows(metrics, "weight")
     worst = f", the {MANY} worst of {len(rows)} pairs" if len(rows) > MANY else ""
-    table = Table(
-        title=plain(f"weight{worst} on {title(metrics)}", "table.title"),
-        caption=_CAPTION + (_PAPER if of_paper(metrics, FUNDAMENTAL) else ""),
-        title_justify="left",
-        caption_justify="left",
+    paper = _PAPER if paper_numbers(metrics, FUNDAMENTAL) else ""
+    errors = Table(
+        _TERMINAL,
+        rows[:MANY],
+        title=f"weight{worst} on {title(metrics)}",
+        caption=(_CAPTION, _ANGLES + paper),
     )
-    for column in ("pair", "E_R", "E_t", "E_2D", "E_3D", "rot", "dir"):
-        table.add_column(column, justify="left" if column == "pair" else "right", no_wrap=True)
-    for row in rows[:MANY]:
-        table.add_row(*map(plain, row))
-    console.print(table)
-    header, rows = comparison(metrics)
-    table = Table(
+    return Document("", [errors, _comparison_summary(metrics)])
+
+
+def _comparison_summary(metrics: Metrics) -> Table:
+    comparison = comparison_table(metrics)
+    names = list(metrics["selections"])
+    rows: list[list[Text]] = []
+    for name, row in zip(names, comparison.rows, strict=True):
+        rows.append([Strong(str(cell)) for cell in row] if name == "weight" else list(row))
+    last = AGGREGATIONS[-1]
+    return Table(
+        comparison.header,
+        rows,
         title="E_3D in mm",
-        title_justify="left",
-        caption="cov: pairs estimated, %",
-        caption_justify="left",
+        caption=("cov: pairs estimated, %",),
+        last_rows=[names.index(last)] if last in names else [],
     )
-    for column in header:
-        table.add_column(column, justify="left" if column == "selection" else "right", no_wrap=True)
-    for name, row in zip(metrics["selections"], rows, strict=True):
-        table.add_row(
-            *map(plain, row),
-            end_section=name == AGGREGATIONS[-1],
-            style="bold" if name == "weight" else None,
-        )
-    console.print(table)
 
 
-def comparison(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
-    """Header and rows: E_3D of every name on each pair, or, where there are many, the median pair
-    and the worst.
-    """
+def comparison_table(metrics: Metrics) -> Table:
+    """Return E_3D of every name on each pair; where there are many, of the median and the worst."""
     order = pair_order(metrics)
     many = len(order) > COLUMNS
+    columns = ["median", "worst", "its pair"] if many else order
     rows = []
     for name, numbers in metrics["selections"].items():
-        by_pair = {pair: numbers["pairs"][pair]["E_3D"] for pair in order}
-        cells = [_short(by_pair[pair]) for pair in order]
-        if many:
-            worst = max(order, key=lambda pair: _or_infinite(by_pair[pair]))
-            middle = statistics.median(map(_or_infinite, by_pair.values()))
-            cells = [_short(middle), _short(by_pair[worst]), worst]
-        coverage = 100 * numbers["coverage"]
-        rows.append([NAMES.get(name, name), *cells, _short(numbers["E_3D"]), f"{coverage:.3g}"])
-    columns = ["median", "worst", "its pair"] if many else order
-    return ["selection", *columns, "mean", "cov"], rows
+        errors = {pair: _pairs(metrics, name)[pair]["E_3D"] for pair in order}
+        cells = _middle_and_worst(errors) if many else [_short(errors[pair]) for pair in order]
+        coverage = f"{100 * numbers['coverage']:.3g}"
+        rows.append([NAMES.get(name, name), *cells, _short(numbers["E_3D"]), coverage])
+    return Table(["selection", *columns, "mean", "cov"], rows)
 
 
-def pair_report(metrics: Mapping[str, Any]) -> str:
-    """The Markdown report of a test run of the camera problem."""
-    provenance = metrics.get("provenance") or {}
-    paper = of_paper(metrics, FUNDAMENTAL)
-    parts = [
-        f"# Relative camera poses on {escaped(title(metrics))}",
-        f"{metrics['draws']} draws of {metrics['frames']} frames, "
-        f"cameras {', '.join(map(escaped, metrics['cameras']))}, "
-        f"seed {metrics['seed']}, checkpoint {code(provenance.get('checkpoint', NONE))}, "
-        f"ghpt {provenance.get('ghpt', NONE)}, commit `{provenance.get('commit') or NONE}`.",
-        "Errors of section 4.5 of the paper: E_R of the rotation (difference of quaternions, in 10⁻³), E_t of the "
-        "translation (mm), E_2D (pixels) and E_3D (mm) of random points of the capture volume; and angles between the "
-        "rotations and between the directions of the translations. Each is the median over all draws, in which a draw "
-        "without an estimate counts as infinitely bad. Best and worst look at the truth.",
-        "## Selection `weight`",
-        markdown(
-            ["pair", *(f"{error}, {UNITS[error]}" for error in ERRORS)],
-            pair_rows(metrics, "weight"),
-        ),
-        _ABOUT_THE_PAPER if paper else "",
-        "## E_3D of all",
-        markdown(*comparison(metrics)),
-        "## One part estimated, the other true",
-        "Median errors of `weight`."
-        + (" In brackets: the paper, tab:fundamental-dissection." if paper else ""),
-        markdown(*dissection(metrics)),
+def _middle_and_worst(errors: Mapping[str, float | None]) -> list[str]:
+    finite = {pair: _none_to_inf(error) for pair, error in errors.items()}
+    worst = max(finite, key=finite.__getitem__)
+    middle = statistics.median(finite.values())
+    return [_short(middle), _short(errors[worst]), worst]
+
+
+def pair_report_document(metrics: Metrics) -> Document:
+    """Return the report of a test run of the camera problem."""
+    paper = bool(paper_numbers(metrics, FUNDAMENTAL))
+    header = ["pair", *(f"{error}, {UNITS[error]}" for error in ERRORS)]
+    in_brackets = " In brackets: the paper, tab:fundamental-dissection." if paper else ""
+    blocks: list[Block] = [
+        Paragraph(_origin(metrics)),
+        Paragraph(_ABOUT),
+        Heading(prose("Selection `weight`")),
+        Table(header, pair_rows(metrics, "weight")),
+        *([Paragraph(_ABOUT_THE_PAPER)] if paper else []),
+        Heading("E_3D of all"),
+        comparison_table(metrics),
+        Heading("One part estimated, the other true"),
+        Paragraph(prose("Median errors of `weight`.{}", in_brackets)),
+        dissection_table(metrics),
     ]
     for error in ERRORS:
-        parts += [
-            f"## {error}: {_WORDS[error]}, {UNITS[error]}",
-            "Medians.",
-            markdown(*_error_table(metrics, error)),
+        blocks += [
+            Heading(f"{error}: {_DESCRIPTIONS[error]}, {UNITS[error]}"),
+            Paragraph("Medians."),
+            _median_table(metrics, error),
+            Paragraph("Means ± deviations over the draws that could be measured."),
+            _mean_table(metrics, error),
         ]
-        parts += [
-            "Means ± deviations over the draws that could be measured.",
-            markdown(*_error_table(metrics, error, spread=True)),
-        ]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    return Document(f"Relative camera poses on {title(metrics)}", blocks)
 
 
-def write_pair_report(path: str | Path, metrics: Mapping[str, Any]) -> None:
-    """Write ``pair_report``'s text."""
-    with atomic_write(path, "w") as handle:
-        handle.write(pair_report(metrics))
+def _origin(metrics: Metrics) -> Text:
+    cameras = ", ".join(metrics["cameras"])
+    size = f"{metrics['draws']} draws of {metrics['frames']} frames"
+    return (f"{size}, cameras {cameras}, seed {metrics['seed']}, ", *origin_text(metrics))
 
 
-def dissection(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
-    """Header and rows of tab:fundamental-dissection for ``weight``."""
-    printed = of_paper(metrics, FUNDAMENTAL_DISSECTION)
+def dissection_table(metrics: Metrics) -> Table:
+    """Return tab:fundamental-dissection for ``weight``."""
+    paper = paper_numbers(metrics, FUNDAMENTAL_DISSECTION)
     rows = []
     for pair in pair_order(metrics):
-        numbers = metrics["selections"]["weight"]["pairs"][pair]
+        numbers = _pairs(metrics, "weight")[pair]
+        printed = paper.get(pair, {})
         cells = [
-            _with_paper(error, numbers[part][error], printed.get(pair, {}).get(part, {}).get(error))
+            _beside_paper(error, numbers[part][error], printed.get(part, {}).get(error))
             for part in ALONE
             for error in ("E_2D", "E_3D")
         ]
         rows.append([pair, *cells])
-    return ["pair", "R: E_2D, px", "R: E_3D, mm", "t: E_2D, px", "t: E_3D, mm"], rows
+    return Table(["pair", "R: E_2D, px", "R: E_3D, mm", "t: E_2D, px", "t: E_3D, mm"], rows)
 
 
-def _error_table(
-    metrics: Mapping[str, Any], error: str, spread: bool = False
-) -> tuple[list[str], Rows]:
-    """Header and rows: an error of every name on every pair; a row is a name, or where there are
-    many pairs, a pair.
-    """
-    order = pair_order(metrics)
+def _median_table(metrics: Metrics, error: str) -> Table:
+    """Return the medians of an error of every name on every pair, and their means."""
+
+    def cell(numbers: Mapping[str, Any]) -> str:
+        return _short(_scaled(error, numbers[error]))
+
     selections = metrics["selections"]
+    table = _error_table(metrics, {name: _cells(metrics, name, cell) for name in selections})
+    if len(pair_order(metrics)) > MANY:
+        return table
+    means = [_short(_scaled(error, numbers[error])) for numbers in selections.values()]
+    rows = [[*row, mean] for row, mean in zip(table.rows, means, strict=True)]
+    return Table([*table.header, "mean"], rows)
 
-    def cell(name: str, pair: str) -> str:
-        numbers = selections[name]["pairs"][pair]
-        if not spread:
-            return _short(_scaled(error, numbers[error]))
-        mean, deviation = (
-            _short(_scaled(error, numbers[key][error])) for key in ("mean", "deviation")
-        )
+
+def _mean_table(metrics: Metrics, error: str) -> Table:
+    """Return means and deviations of an error of every name on every pair."""
+
+    def cell(numbers: Mapping[str, Any]) -> str:
+        mean = _short(_scaled(error, numbers["mean"][error]))
+        deviation = _short(_scaled(error, numbers["deviation"][error]))
         return f"{mean} ± {deviation}"
 
-    if len(order) > MANY:
-        return ["pair", *selections], [
-            [pair, *(cell(name, pair) for name in selections)] for pair in order
-        ]
-    header = ["selection", *order] + ([] if spread else ["mean"])
-    rows = [[NAMES.get(name, name), *(cell(name, pair) for pair in order)] for name in selections]
-    if not spread:
-        for row, name in zip(rows, selections, strict=True):
-            row.append(_short(_scaled(error, selections[name][error])))
-    return header, rows
+    cells = {name: _cells(metrics, name, cell) for name in metrics["selections"]}
+    return _error_table(metrics, cells)
 
 
-def _worst_first(metrics: Mapping[str, Any], name: str) -> list[str]:
-    """The paper's order; where there are many pairs, those with the largest E_3D first."""
+def _cells(metrics: Metrics, name: str, cell: Callable[[Mapping[str, Any]], str]) -> list[str]:
+    """Return a selection's cells in the order of the pairs."""
+    pairs = _pairs(metrics, name)
+    return [cell(pairs[pair]) for pair in pair_order(metrics)]
+
+
+def _error_table(metrics: Metrics, cells: Mapping[str, list[str]]) -> Table:
+    """Return a table of cells by name; a row is a name, or where there are many pairs, a pair."""
     order = pair_order(metrics)
-    pairs = metrics["selections"][name]["pairs"]
-    return (
-        order
-        if len(order) <= MANY
-        else sorted(order, key=lambda pair: -_or_infinite(pairs[pair]["E_3D"]))
-    )
+    if len(order) <= MANY:
+        rows = [[NAMES.get(name, name), *of_name] for name, of_name in cells.items()]
+        return Table(["selection", *order], rows)
+    columns = zip(*cells.values(), strict=True)
+    return Table(["pair", *cells], [[pair, *row] for pair, row in zip(order, columns, strict=True)])
 
 
-def _with_paper(error: str, value: float | None, paper: float | None) -> str:
+def _worst_first(metrics: Metrics, name: str) -> list[str]:
+    """Return the pairs in the paper's order; where there are many, the largest E_3D first."""
+    order = pair_order(metrics)
+    if len(order) <= MANY:
+        return order
+    pairs = _pairs(metrics, name)
+    return sorted(order, key=lambda pair: -_none_to_inf(pairs[pair]["E_3D"]))
+
+
+def _beside_paper(error: str, value: float | None, paper: float | None) -> str:
     ours = _short(_scaled(error, value))
-    return (
-        ours if paper is None else f"{ours} ({_printed(1000 * paper if error == 'E_R' else paper)})"
-    )
+    if paper is None:
+        return ours
+    return f"{ours} ({_as_printed(1000 * paper if error == 'E_R' else paper)})"
 
 
 def _scaled(error: str, value: float | None) -> float | None:
-    return None if value is None else 1000 * value if error == "E_R" else value
+    """Return an error in its unit of ``UNITS``."""
+    if value is None:
+        return None
+    return 1000 * value if error == "E_R" else value
 
 
-def _printed(value: float) -> str:
-    """As the paper prints it: 0.72, 4.9, 10.8, 23."""
-    return (
-        f"{value:.2g}"
-        if value < 1
-        else f"{value:.1f}"
-        if value % 1 or value < 10
-        else f"{value:.0f}"
-    )
+def _as_printed(value: float) -> str:
+    """Return the number as the paper prints it: 0.72, 4.9, 10.8, 23."""
+    if value < 1:
+        return f"{value:.2g}"
+    return f"{value:.1f}" if value % 1 or value < 10 else f"{value:.0f}"
 
 
-def _or_infinite(value: float | None) -> float:
-    return float("inf") if value is None else value
+def _none_to_inf(value: float | None) -> float:
+    return math.inf if value is None else value
 
 
 def _short(value: float | None) -> str:
-    """At most five characters: 0.12, 1.23, 12.3, 123, 1e+05."""
-    if value is None or value == float("inf"):
+    """Return at most five characters: 0.12, 1.23, 12.3, 123, 1e+05."""
+    if value is None or value == math.inf:
         return NONE
+    if value >= 99999.5:
+        return f"{value:.0e}"
     digits = 2 if value < 9.995 else 1 if value < 99.95 else 0
-    return f"{value:.{digits}f}" if value < 99999.5 else f"{value:.0e}"
+    return f"{value:.{digits}f}"

@@ -1,7 +1,6 @@
 """A test run of the camera problem in TensorBoard."""
 
-from collections.abc import Mapping
-from dataclasses import fields
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,13 +8,13 @@ import torch
 from torch.utils.tensorboard import SummaryWriter
 
 from ghpt.models.relative_pose.evaluation import ERRORS, pair_errors
-from ghpt.models.relative_pose.predictions import PairPredictions
-from ghpt.models.rows import WEIGHTS
+from ghpt.models.relative_pose.schema import PairPredictions
 from ghpt.observations import RelativePoseEstimate
 from ghpt.report.figures import image
 from ghpt.report.pair_figures import rig_figure
-from ghpt.report.pair_tables import MANY
-from ghpt.report.tables import title
+from ghpt.report.pair_tables import MANY, pair_report_document, pair_summary_document
+from ghpt.report.report import Report
+from ghpt.report.tables import Metrics, title
 from ghpt.report.tensorboard import write_hyperparameters, write_parts, write_weights
 
 SHOWN = ("weight", "rig")
@@ -23,80 +22,85 @@ SHOWN = ("weight", "rig")
 _CHUNK = 2048
 
 
-def write_pair_events(
-    folder: str | Path, predictions: PairPredictions, metrics: Mapping[str, Any]
-) -> int:
-    """Write a test run's scalars, histograms, figure and hyper-parameters, as ``write_parts`` does."""
-    return write_parts(
-        folder,
-        {
-            "scalars": lambda writer: _scalars(writer, metrics),
-            "the weights": lambda writer: _weights(writer, predictions),
-            "the rig": lambda writer: _rig(writer, predictions, metrics),
-            "the hyper-parameters": lambda writer: write_hyperparameters(
-                writer, predictions.meta, metrics, "E_3D"
-            ),
-        },
-    )
+def write_pair_events(folder: str | Path, predictions: PairPredictions, metrics: Metrics) -> int:
+    """Write scalars, histograms, the figure and hyper-parameters, as ``write_parts`` does."""
+
+    def hyperparameters(writer: SummaryWriter) -> None:
+        write_hyperparameters(writer, predictions.meta, metrics, "E_3D")
+
+    parts = {
+        "scalars": lambda writer: _write_scalars(writer, metrics),
+        "the weights": lambda writer: _write_weights(writer, predictions),
+        "the rig": lambda writer: _write_rig(writer, predictions, metrics),
+        "the hyper-parameters": hyperparameters,
+    }
+    return write_parts(folder, parts)
 
 
-def _scalars(writer: SummaryWriter, metrics: Mapping[str, Any]) -> None:
+def _write_scalars(writer: SummaryWriter, metrics: Metrics) -> None:
     for name, numbers in metrics["selections"].items():
-        _add(writer, "", name, numbers)
-        if len(numbers["pairs"]) <= MANY:
-            for pair, of_pair in numbers["pairs"].items():
-                _add(writer, f" {pair}", name, of_pair)
+        _add_errors(writer, "", name, numbers)
+        pairs = numbers["pairs"]
+        if len(pairs) <= MANY:
+            for pair, of_pair in pairs.items():
+                _add_errors(writer, f" {pair}", name, of_pair)
 
 
-def _add(writer: SummaryWriter, of: str, name: str, numbers: Mapping[str, Any]) -> None:
+def _add_errors(writer: SummaryWriter, suffix: str, name: str, numbers: Mapping[str, Any]) -> None:
     for error in (*ERRORS, "coverage"):
         if numbers[error] is not None:
-            writer.add_scalar(f"{error}{of}/{name}", numbers[error], 0)
+            writer.add_scalar(f"{error}{suffix}/{name}", numbers[error], 0)
 
 
-def _weights(writer: SummaryWriter, predictions: PairPredictions) -> None:
-    chunks = [chunk.weights for chunk in predictions.chunks(_CHUNK)]
-    write_weights(
-        writer,
-        {summary: torch.cat([weights[summary] for weights in chunks]) for summary in WEIGHTS},
-    )
+def _write_weights(writer: SummaryWriter, predictions: PairPredictions) -> None:
+    write_weights(writer, [chunk.weights for chunk in predictions.chunks(_CHUNK)])
 
 
-def _rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Mapping[str, Any]) -> None:
-    """The draw whose mean E_3D over its pairs is the median: neither a good nor a bad one."""
+def _write_rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Metrics) -> None:
+    """Write the draw whose mean E_3D over its pairs is the median, neither good nor bad."""
     rows = _typical_draw(predictions)
     chunks = [predictions.read(row, row + 1) for row in rows]
-    rig = int(chunks[0].rig[0])
-    estimates = {
-        name: RelativePoseEstimate(
-            *(
-                torch.cat([getattr(c.estimates[name], field.name) for c in chunks])
-                for field in fields(RelativePoseEstimate)
-            )
-        )
-        for name in SHOWN
-        if name in predictions.names
-    }
-    heading = f"{title(metrics)}\nrig of {predictions.rig_name[rig]}, the draw of median E_3D under {SHOWN[0]}"
+    rig = int(chunks[0].sample.rig[0])
+    tables = predictions.tables
+    estimates = {}
+    for name in SHOWN:
+        if name in predictions.names:
+            estimates[name] = _concatenate([chunk.estimates[name] for chunk in chunks])
+    heading = (
+        f"{title(metrics)}\nrig of {tables.rig_name[rig]}, the draw of median E_3D under {SHOWN[0]}"
+    )
     figure = rig_figure(
-        predictions.cameras.index(rig),
-        predictions.camera_name[rig],
-        predictions.points[rig],
-        torch.cat([chunk.pair for chunk in chunks]),
+        tables.cameras.index(rig),
+        tables.camera_name[rig].tolist(),
+        tables.points[rig],
+        torch.cat([chunk.sample.pair for chunk in chunks]),
         estimates,
         heading,
     )
     writer.add_image("rig", image(figure), 0, dataformats="HWC")
 
 
+def _concatenate(estimates: Sequence[RelativePoseEstimate]) -> RelativePoseEstimate:
+    return RelativePoseEstimate(
+        torch.cat([estimate.R for estimate in estimates]),
+        torch.cat([estimate.t for estimate in estimates]),
+        torch.cat([estimate.estimated for estimate in estimates]),
+    )
+
+
 def _typical_draw(predictions: PairPredictions) -> list[int]:
-    """The rows of a draw that is median in E_3D under the first shown selection."""
+    """Return the rows of a draw that is median in E_3D under the first shown selection."""
     errors = []
     draws = []
     for chunk in predictions.chunks(_CHUNK):
         errors.append(pair_errors(predictions, chunk, SHOWN[0])["E_3D"].double())
-        draws.append(chunk.draw)
+        draws.append(chunk.sample.draw)
     numbers, which = torch.cat(draws).unique(return_inverse=True)
-    total = torch.zeros(len(numbers), dtype=torch.float64).index_add(0, which, torch.cat(errors))
+    zero = torch.zeros(len(numbers), dtype=torch.float64)
+    total = zero.index_add(0, which, torch.cat(errors))
     middle = int(total.argsort()[(len(numbers) - 1) // 2])
     return (which == middle).nonzero()[:, 0].tolist()
+
+
+REPORT = Report(pair_summary_document, pair_report_document, write_pair_events)
+"""The report of the camera problem."""

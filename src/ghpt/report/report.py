@@ -1,33 +1,26 @@
-"""What testing needs to know of a problem: how its predictions are collected, measured and shown."""
+"""How the metrics of a test run are shown."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ghpt.models.collect import Collect
+from ghpt.report.document import Document
+
+Metrics = Mapping[str, Any]
+"""The content of metrics.json."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """One instance for each problem. ``metrics`` below is what ``evaluate`` returns, the content of
-    metrics.json.
-    """
+    """What a problem shows of a test run, in the terminal and in files."""
 
-    settings: type
-    """The settings that test.py needs for this problem alone, a TypedDict."""
-    estimators: Callable[[Mapping[str, Any], Any], dict[str, Callable[[Any], Any]]]
-    """Configuration and model -> what is tested beside the selections, by name: each takes a batch.
+    summary: Callable[[Metrics], Document]
+    """Returns the main numbers, for the terminal."""
+    document: Callable[[Metrics], Document]
+    """Returns all numbers, for report.md."""
+    write_events: Callable[[Path, Any, Metrics], int]
+    """Writes TensorBoard's events of the opened predictions and metrics into a folder.
+
+    It never raises, and returns how many parts could not be written.
     """
-    collect: type[Collect]
-    """Writes predictions.npz."""
-    open: Callable[[Path], Any]
-    """Opens and checks it."""
-    evaluate: Callable[[Any], dict[str, Any]]
-    """Opened predictions -> metrics."""
-    print_table: Callable[[Mapping[str, Any]], None]
-    write_report: Callable[[Path, Mapping[str, Any]], None]
-    write_events: Callable[[Path, Any, Mapping[str, Any]], int]
-    """Folder, opened predictions and metrics; never raises."""
-    headline: str
-    """The number of a selection, in mm, that sums a run up."""

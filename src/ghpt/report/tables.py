@@ -1,19 +1,25 @@
-"""Tables of a test run: report.md and the one in the terminal."""
+"""What a test run of the pose problem reports: in the terminal, and in report.md."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from pathlib import Path
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
-from ghpt.files import atomic_write
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.paper.published import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
-from ghpt.report.escape import code, escaped, plain
+from ghpt.report.document import (
+    Block,
+    Code,
+    Document,
+    Heading,
+    Paragraph,
+    Span,
+    Strong,
+    Table,
+    Text,
+)
+from ghpt.report.markdown import render_markdown
 
 NAMES = {
     "h36m": "Human3.6M",
@@ -39,206 +45,197 @@ COLUMNS = (
     "paper",
     "difference",
 )
-_TERMINAL = dict(
-    zip(COLUMNS, ("selection", "abs", "rel", "PA", "6 j", "cov %", "paper", "diff %"), strict=True)
+_TERMINAL = ("selection", "abs", "rel", "PA", "6 j", "cov %", "paper", "diff %")
+"""The columns in the terminal."""
+_CAPTION = (
+    "abs: in the world; rel: relative to the pelvis; PA: Procrustes-aligned",
+    "6 j: rel, elbows wrists knees; cov: joints estimated; diff: rel to paper",
 )
-_CAPTION = """abs: in the world; rel: relative to the pelvis; PA: Procrustes-aligned
-6 j: rel, elbows wrists knees; cov: joints estimated; diff: rel to paper"""
 _MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 _PER_ACTION = ("weight", "average", "best", "view_weights", "linear", "ransac")
+_BOLD = ("weight", "view_weights")
 
-Rows = list[list[str]]
+Metrics = Mapping[str, Any]
+"""The content of metrics.json."""
 
 
 def display_name(data: str | None, source: str | None) -> str:
-    """The data of a run in words that tell synthetic from real: every heading goes through here."""
+    """Return the name of a run's data in words that tell synthetic from real, for every heading."""
     name = NAMES.get(str(data), str(data))
     return f"synthetic {name}" if source == "synthetic" else f"{name} from {source}"
 
 
-def trained_on(metrics: Mapping[str, Any]) -> tuple[str | None, str | None]:
-    """Name and source of the training data, from the checkpoint's provenance."""
-    training = (metrics.get("provenance") or {}).get("training") or {}
+def training_data(metrics: Metrics) -> tuple[str | None, str | None]:
+    """Return name and source of the training data, from the checkpoint's provenance."""
+    provenance = metrics.get("provenance") or {}
+    training = provenance.get("training") or {}
     return training.get("data"), training.get("source")
 
 
-def title(metrics: Mapping[str, Any]) -> str:
-    trained, source = trained_on(metrics)
-    training = f", trained on {display_name(trained, source)}" if trained else ""
-    return f"{display_name(metrics['data'], metrics['source'])}, {metrics['split']} split{training}"
+def title(metrics: Metrics) -> str:
+    """Return what a run was tested and trained on, in words."""
+    tested = f"{display_name(metrics['data'], metrics['source'])}, {metrics['split']} split"
+    trained, source = training_data(metrics)
+    return f"{tested}, trained on {display_name(trained, source)}" if trained else tested
 
 
-def main_rows(metrics: Mapping[str, Any]) -> Rows:
-    """A row of ``COLUMNS`` for each selection and baseline; the paper's number where it has one for
-    this test.
+def main_rows(metrics: Metrics) -> list[list[str]]:
+    """Return a row of ``COLUMNS`` for each selection and baseline.
+
+    It has the paper's number where the paper has one for this test.
     """
-    rows = []
-    (trained, _) = trained_on(metrics)
-    for name, numbers in metrics["selections"].items():
-        paper = paper_value(metrics["data"], name, trained) if metrics["split"] == "test" else None
-        ours = numbers["mpjpe_relative"]
-        rows.append(
-            [
-                NAMES.get(name, name),
-                *(_mm(numbers[mean]) for mean in _MEANS),
-                _percent(numbers["coverage"]),
-                _mm(paper),
-                NONE if None in (paper, ours) else f"{100 * (ours / paper - 1):+.1f} %",
-            ]
-        )
-    return rows
+    return [_main_row(metrics, name) for name in metrics["selections"]]
 
 
-def print_table(metrics: Mapping[str, Any], console: Console | None = None) -> None:
-    """Print the main table to the terminal (or to ``console``), in 80 columns."""
-    table = Table(
-        title=plain(f"MPJPE in mm on {title(metrics)}", "table.title"),
-        caption=_CAPTION,
-        title_justify="left",
-        caption_justify="left",
-    )
-    for column, short in _TERMINAL.items():
-        table.add_column(short, justify="left" if column == COLUMNS[0] else "right", no_wrap=True)
-    for name, row in zip(metrics["selections"], main_rows(metrics), strict=True):
+def _main_row(metrics: Metrics, name: str) -> list[str]:
+    numbers = metrics["selections"][name]
+    paper = None
+    if metrics["split"] == "test":
+        trained, _ = training_data(metrics)
+        paper = paper_value(metrics["data"], name, trained)
+    return [
+        NAMES.get(name, name),
+        *(_mm(numbers[mean]) for mean in _MEANS),
+        _percent(numbers["coverage"]),
+        _mm(paper),
+        _difference(numbers["mpjpe_relative"], paper),
+    ]
+
+
+def _difference(ours: float | None, paper: float | None) -> str:
+    if ours is None or paper is None:
+        return NONE
+    return f"{100 * (ours / paper - 1):+.1f} %"
+
+
+def summary_document(metrics: Metrics) -> Document:
+    """Return the main table, for the terminal, in 80 columns."""
+    names = list(metrics["selections"])
+    rows: list[list[Text]] = []
+    for name, row in zip(names, main_rows(metrics), strict=True):
         cells = [cell.removesuffix(" %") for cell in row]
-        style = "bold" if name in ("weight", "view_weights") else None
-        table.add_row(*map(plain, cells), end_section=name == AGGREGATIONS[-1], style=style)
-    (console or Console()).print(table)
+        rows.append([Strong(cell) for cell in cells] if name in _BOLD else list(cells))
+    last = AGGREGATIONS[-1]
+    table = Table(
+        _TERMINAL,
+        rows,
+        title=f"MPJPE in mm on {title(metrics)}",
+        caption=_CAPTION,
+        last_rows=[names.index(last)] if last in names else [],
+    )
+    return Document("", [table])
 
 
-def report(metrics: Mapping[str, Any]) -> str:
-    """The Markdown report of a test run."""
-    selections = metrics["selections"]
+def report_document(metrics: Metrics) -> Document:
+    """Return the report of a test run."""
+    about = (
+        "MPJPE in mm: in the world, relative to the pelvis, after Procrustes alignment, and "
+        "(relative) on elbows, wrists and knees. Coverage: joints that were estimated, of all that "
+        "have a truth. Best and worst look at the truth."
+    )
+    blocks: list[Block] = [
+        Paragraph(_origin(metrics)),
+        Paragraph(about),
+        Table(COLUMNS, main_rows(metrics)),
+        *_paper_note(metrics),
+        *_without_damaged(metrics),
+        Heading("Actions"),
+        Paragraph("Relative MPJPE, mm."),
+        action_table(metrics),
+        Heading("Pose prior"),
+        Paragraph("Variance over frames of the ratio of left to right part, times 1000."),
+    ]
+    for subject in _first_selection(metrics)["pose_prior"]:
+        blocks += [Heading(subject, 3), prior_table(metrics, subject)]
+    return Document(f"Test on {title(metrics)}", blocks)
+
+
+def origin_text(metrics: Metrics) -> tuple[Span, ...]:
+    """Return the checkpoint and the version that made a run's numbers."""
     provenance = metrics.get("provenance") or {}
-    parts = [
-        f"# Test on {escaped(title(metrics))}",
-        f"{metrics['frames']} frames, seed {metrics['seed']}, "
-        f"checkpoint {code(provenance.get('checkpoint', NONE))}, "
-        f"ghpt {provenance.get('ghpt', NONE)}, commit `{provenance.get('commit') or NONE}`.",
-        "MPJPE in mm: in the world, relative to the pelvis, after Procrustes alignment, and (relative) on elbows, "
-        "wrists and knees. Coverage: joints that were estimated, of all that have a truth. Best and worst look at "
-        "the truth.",
-        markdown(COLUMNS, main_rows(metrics)),
-        _about_the_paper(metrics),
-    ]
-    if any("without_damaged" in numbers for numbers in selections.values()):
-        parts += [
-            "## Without S9's takes with damaged ground truth",
-            markdown(
-                COLUMNS[:5],
-                (
-                    [NAMES.get(name, name), *(_mm(numbers["without_damaged"][m]) for m in _MEANS)]
-                    for name, numbers in selections.items()
-                ),
-            ),
-        ]
-    parts += ["## Actions", "Relative MPJPE, mm.", markdown(*action_table(metrics))]
-    parts += [
-        "## Pose prior",
-        "Variance over frames of the ratio of left to right part, times 1000.",
-    ]
-    for subject in next(iter(selections.values()))["pose_prior"]:
-        parts += [f"### {escaped(subject)}", markdown(*prior_table(metrics, subject))]
-    return "\n\n".join(part for part in parts if part) + "\n"
+    checkpoint = Code(provenance.get("checkpoint", NONE))
+    commit = Code(provenance.get("commit") or NONE)
+    version = provenance.get("ghpt", NONE)
+    return ("checkpoint ", checkpoint, f", ghpt {version}, commit ", commit, ".")
 
 
-def write_report(path: str | Path, metrics: Mapping[str, Any]) -> None:
-    """Write ``report``'s text."""
-    with atomic_write(path, "w") as handle:
-        handle.write(report(metrics))
+def _origin(metrics: Metrics) -> Text:
+    return (f"{metrics['frames']} frames, seed {metrics['seed']}, ", *origin_text(metrics))
 
 
-def action_table(metrics: Mapping[str, Any]) -> tuple[list[str], Rows]:
-    """Header and rows: relative MPJPE of an action under the main selections, and the paper's for
-    ``weight``.
+def _first_selection(metrics: Metrics) -> Mapping[str, Any]:
+    return next(iter(metrics["selections"].values()))
+
+
+def _without_damaged(metrics: Metrics) -> list[Block]:
+    rows = []
+    for name, numbers in metrics["selections"].items():
+        if "without_damaged" in numbers:
+            means = [_mm(numbers["without_damaged"][mean]) for mean in _MEANS]
+            rows.append([NAMES.get(name, name), *means])
+    heading = Heading("Without S9's takes with damaged ground truth")
+    return [heading, Table(COLUMNS[:5], rows)] if rows else []
+
+
+def action_table(metrics: Metrics) -> Table:
+    """Return the relative MPJPE of each action under the main selections.
+
+    The last column is the paper's for ``weight``, where it has one.
     """
     selections = metrics["selections"]
     names = [name for name in _PER_ACTION if name in selections]
-    trained, _ = trained_on(metrics)
-    paper = (
-        QUANTITATIVE
-        if (trained, metrics["data"], metrics["split"]) == ("h36m", "h36m", "test")
-        else {}
-    )
-    rows = [
-        [
-            action,
-            *(_mm(selections[name]["per_action"][action]) for name in names),
-            _mm(paper.get(action)),
-        ]
-        for action in next(iter(selections.values()))["per_action"]
-    ]
-    mean = _mm(QUANTITATIVE_MEAN if paper else None)
-    rows.append(["all", *(_mm(selections[name]["mpjpe_relative"]) for name in names), mean])
-    return ["action", *(NAMES.get(name, name) for name in names), "paper (weight)"], rows
+    trained, _ = training_data(metrics)
+    of_paper = (trained, metrics["data"], metrics["split"]) == ("h36m", "h36m", "test")
+    paper = QUANTITATIVE if of_paper else {}
+    rows = []
+    for action in _first_selection(metrics)["per_action"]:
+        errors = [_mm(selections[name]["per_action"][action]) for name in names]
+        rows.append([action, *errors, _mm(paper.get(action))])
+    means = [_mm(selections[name]["mpjpe_relative"]) for name in names]
+    rows.append(["all", *means, _mm(QUANTITATIVE_MEAN if of_paper else None)])
+    columns = [NAMES.get(name, name) for name in names]
+    return Table(["action", *columns, "paper (weight)"], rows)
 
 
-def prior_table(metrics: Mapping[str, Any], subject: str) -> tuple[list[str], Rows]:
-    """Header and rows: 1000 S^2 of a subject's six parts under each selection."""
-    selections = {
-        name: numbers for name, numbers in metrics["selections"].items() if name in AGGREGATIONS
-    }
+def prior_table(metrics: Metrics, subject: str) -> Table:
+    """Return 1000 S² of a subject's six parts under each selection."""
+    selections = [name for name in metrics["selections"] if name in AGGREGATIONS]
+    priors = [metrics["selections"][name]["pose_prior"][subject] for name in selections]
     rows = []
     for part in PARTS:
-        values = [numbers["pose_prior"][subject][part] for numbers in selections.values()]
-        rows.append(
-            [
-                part.replace("_", " "),
-                *(NONE if v is None else _three_digits(1000 * v) for v in values),
-            ]
-        )
-    return ["part", *selections], rows
+        rows.append([part.replace("_", " "), *(_thousandfold(prior[part]) for prior in priors)])
+    return Table(["part", *selections], rows)
 
 
-def _three_digits(value: float) -> str:
-    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+def _thousandfold(value: float | None) -> str:
+    """Return 1000 times the value with three digits."""
+    if value is None:
+        return NONE
+    return f"{1000 * value:.0f}" if 1000 * value >= 100 else f"{1000 * value:.3g}"
 
 
 def max_difference(values: Iterable[float]) -> float:
-    """(largest - smallest) / smallest, percent: the definition that gives the paper's last column."""
+    """Return (largest - smallest) / smallest in percent, as the paper's last column is defined."""
     values = list(values)
     return 100 * (max(values) / min(values) - 1)
 
 
-def markdown(
-    header: Sequence[str], rows: Iterable[Sequence[str]], text: Collection[int] = (0,)
-) -> str:
-    """A Markdown table, also aligned as plain text; the columns ``text`` to the left, numbers to
-    the right.
-
-    Cells are escaped, unless they are ``Markdown`` already.
-    """
-    table = [list(map(escaped, row)) for row in (header, *rows)]
-    widths = [max(len(row[i]) for row in table) for i in range(len(header))]
-    lines = [
-        " | ".join(
-            cell.ljust(w) if i in text else cell.rjust(w)
-            for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        )
-        for row in table
-    ]
-    rule = "|".join(
-        ("-" * (w + 2)) if i in text else "-" * (w + 1) + ":" for i, w in enumerate(widths)
-    )
-    return "\n".join([f"| {lines[0]} |", f"|{rule}|", *(f"| {line} |" for line in lines[1:])])
-
-
-def _about_the_paper(metrics: Mapping[str, Any]) -> str:
-    if all(row[-2] == NONE for row in main_rows(metrics)):
-        return ""
+def _paper_note(metrics: Metrics) -> list[Block]:
+    paper_column = COLUMNS.index("paper")
+    if all(row[paper_column] == NONE for row in main_rows(metrics)):
+        return []
     note = (
-        "Paper: relative MPJPE on the real data set, tab:quantitative-hypotheses and tab:generalization-evaluation. "
-        "Its RANSAC is quoted from Iskakov et al., on their own detections."
+        "Paper: relative MPJPE on the real data set, tab:quantitative-hypotheses and "
+        "tab:generalization-evaluation. Its RANSAC is quoted from Iskakov et al., on their own "
+        "detections."
     )
     if metrics["source"] == "synthetic":
-        fitted = "random, average, best, worst" + (
-            " and RANSAC" if metrics["data"] == "h36m" else ""
-        )
+        ransac = " and RANSAC" if metrics["data"] == "h36m" else ""
         note += (
-            f" These data are synthetic: their detector model was fitted to the paper's {fitted} here,"
-            " and to no row of a trained scorer."
+            " These data are synthetic: their detector model was fitted to the paper's random, "
+            f"average, best, worst{ransac} here, and to no row of a trained scorer."
         )
-    return note
+    return [Paragraph(note)]
 
 
 def _mm(value: float | None) -> str:
@@ -247,3 +244,8 @@ def _mm(value: float | None) -> str:
 
 def _percent(value: float | None) -> str:
     return NONE if value is None else f"{100 * value:.2f} %"
+
+
+def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Return a table as Markdown."""
+    return render_markdown(Document("", [Table(header, list(rows))])).rstrip()

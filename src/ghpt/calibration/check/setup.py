@@ -118,7 +118,7 @@ class Rays:
 
 @dataclass
 class RayCache:
-    """The rays of the evidence. Each view's are kept, because a search asks for the same ones again.
+    """The rays of the evidence. Each view's are kept: a search asks for the same ones again.
 
     Raises ValueError for a shift that is larger than the evidence's largest.
     """

@@ -8,9 +8,9 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ghpt.commands.display import display_path, shell_override
 from ghpt.commands.inputs import InputSettings
 from ghpt.commands.prediction.verdict import Commands
-from ghpt.commands.train import display_path, shell_override
 
 _HEIGHT = 1750
 """mm: stands for the person's own."""

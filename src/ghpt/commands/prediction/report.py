@@ -2,162 +2,204 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
-from rich.console import Console
-from rich.table import Table
-
+from ghpt.commands.prediction.result import PredictionResult
+from ghpt.commands.prediction.statistics import EstimatorErrors
 from ghpt.commands.prediction.verdict import verdict_lines
 from ghpt.models.relative_pose.scale import BONE_NAMES
-from ghpt.report.escape import code, escaped, plain
-from ghpt.report.tables import NAMES, NONE, markdown
+from ghpt.report.document import (
+    Block,
+    Bullets,
+    Code,
+    Document,
+    Heading,
+    Paragraph,
+    Strong,
+    Table,
+    Text,
+    prose,
+)
+from ghpt.report.rig_comparison import Quantiles
+from ghpt.report.tables import NAMES, NONE
 
-Numbers = dict[str, Any]
-Rows = list[list[str]]
 
-
-def summary_lines(numbers: Numbers) -> list[str]:
-    """What one sentence each says of the recording as a whole."""
-    share = numbers["share"]
-    missing = ", ".join(
-        f"{100 * part:.1f} % {state.replace('_', ' ')}"
-        for state, part in share.items()
-        if part and state not in ("observed", "filled")
-    )
-    lines = [
-        f"Estimator: {numbers['estimator_text']}.",
-        f"{numbers['frames']} frames, {len(numbers['cameras'])} views: {100 * share['observed']:.1f} % of the joints "
-        f"observed"
-        + (f", {100 * share['filled']:.1f} % filled" if share["filled"] else "")
-        + (f"; missing: {missing}." if missing else "."),
-    ]
-    flipped = {view: n for view, n in numbers["swapped"].items() if n}
+def summary_lines(result: PredictionResult) -> list[str]:
+    """Return the sentences that hold for the recording as a whole."""
+    coverage = result.coverage
+    lines = [f"Estimator: {result.estimator_text}.", _coverage_line(result)]
+    flipped = [f"{count} frames of {view}" for view, count in coverage.swapped.items() if count]
     if flipped:
-        lines.append(
-            "Left and right exchanged in "
-            + ", ".join(f"{n} frames of {v}" for v, n in flipped.items())
-            + "."
-        )
-    if numbers["stature_mm"]:
-        lines.append(f"The person measures {numbers['stature_mm'] / 1000:.2f} m.")
-    if numbers["smooth_hz"]:
-        lines.append(f"Smoothed: zero-phase Butterworth, {numbers['smooth_hz']:g} Hz.")
+        lines.append(f"Left and right exchanged in {', '.join(flipped)}.")
+    if coverage.stature_mm:
+        lines.append(f"The person measures {coverage.stature_mm / 1000:.2f} m.")
+    if result.smooth_hz:
+        lines.append(f"Smoothed: zero-phase Butterworth, {result.smooth_hz:g} Hz.")
     return lines
 
 
-def error_rows(numbers: Numbers) -> tuple[list[str], Rows]:
-    """For each view the reprojection and held-out errors of the estimator."""
-    own = next(iter(numbers["evaluation"]["estimators"].values()))
-    header = ["view", "reprojected px", "90 %", "left out px", "90 %"]
-    rows = [
-        [view, *_pair(own["reprojection"]["views"][view]), *_pair(own["held_out"]["views"][view])]
-        for view in numbers["cameras"]
+def _coverage_line(result: PredictionResult) -> str:
+    """Return which shares of the joints are observed, filled and missing."""
+    missing = dict(result.coverage.share)
+    observed = missing.pop("observed")
+    filled = missing.pop("filled")
+    line = (
+        f"{result.coverage.frames} frames, {len(result.cameras)} views: "
+        f"{100 * observed:.1f} % of the joints observed"
+    )
+    if filled:
+        line += f", {100 * filled:.1f} % filled"
+    shares = [
+        f"{100 * share:.1f} % {state.replace('_', ' ')}"
+        for state, share in missing.items()
+        if share
     ]
-    return header, [*rows, ["all", *_pair(own["reprojection"]), *_pair(own["held_out"])]]
+    return f"{line}; missing: {', '.join(shares)}." if shares else f"{line}."
 
 
-def comparison_rows(numbers: Numbers) -> tuple[list[str], Rows]:
-    """A row for each estimator."""
-    header = ["estimator", "reproj. px", "90 %", "left out px", "90 %", "segm. %", "joints %"]
+def error_table(result: PredictionResult, title: str = "") -> Table:
+    """Return the reprojection and held-out errors of the estimator for each view."""
+    own = next(iter(_estimators(result).values()))
     rows = []
-    for name, found in numbers["evaluation"]["estimators"].items():
+    for view in result.cameras:
+        reprojection = _quantiles(own.reprojection.views[view])
+        rows.append([view, *reprojection, *_quantiles(own.held_out.views[view])])
+    rows.append(["all", *_quantiles(own.reprojection), *_quantiles(own.held_out)])
+    return Table(["view", "reprojected px", "90 %", "held out px", "90 %"], rows, title)
+
+
+def comparison_table(result: PredictionResult, title: str = "") -> Table:
+    """Return the errors of each estimator."""
+    header = ["estimator", "reproj. px", "90 %", "held out px", "90 %", "segm. %", "joints %"]
+    rows = []
+    for name, errors in _estimators(result).items():
         rows.append(
             [
-                NAMES.get(name, name.replace("_", " ")),
-                *_pair(found["reprojection"]),
-                *_pair(found["held_out"]),
-                number(found["segments"]["median"], 1, 100),
-                number(found["placed"], 1, 100),
+                _display_name(name),
+                *_quantiles(errors.reprojection),
+                *_quantiles(errors.held_out),
+                format_number(errors.segments.median, 1, 100),
+                format_number(errors.placed, 1, 100),
             ]
         )
-    return header, rows
+    return Table(header, rows, title)
 
 
-def print_prediction(numbers: Numbers, console: Console | None = None) -> None:
-    """The table of the views, that of the estimators if there are several, and what holds for all."""
-    console = console or Console()
-    tables = [(f"Prediction of {numbers['data']}", *error_rows(numbers))]
-    if len(numbers["evaluation"]["estimators"]) > 1:
-        tables.append(("Estimators on the same key points", *comparison_rows(numbers)))
-    for title, header, rows in tables:
-        table = Table(title=plain(title, "table.title"), title_justify="left")
-        for i, column in enumerate(header):
-            table.add_column(column, justify="right" if i else "left")
-        for row in rows:
-            table.add_row(*map(plain, row))
-        console.print(table)
-    for line in summary_lines(numbers):
-        console.print(plain(line), soft_wrap=True)
+def _estimators(result: PredictionResult) -> Mapping[str, EstimatorErrors]:
+    return result.evaluation.estimators
 
 
-def print_verdict(verdict: Numbers, console: Console | None = None) -> None:
-    """The last words in the terminal."""
-    console = console or Console()
-    for line in verdict_lines(verdict):
-        console.print(plain(line), soft_wrap=True)
+def _display_name(estimator: str) -> str:
+    return NAMES.get(estimator, estimator.replace("_", " "))
 
 
-def prediction_report(numbers: Numbers) -> str:
-    """The Markdown report."""
-    evaluation = numbers["evaluation"]
-    origin = numbers["provenance"]
-    observed = [
-        [name.replace("_", " "), number(share, 1, 100)]
-        for name, share in numbers["observed"].items()
-    ]
-    estimators = evaluation["estimators"]
-    segments = [
+def summary_document(result: PredictionResult) -> Document:
+    """Return the table of the views, that of several estimators, and what holds for all."""
+    blocks: list[Block] = [error_table(result, f"Prediction of {result.data}")]
+    if len(_estimators(result)) > 1:
+        blocks.append(comparison_table(result, "Estimators on the same key points"))
+    blocks += [Paragraph(line) for line in summary_lines(result)]
+    return Document("", blocks)
+
+
+def verdict_document(result: PredictionResult) -> Document:
+    """Return the last words in the terminal."""
+    if result.verdict is None:
+        return Document("", [])
+    lines = verdict_lines(result.verdict.numbers())
+    return Document("", [Paragraph(line) for line in lines])
+
+
+def report_document(result: PredictionResult) -> Document:
+    """Return the report of a prediction."""
+    frames = result.evaluation.frames
+    verdict = result.verdict.numbers() if result.verdict else None
+    return Document(
+        f"Prediction of {result.data}",
         [
-            name.replace("_", " "),
-            *(number(found["segments"]["each"][name], 1, 100) for found in estimators.values()),
-        ]
-        for name in BONE_NAMES
-    ]
-    parts = [
-        f"# Prediction of {escaped(numbers['data'])}",
-        f"ghpt {origin['ghpt']}, commit `{origin['commit'] or NONE}`, seed {origin['seed']}: "
-        f"{code(origin['command'])}.",
-        "\n".join(f"- {escaped(line)}" for line in summary_lines(numbers)),
-        "## Verdict",
-        *_verdict(numbers["verdict"]),
-        "## Errors by view",
-        f"On {evaluation['frames']} frames, evenly spread; median and 90 %, pixels. *Reprojection* is the distance of "
-        "every key point from its joint, set aside or not; *left out*, from the joint that "
-        "the other views alone give.",
-        markdown(*error_rows(numbers)),
-        "## Estimators",
-        "On the same key points; left-out views on the joints that all of them estimate without the view. *Segm.*: the "
-        "median over the body's parts of how much their lengths vary over the frames; *joints*: those with a position.",
-        markdown(*comparison_rows(numbers)),
-        "## Joints",
-        "Frames in which each joint is observed, %.",
-        markdown(["joint", "observed"], observed),
-        "## Segments",
-        "Variation of their lengths over the frames, % (1.4826 x median deviation over median).",
-        markdown(["segment", *(NAMES.get(n, n.replace("_", " ")) for n in estimators)], segments),
-    ]
-    return "\n\n".join(parts) + "\n"
+            Paragraph(_origin(result.provenance)),
+            Bullets(summary_lines(result)),
+            *(_verdict_blocks(verdict) if verdict else []),
+            Heading("Errors by view"),
+            Paragraph(
+                prose(
+                    "On {} frames, evenly spread; median and 90 %, pixels. *Reprojection* is the "
+                    "distance of every key point from its joint, set aside or not; *held out*, "
+                    "from the joint that the other views alone give.",
+                    str(frames),
+                )
+            ),
+            error_table(result),
+            Heading("Estimators"),
+            Paragraph(
+                prose(
+                    "On the same key points; held-out views on the joints that all of them "
+                    "estimate without the view. *Segm.*: the median over the body's parts of how "
+                    "much their lengths vary over the frames; *joints*: those with a position."
+                )
+            ),
+            comparison_table(result),
+            Heading("Joints"),
+            Paragraph("Frames in which each joint is observed, %."),
+            _joint_table(result),
+            Heading("Segments"),
+            Paragraph(
+                "Variation of their lengths over the frames, % (1.4826 x median deviation over "
+                "median)."
+            ),
+            _segment_table(result),
+        ],
+    )
 
 
-def _verdict(verdict: Numbers) -> list[str]:
-    """Paragraphs of the report."""
-    parts = [f"**{verdict['level']}**"]
-    for finding in verdict["findings"]:
-        against = (
-            f" ({finding['value']:.3g}, limit {finding['limit']:g})" if finding["limit"] else ""
-        )
-        parts.append(
-            f"- {finding['level']}, `{finding['code']}`: {escaped(finding['text'])}{against}.\n"
-            f"  Next: {code(finding['command'])}"
-        )
+def _origin(provenance: Mapping[str, Any]) -> Text:
+    commit = Code(provenance["commit"] or NONE)
+    command = Code(provenance["command"])
+    version = f"ghpt {provenance['ghpt']}, commit "
+    return (version, commit, f", seed {provenance['seed']}: ", command, ".")
+
+
+def _joint_table(result: PredictionResult) -> Table:
+    rows = []
+    for name, share in result.coverage.observed.items():
+        rows.append([name.replace("_", " "), format_number(share, 1, 100)])
+    return Table(["joint", "observed"], rows)
+
+
+def _segment_table(result: PredictionResult) -> Table:
+    estimators = _estimators(result)
+    rows = []
+    for name in BONE_NAMES:
+        variations = [errors.segments.each[name] for errors in estimators.values()]
+        cells = [format_number(variation, 1, 100) for variation in variations]
+        rows.append([name.replace("_", " "), *cells])
+    return Table(["segment", *map(_display_name, estimators)], rows)
+
+
+def _verdict_blocks(verdict: Mapping[str, Any]) -> list[Block]:
+    blocks: list[Block] = [Heading("Verdict"), Paragraph(Strong(verdict["level"]))]
+    findings = [_finding_text(finding) for finding in verdict["findings"]]
+    if findings:
+        blocks.append(Bullets(findings))
     if verdict["undecidable"]:
-        parts.append(f"Not decidable: {escaped('; '.join(verdict['undecidable']))}.")
-    return parts
+        blocks.append(Paragraph(f"Not decidable: {'; '.join(verdict['undecidable'])}."))
+    return blocks
 
 
-def number(value: float | None, digits: int, factor: int = 1) -> str:
+def _finding_text(finding: Mapping[str, Any]) -> Text:
+    limit = ""
+    if finding["limit"]:
+        limit = f" ({finding['value']:.3g}, limit {finding['limit']:g})"
+    code = Code(finding["code"])
+    command = Code(finding["command"])
+    return (f"{finding['level']}, ", code, f": {finding['text']}{limit}. Next: ", command)
+
+
+def format_number(value: float | None, digits: int, factor: int = 1) -> str:
+    """Return ``factor`` times the value, a dash for None."""
     return NONE if value is None else f"{factor * value:.{digits}f}"
 
 
-def _pair(found: Numbers) -> list[str]:
-    return [number(found["median"], 1), number(found["p90"], 1)]
+def _quantiles(errors: Quantiles) -> list[str]:
+    return [format_number(errors.median, 1), format_number(errors.p90, 1)]

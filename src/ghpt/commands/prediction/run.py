@@ -16,9 +16,10 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from torch.utils.data import DataLoader
 
+from ghpt.commands.display import display_path
 from ghpt.commands.lost import told
 from ghpt.commands.prediction.shards import Shards
-from ghpt.commands.train import display_path, make_trainer
+from ghpt.commands.trainer import make_trainer
 from ghpt.data.people.sequence import Sequence
 from ghpt.observations import Observations
 from ghpt.reconstruction import Reconstruction

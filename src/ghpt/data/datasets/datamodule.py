@@ -1,30 +1,35 @@
-"""DataModules that serve the 2D key points of a camera arrangement, synthetic or real (``root``)."""
+"""DataModules of the 2D key points of a camera arrangement, synthetic or real (``root``)."""
 
 from abc import abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import pairwise
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import lightning as L
-import numpy as np
 
-from ghpt import randomness
-from ghpt.data.datasets.frames import BatchOrder, FrameLoader, Frames, trainable
-from ghpt.data.datasets.pairs import Pairs, PairSettings
-from ghpt.data.datasets.store import prepared
+from ghpt.data.datasets.frames import (
+    BatchOrder,
+    FrameLoader,
+    SampleSet,
+    Sampling,
+    draw_frames,
+)
+from ghpt.data.datasets.store import prepare
 from ghpt.errors import GhptDataError, check
 from ghpt.observations import Labelled, LabelledRecording
 
 SPLITS = ("train", "validation", "test")
 
+Draw = Callable[[Sequence[LabelledRecording], Sampling], SampleSet]
+"""Draws the samples of a split from its recordings."""
+
 
 class KeyPointDataModule(L.LightningDataModule):
-    """Shared by all arrangements: preparation, choice of frames, batches.
+    """What all arrangements share: preparation, choice of samples, batches.
 
-    ``root`` None means the synthetic source, a path the real data set there. ``seed``
-    chooses the training samples and their order. ``batch_size`` is the global one, divided among
-    the processes. ``evaluate`` names the split that ``test`` runs on.
+    ``root`` None means the synthetic source, a path the real data set there. ``seed`` chooses the
+    training samples and their order. ``batch_size`` is the global one, divided among the processes.
+    ``evaluate`` names the split that ``test`` runs on.
     """
 
     def __init__(
@@ -41,25 +46,14 @@ class KeyPointDataModule(L.LightningDataModule):
         workers: int,
     ) -> None:
         super().__init__()
-        for key, value in (
-            ("train_samples", train_samples),
-            ("stride", stride),
-            ("batch_size", batch_size),
-        ):
+        counts = {"train_samples": train_samples, "stride": stride, "batch_size": batch_size}
+        for key, value in counts.items():
             check(value >= 1, f"data.{key}", f"is {value}", "It must be >= 1.")
         check(workers >= 0, "data.workers", f"is {workers}", "It must be >= 0.")
-        check(
-            1 <= least_joints <= 17,
-            "data.least_joints",
-            f"is {least_joints}",
-            "It must be 1 to 17.",
-        )
-        check(
-            evaluate in SPLITS,
-            "data.evaluate",
-            f"is {evaluate!r}",
-            f"Existing: {', '.join(SPLITS)}.",
-        )
+        possible = 1 <= least_joints <= 17
+        check(possible, "data.least_joints", f"is {least_joints}", "It must be 1 to 17.")
+        hint = f"Existing: {', '.join(SPLITS)}."
+        check(evaluate in SPLITS, "data.evaluate", f"is {evaluate!r}", hint)
         self.name = name
         self.root = root
         self.cache = cache
@@ -70,14 +64,13 @@ class KeyPointDataModule(L.LightningDataModule):
         self.evaluate = evaluate
         self.batch_size = batch_size
         self.workers = workers
-        self.pairs: PairSettings | None = None
-        self.frames: dict[str, Frames | Pairs] = {}
+        self.draw: Draw = draw_frames
+        self.frames: dict[str, SampleSet] = {}
+        """The samples of each role: train, validation, test."""
 
     def bind(self, problem: Any) -> None:
-        """Serve what ``problem`` takes: pairs of cameras where it has ``PairSettings`` (``pairs``),
-        else frames.
-        """
-        self.pairs = getattr(problem, "pairs", None)
+        """Take the samples that a problem draws from recordings, in place of frames."""
+        self.draw = problem.dataset
 
     @property
     def source(self) -> str:
@@ -86,11 +79,11 @@ class KeyPointDataModule(L.LightningDataModule):
 
     @abstractmethod
     def generate(self, split: str) -> Iterable[LabelledRecording]:
-        """The split's recordings from their source, slowly."""
+        """Return the split's recordings from their source, slowly."""
 
     @abstractmethod
     def cache_key(self, split: str) -> dict[str, Any]:
-        """Everything that decides what ``make`` gives, as plain data."""
+        """Return everything that decides what ``generate`` gives, as plain data."""
 
     def prepare_data(self) -> None:
         """Prepare what is not yet in the cache (one process; the others then open it)."""
@@ -101,67 +94,43 @@ class KeyPointDataModule(L.LightningDataModule):
     def setup(self, stage: str) -> None:
         for role, split in self._roles(stage).items():
             if role not in self.frames:
-                self.frames[role] = self._choose(self.recordings(split), role == "train")
+                self.frames[role] = self.draw(self.recordings(split), self._sampling(role))
+
+    def _sampling(self, role: str) -> Sampling:
+        return Sampling(
+            source=self.source,
+            split=f"{self.name} {role}",
+            seed=self.seed,
+            train_samples=self.train_samples if role == "train" else None,
+            stride=self.stride,
+            least_joints=self.least_joints,
+        )
 
     def _roles(self, stage: str) -> dict[str, str]:
-        """What the stage needs: role -> split."""
-        return (
-            {"test": self.evaluate}
-            if stage == "test"
-            else {"train": "train", "validation": "validation"}
-        )
+        """Return the split of each role that the stage needs."""
+        if stage == "test":
+            return {"test": self.evaluate}
+        return {"train": "train", "validation": "validation"}
 
     def recordings(self, split: str) -> list[LabelledRecording]:
-        """The split's recordings, prepared first where they are not in the cache. Raises
-        GhptDataError.
+        """Return the split's recordings, prepared first where they are not in the cache.
+
+        Raises GhptDataError where there are none.
         """
-        recordings = prepared(
-            self.cache,
-            self.cache_key(split),
-            lambda: self.generate(split),
-            {"source": self.source, "split": split},
-        )
+        about = {"source": self.source, "split": split}
+        key = self.cache_key(split)
+        recordings = prepare(self.cache, key, lambda: self.generate(split), about)
         if not sum(map(len, recordings)):
+            where = f"{self.name} {split}"
             hint = "Choose another split, or check what data.root holds."
-            raise GhptDataError(
-                self.source, f"{self.name} {split}", "the split has no frames", hint
-            )
+            raise GhptDataError(self.source, where, "the split has no frames", hint)
         return recordings
 
-    def _choose(self, recordings: Sequence[LabelledRecording], training: bool) -> Frames | Pairs:
-        if self.pairs is not None:
-            return Pairs(
-                recordings, self.pairs, self.seed, self.train_samples if training else None
-            )
-        return Frames(recordings, self._random(recordings) if training else self._every(recordings))
-
-    def _every(self, recordings: Sequence[LabelledRecording]) -> np.ndarray:
-        """Every ``stride``-th frame of each recording."""
-        starts = np.cumsum([0] + [len(r) for r in recordings])
-        return np.concatenate([np.arange(a, b, self.stride) for a, b in pairwise(starts)])
-
-    def _random(self, recordings: Sequence[LabelledRecording]) -> np.ndarray:
-        """``train_samples`` random frames that can teach."""
-        order = randomness.permutation(
-            self.seed, "training samples", 0, sum(map(len, recordings))
-        ).numpy()
-        chosen = np.empty(0, dtype=np.int64)
-        for first in range(0, len(order), 4 * self.train_samples):
-            some = order[first : first + 4 * self.train_samples]
-            chosen = np.concatenate([chosen, some[trainable(recordings, some, self.least_joints)]])
-            if len(chosen) >= self.train_samples:
-                break
-        if not len(chosen):
-            raise GhptDataError(
-                self.source,
-                f"{self.name} train",
-                f"no frame has a true pelvis and {self.least_joints} joints seen in two views",
-                "Lower data.least_joints, or check the detections.",
-            )
-        return chosen[: self.train_samples]
-
     def train_dataloader(self) -> FrameLoader:
-        return self._loader("train", seed=self.seed, done=lambda: self.trainer.global_step)
+        return self._loader("train", seed=self.seed, done=self._batches_done)
+
+    def _batches_done(self) -> int:
+        return self.trainer.global_step if self.trainer else 0
 
     def val_dataloader(self) -> FrameLoader:
         return self._loader("validation")
@@ -169,17 +138,16 @@ class KeyPointDataModule(L.LightningDataModule):
     def test_dataloader(self) -> FrameLoader:
         return self._loader("test")
 
-    def _loader(self, role: str, seed: int | None = None, done: Any = lambda: 0) -> FrameLoader:
-        rank, world = (
-            (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
-        )
+    def _loader(
+        self, role: str, seed: int | None = None, done: Callable[[], int] = lambda: 0
+    ) -> FrameLoader:
+        rank = self.trainer.global_rank if self.trainer else 0
+        world = self.trainer.world_size if self.trainer else 1
         order = BatchOrder(len(self.frames[role]), self.batch_size, rank, world, seed, done)
         return FrameLoader(self.frames[role], order, self.workers)
 
     def all_training_batches(self) -> Iterator[Labelled[Any, Any]]:
-        """Every training sample once, in order, the same on every process: for the feature
-        statistics.
-        """
+        """Yield every training sample once, in order, the same on every process."""
         frames = self.frames["train"]
         for first in range(0, len(frames), self.batch_size):
             yield frames[range(first, min(first + self.batch_size, len(frames)))]

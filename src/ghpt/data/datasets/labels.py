@@ -1,5 +1,4 @@
-"""karfly's ``human36m-multiview-labels-GTbboxes.npy``: a pickled dict, read without running
-anything it holds.
+"""karfly's ``human36m-multiview-labels-GTbboxes.npy``: a pickle, read without running it.
 
 A pickle names functions to call. The reader admits the four names that numpy's arrays need, and
 none of them is numpy's: each stands for plain bookkeeping here, from which arrays are then built
@@ -54,46 +53,33 @@ class Labels:
 
 
 def read_labels(path: Path) -> Labels:
-    """Read and check a labels file. Raises GhptDataError if it is not what it should be or holds
-    code.
+    """Read and check a labels file.
+
+    Raises GhptDataError if it is not what it should be or holds code.
     """
-    content = _unpickled(path)
-    names = {
-        key: _names(path, key, content) for key in ("subject_names", "camera_names", "action_names")
-    }
-    rig = _structured(path, "cameras", content, tuple(map(len, names.values()))[:2])
+    content = _read_pickle(path)
+    subjects = _names(path, "subject_names", content)
+    cameras = _names(path, "camera_names", content)
+    actions = _names(path, "action_names", content)
+    rigs = _structured(path, "cameras", content, (len(subjects), len(cameras)))
     table = _structured(path, "table", content, (None,))
-    rigs = {
-        key: check_array(
-            path, f"cameras[{key!r}]", _column(path, "cameras", rig, key), (None, None, *shape), "f"
-        )
-        for key, shape in {"K": (3, 3), "R": (3, 3), "t": (3, 1), "dist": (5,)}.items()
-    }
-    rows = {
-        key: _column(path, "table", table, key)
-        for key in ("subject_idx", "action_idx", "frame_idx")
-    }
-    for key, count in (
-        ("subject_idx", "subject_names"),
-        ("action_idx", "action_names"),
-        ("frame_idx", None),
-    ):
-        check_array(path, f"table[{key!r}]", rows[key], (None,), "iu")
-        if count and len(table) and (rows[key].min() < 0 or rows[key].max() >= len(names[count])):
-            problem = f"goes from {rows[key].min()} to {rows[key].max()}, with {len(names[count])} {count}"
-            raise GhptDataError(path, f"table[{key!r}]", problem, _HINT)
-    points = _column(path, "table", table, "keypoints")
+    subject = _column(table, "subject_idx", (None,), "iu")
+    action = _column(table, "action_idx", (None,), "iu")
+    _check_range(subject, table, "subject_idx", "subject_names", len(subjects))
+    _check_range(action, table, "action_idx", "action_names", len(actions))
     return Labels(
-        path,
-        *names.values(),
-        K=rigs["K"],
-        R=rigs["R"],
-        t=rigs["t"][..., 0],
-        distortion=rigs["dist"],
-        subject=rows["subject_idx"],
-        action=rows["action_idx"],
-        frame=rows["frame_idx"],
-        key_points=check_array(path, "table['keypoints']", points, (None, 17, 3), "f"),
+        path=path,
+        subjects=subjects,
+        cameras=cameras,
+        actions=actions,
+        K=_column(rigs, "K", (None, None, 3, 3), "f"),
+        R=_column(rigs, "R", (None, None, 3, 3), "f"),
+        t=_column(rigs, "t", (None, None, 3, 1), "f")[..., 0],
+        distortion=_column(rigs, "dist", (None, None, 5), "f"),
+        subject=subject,
+        action=action,
+        frame=_column(table, "frame_idx", (None,), "iu"),
+        key_points=_column(table, "keypoints", (None, 17, 3), "f"),
     )
 
 
@@ -154,10 +140,12 @@ _STAND_INS: dict[str, Callable[..., Any]] = {
     "_codecs.encode": lambda text, encoding: text.encode("latin1"),  # bytes, in protocol 2
 }
 _OPCODES = """
-    PROTO FRAME STOP MARK MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET GLOBAL STACK_GLOBAL REDUCE BUILD
-    NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG1 FLOAT BINFLOAT STRING BINSTRING SHORT_BINSTRING UNICODE
-    SHORT_BINUNICODE BINUNICODE BINUNICODE8 SHORT_BINBYTES BINBYTES BINBYTES8 EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3
-    TUPLE EMPTY_LIST LIST APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS POP"""
+    PROTO FRAME STOP MARK MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET GLOBAL
+    STACK_GLOBAL REDUCE BUILD NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG1 FLOAT
+    BINFLOAT STRING BINSTRING SHORT_BINSTRING UNICODE SHORT_BINUNICODE BINUNICODE BINUNICODE8
+    SHORT_BINBYTES BINBYTES BINBYTES8 EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 TUPLE EMPTY_LIST LIST
+    APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS POP
+"""
 """Those that build plain data. Not among them: making instances, extension codes, references to
 outside.
 """
@@ -168,13 +156,12 @@ class _Unpickler(pickle.Unpickler):
         stand_in = _STAND_INS.get(f"{module}.{name}")
         if stand_in is None:
             raise pickle.UnpicklingError(f"it holds code: it names {module}.{name}")
-        return lambda *args: stand_in(
-            *args
-        )  # a new one each time: a pickle can set attributes of what it names
+        # a new one each time: a pickle can set attributes of what it names
+        return lambda *args: stand_in(*args)
 
 
-def _unpickled(path: Path) -> dict[str, Any]:
-    """The pickled dict, its arrays still as `_Array`."""
+def _read_pickle(path: Path) -> dict[str, Any]:
+    """Return the pickled dict, its arrays still as `_Array`."""
     with open_input(path) as handle:
         _, _, dtype = npy_header(path, "", handle, path.stat().st_size, pickled=True)
         if not dtype.hasobject:
@@ -187,9 +174,8 @@ def _unpickled(path: Path) -> dict[str, Any]:
                 content = _Unpickler(data, encoding="latin1").load()
                 (content,) = content.state[4]
             except Exception as error:  # damaged pickles raise almost anything
-                raise GhptDataError(
-                    path, "", f"is not a labels file ({error!s:.200})", _HINT
-                ) from error
+                problem = f"is not a labels file ({error!s:.200})"
+                raise GhptDataError(path, "", problem, _HINT) from error
     if not isinstance(content, dict):
         raise GhptDataError(path, "", f"holds a {type(content).__name__}, not a dict", _HINT)
     return content
@@ -198,12 +184,13 @@ def _unpickled(path: Path) -> dict[str, Any]:
 def _check_opcodes(data: mmap.mmap) -> None:
     """Raise unless the pickle is short and plain, before any of it is carried out."""
     allowed = frozenset(_OPCODES.split())
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(data)):
+    # mmap has the two methods that genops needs, which its annotation does not say
+    opcodes = pickletools.genops(data)  # type: ignore[arg-type]
+    for count, (opcode, argument, _) in enumerate(opcodes):
         if opcode.name not in allowed:
             raise pickle.UnpicklingError(f"it holds code: opcode {opcode.name}")
-        if count > _MAX_OPCODES or (
-            opcode.name in ("PUT", "LONG_BINPUT") and int(argument) > _MAX_OPCODES
-        ):
+        memo = argument if opcode.name in ("PUT", "LONG_BINPUT") else 0
+        if count > _MAX_OPCODES or int(memo or 0) > _MAX_OPCODES:
             raise pickle.UnpicklingError("it is too complicated")
 
 
@@ -214,9 +201,21 @@ def _names(path: Path, key: str, content: dict[str, Any]) -> tuple[str, ...]:
     return tuple(names)
 
 
+@dataclass(frozen=True)
+class _Table:
+    """A structured array of the file."""
+
+    path: Path
+    key: str
+    array: np.ndarray
+
+
 def _structured(
-    path: Path, key: str, content: dict[str, Any], shape: tuple[int | None, ...]
-) -> np.ndarray:
+    path: Path,
+    key: str,
+    content: dict[str, Any],
+    shape: tuple[int | None, ...],
+) -> _Table:
     array = content.get(key)
     if not isinstance(array, _Array):
         raise GhptDataError(path, key, "is missing, or not an array", _HINT)
@@ -224,10 +223,24 @@ def _structured(
         built = array.build()
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError) as error:
         raise GhptDataError(path, key, f"is not a numpy array ({error})", _HINT) from error
-    return check_array(path, key, built, shape, "V")
+    return _Table(path, key, check_array(path, key, built, shape, "V"))
 
 
-def _column(path: Path, key: str, array: np.ndarray, name: str) -> np.ndarray:
-    if name not in (array.dtype.names or ()):
-        raise GhptDataError(path, f"{key}[{name!r}]", "is missing", _HINT)
-    return array[name]
+def _column(table: _Table, name: str, shape: tuple[int | None, ...], kinds: str) -> np.ndarray:
+    where = f"{table.key}[{name!r}]"
+    if name not in (table.array.dtype.names or ()):
+        raise GhptDataError(table.path, where, "is missing", _HINT)
+    return check_array(table.path, where, table.array[name], shape, kinds)
+
+
+def _check_range(
+    index: Int[np.ndarray, " N"],
+    table: _Table,
+    name: str,
+    names: str,
+    count: int,
+) -> None:
+    """Raise GhptDataError unless every index is one of ``count`` names."""
+    if len(index) and (index.min() < 0 or index.max() >= count):
+        problem = f"goes from {index.min()} to {index.max()}, with {count} {names}"
+        raise GhptDataError(table.path, f"{table.key}[{name!r}]", problem, _HINT)

@@ -1,5 +1,6 @@
-"""Pairs of cameras as a torch data set: M random frames of a rig, seen by two of its cameras
-(paper, section 3.2).
+"""Pairs of cameras as a torch data set (paper, section 3.2).
+
+A sample is M random frames of a rig, seen by two of its cameras.
 """
 
 from __future__ import annotations
@@ -7,10 +8,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils.data import Dataset
 
@@ -59,9 +61,19 @@ class RigOfSplit:
     """X*: uniform in the box of the true joints, world, mm."""
 
 
+class Place(NamedTuple):
+    """What a sample is of."""
+
+    rig: int
+    """Index among the rigs."""
+    draw: int
+    """Number of the draw of frames, over all rigs."""
+    pair: tuple[int, int]
+    """The two views."""
+
+
 class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
-    """Every pair of views of every rig with ``draws`` draws of M frames each, or ``samples`` random
-    ones.
+    """Every pair of views of every rig, with ``draws`` draws of M frames each, or random ones.
 
     In order: sample i is a rig, then a draw, then a pair, so that the pairs of one draw, which
     share their frames, follow one another. With ``samples`` each sample has its own draw and a
@@ -84,125 +96,150 @@ class Pairs(Dataset[Labelled[PairObservations, PairTruth]]):
         self.pairs = list(combinations(range(len(self.rigs[0].names)), 2))
 
     @property
-    def frames_per_item(self) -> int:
-        return self.settings.frames
-
-    @property
     def draws(self) -> int:
+        """Draws of each rig."""
         return self.settings.draws
 
     def __len__(self) -> int:
-        return (
-            len(self.rigs) * self.draws * len(self.pairs) if self.samples is None else self.samples
-        )
+        if self.samples is not None:
+            return self.samples
+        return len(self.rigs) * self.draws * len(self.pairs)
 
-    def locate(self, sample: int) -> tuple[int, int, tuple[int, int]]:
-        """The rig's index, the number of the draw over all rigs, and the pair of views."""
+    def locate(self, sample: int) -> Place:
+        """Return what a sample is of."""
         if self.samples is None:
             draw, pair = divmod(sample, len(self.pairs))
-            return draw // self.draws, draw, self.pairs[pair]
-        rig, pair = (randomness.uniform(randomness.key(self.seed, "pair", sample), (2,))).tolist()
-        return int(rig * len(self.rigs)), sample, self.pairs[int(pair * len(self.pairs))]
+            return Place(draw // self.draws, draw, self.pairs[pair])
+        key = randomness.key(self.seed, "pair", sample)
+        for_rig, for_pair = randomness.uniform(key, (2,)).tolist()
+        rig = int(for_rig * len(self.rigs))
+        pair = int(for_pair * len(self.pairs))
+        return Place(rig, sample, self.pairs[pair])
 
-    def frames_of(self, rig: int, draw: int) -> list[tuple[int, Int[np.ndarray, " F"]]]:
-        """The frames of a draw: recording and positions in it, in order of time; at most M."""
+    def locate_frames(self, rig: int, draw: int) -> list[tuple[int, Int[np.ndarray, " F"]]]:
+        """Return the frames of a draw: recording and positions in it, in order of time.
+
+        There are at most M of them.
+        """
         recordings = self.rigs[rig].recordings
-        start = np.cumsum([0] + [len(self.recordings[r]) for r in recordings])
-        count = min(self.settings.frames, int(start[-1]))
-        chosen = _distinct(self.seed, draw, int(start[-1]), count)
+        start = np.cumsum([0, *(len(self.recordings[index]) for index in recordings)])
+        total = int(start[-1])
+        chosen = _distinct(self.seed, draw, total, min(self.settings.frames, total))
         which = np.searchsorted(start, chosen, side="right") - 1
-        return [
-            (r, chosen[which == i] - start[i])
-            for i, r in enumerate(recordings)
-            if (which == i).any()
-        ]
+        frames = []
+        for place, recording in enumerate(recordings):
+            positions = chosen[which == place] - start[place]
+            if len(positions):
+                frames.append((recording, positions))
+        return frames
 
     def __getitem__(self, samples: Sequence[int]) -> Labelled[PairObservations, PairTruth]:
         places = [self.locate(sample) for sample in samples]
-        rig = torch.tensor([place[0] for place in places], dtype=torch.int64)
-        drawn: dict[int, dict[str, np.ndarray]] = {}
-        for which, draw, _ in places:
-            if draw not in drawn:
-                drawn[draw] = self._read(which, draw)
-        like = self.recordings[0].key_points.shape[1:]
-
-        def gather(field: str) -> Tensor:
-            if not places:
-                return torch.from_numpy(_EMPTY[field](0, like[0], self.settings.frames, like[1]))
-            return torch.from_numpy(np.stack([drawn[draw][field] for _, draw, _ in places]))
-
-        pair = torch.tensor([place[2] for place in places], dtype=torch.int64).reshape(-1, 2)
-        K, R, t = (torch.stack([getattr(r.cameras, n) for r in self.rigs])[rig] for n in "KRt")
-        cameras = Cameras(*(select_views(values, pair) for values in (K, R, t)))
+        rig = torch.tensor([place.rig for place in places], dtype=torch.int64)
+        draw = torch.tensor([place.draw for place in places], dtype=torch.int64)
+        pair = torch.tensor([place.pair for place in places], dtype=torch.int64).reshape(-1, 2)
+        K = torch.stack([r.cameras.K for r in self.rigs])[rig]
+        R = torch.stack([r.cameras.R for r in self.rigs])[rig]
+        t = torch.stack([r.cameras.t for r in self.rigs])[rig]
+        cameras = Cameras(select_views(K, pair), select_views(R, pair), select_views(t, pair))
+        seen = self._gather(places)
         observations = PairObservations(
             index=torch.tensor(list(samples), dtype=torch.int64),
             rig=rig,
-            draw=torch.tensor([place[1] for place in places], dtype=torch.int64),
+            draw=draw,
             pair=pair,
             K=K,
             baseline=(cameras.centre[:, 1] - cameras.centre[:, 0]).norm(dim=-1),
-            key_points=gather("key_points"),
-            confidence=gather("confidence"),
-            valid=gather("valid"),
+            key_points=torch.from_numpy(seen.key_points),
+            confidence=torch.from_numpy(seen.confidence),
+            valid=torch.from_numpy(seen.valid),
         )
         points = torch.stack([r.points for r in self.rigs])[rig]
         return Labelled(observations, PairTruth(cameras, points))
 
-    def _read(self, rig: int, draw: int) -> dict[str, np.ndarray]:
-        """Key points, confidence and masks [V, M, J, ...] of a draw."""
+    def _gather(self, places: Sequence[Place]) -> _Seen:
+        """Return what all views see at these places; the pairs of one draw are read once."""
+        if not places:
+            views, joints = self.recordings[0].key_points.shape[1:3]
+            return _Seen.empty(0, views, self.settings.frames, joints)
+        drawn: dict[int, _Seen] = {}
+        for place in places:
+            if place.draw not in drawn:
+                drawn[place.draw] = self._read(place.rig, place.draw)
+        each = [drawn[place.draw] for place in places]
+        return _Seen(
+            key_points=np.stack([seen.key_points for seen in each]),
+            confidence=np.stack([seen.confidence for seen in each]),
+            valid=np.stack([seen.valid for seen in each]),
+        )
+
+    def _read(self, rig: int, draw: int) -> _Seen:
+        """Return what the V views see in the M frames of a draw."""
         views, joints = self.recordings[0].key_points.shape[1:3]
-        arrays = {
-            field: make(views, self.settings.frames, joints) for field, make in _EMPTY.items()
-        }
+        seen = _Seen.empty(views, self.settings.frames, joints)
         row = 0
-        for recording, positions in self.frames_of(rig, draw):
-            for field, array in arrays.items():
-                values = getattr(self.recordings[recording], field)[positions]
-                array[:, row : row + len(positions)] = values.swapaxes(0, 1)
+        for index, positions in self.locate_frames(rig, draw):
+            recording = self.recordings[index]
+            rows = slice(row, row + len(positions))
+            seen.key_points[:, rows] = recording.key_points[positions].swapaxes(0, 1)
+            seen.confidence[:, rows] = recording.confidence[positions].swapaxes(0, 1)
+            seen.valid[:, rows] = recording.valid[positions].swapaxes(0, 1)
             row += len(positions)
-        return arrays
+        return seen
 
 
-_EMPTY = {
-    "key_points": lambda *shape: np.zeros((*shape, 2), dtype=np.float32),
-    "confidence": lambda *shape: np.zeros(shape, dtype=np.float32),
-    "valid": lambda *shape: np.zeros(shape, dtype=bool),
-}
+@dataclass(frozen=True)
+class _Seen:
+    """What V views see in M frames, with any leading dimensions."""
+
+    key_points: Float[np.ndarray, "*B V M J 2"]
+    confidence: Float[np.ndarray, "*B V M J"]
+    valid: Bool[np.ndarray, "*B V M J"]
+
+    @staticmethod
+    def empty(*shape: int) -> _Seen:
+        """Return what views see that see nothing."""
+        key_points = np.zeros((*shape, 2), dtype=np.float32)
+        confidence = np.zeros(shape, dtype=np.float32)
+        return _Seen(key_points, confidence, np.zeros(shape, dtype=bool))
 
 
 def _distinct(seed: int, draw: int, total: int, count: int) -> Int[np.ndarray, " F"]:
-    """``count`` distinct numbers below ``total``, sorted (Floyd's algorithm, so that long
-    recordings cost nothing).
+    """Return ``count`` distinct numbers below ``total``, sorted.
+
+    Floyd's algorithm, so that long recordings cost nothing.
     """
     draws = randomness.uniform(randomness.key(seed, "frames of a draw", draw), (count,)).numpy()
     chosen: set[int] = set()
-    for last, u in zip(range(total - count, total), draws, strict=True):
-        candidate = int(u * (last + 1))
+    for last, uniform in zip(range(total - count, total), draws, strict=True):
+        candidate = int(uniform * (last + 1))
         chosen.add(last if candidate in chosen else candidate)
     return np.array(sorted(chosen), dtype=np.int64)
 
 
 def _rigs(recordings: Sequence[LabelledRecording], points: int, seed: int) -> list[RigOfSplit]:
-    """Recordings with the same cameras are of one rig."""
+    """Return the rigs: recordings with the same cameras are of one."""
     groups: dict[tuple[tuple[str, ...], bytes], list[int]] = {}
     for index, recording in enumerate(recordings):
-        c = recording.cameras
-        values = torch.cat([c.K.flatten(1), c.R.flatten(1), c.t], dim=1).double()
-        groups.setdefault((recording.camera_names, values.numpy().tobytes()), []).append(index)
+        K = recording.cameras.K.flatten(1)
+        R = recording.cameras.R.flatten(1)
+        values = torch.cat([K, R, recording.cameras.t], dim=1).double()
+        identity = (recording.camera_names, values.numpy().tobytes())
+        groups.setdefault(identity, []).append(index)
     rigs = []
     for number, ((names, _), members) in enumerate(groups.items()):
-        subjects = dict.fromkeys(recordings[i].subject for i in members)
-        volume = _volume([recordings[i] for i in members])
-        share = randomness.uniform(
-            randomness.key(seed, "points of the volume", number), (points, 3)
-        )
-        cameras = Cameras(
-            *(getattr(recordings[members[0]].cameras, n).double() for n in ("K", "R", "t"))
-        )
-        low, high = volume
+        own = [recordings[index] for index in members]
+        subjects = dict.fromkeys(recording.subject for recording in own)
+        low, high = _volume(own)
+        key = randomness.key(seed, "points of the volume", number)
+        share = randomness.uniform(key, (points, 3))
         rigs.append(
             RigOfSplit(
-                " ".join(subjects), names, cameras, tuple(members), low + share * (high - low)
+                name=" ".join(subjects),
+                names=names,
+                cameras=own[0].cameras.to(torch.float64),
+                recordings=tuple(members),
+                points=low + share * (high - low),
             )
         )
     return rigs
@@ -211,18 +248,14 @@ def _rigs(recordings: Sequence[LabelledRecording], points: int, seed: int) -> li
 def _volume(
     recordings: Sequence[LabelledRecording],
 ) -> tuple[Float[Tensor, " 3"], Float[Tensor, " 3"]]:
-    """The lowest and highest corner of the box of the true joints. Raises GhptDataError where there
-    are none.
+    """Return the lowest and highest corner of the box of the true joints.
+
+    Raises GhptDataError where there are none.
     """
     step = max(1, sum(map(len, recordings)) // _VOLUME_FRAMES)
-    joints = np.concatenate([r.truth[::step][r.truth_valid[::step]] for r in recordings]).astype(
-        np.float64
-    )
+    parts = [r.truth[::step][r.truth_valid[::step]] for r in recordings]
+    joints = np.concatenate(parts).astype(np.float64)
     if not len(joints):
-        raise GhptDataError(
-            recordings[0].name,
-            "truth",
-            "has no true pose, so errors cannot be measured",
-            "Use calibrate.py for it.",
-        )
+        problem = "has no true pose, so errors cannot be measured"
+        raise GhptDataError(recordings[0].name, "truth", problem, "Use calibrate.py for it.")
     return torch.from_numpy(joints.min(axis=0)), torch.from_numpy(joints.max(axis=0))

@@ -49,8 +49,9 @@ _LARGEST_NUMBER = 1e15
 """No focal length or distance; its square would still be one, though."""
 _FIELDS = ("matrix", "distortions", "rotation", "translation")
 _FORMATS = (
-    "Known: TOML of Pose2Sim, aniposelib, caliscope or freemocap; intri.yml (with extri.yml beside it) of OpenCV or "
-    "EasyMocap; calibration JSON of CMU Panoptic; camera-parameters.json of Human3.6M; a folder with a COLMAP model."
+    "Known: TOML of Pose2Sim, aniposelib, caliscope or freemocap; intri.yml (with extri.yml beside "
+    "it) of OpenCV or EasyMocap; calibration JSON of CMU Panoptic; camera-parameters.json of "
+    "Human3.6M; a folder with a COLMAP model."
 )
 
 

@@ -48,11 +48,9 @@ def read_coco(path: Path, skeleton: str | None) -> Detections:
 def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[int]]]:
     """Return each view's people as (frame number, joints), and the numbers of its frames."""
     content = read_json(file)
-    images = content.get("images", []) if isinstance(content, dict) else []
-    people = content.get("annotations") if isinstance(content, dict) else content
-    for field, listed in (("images", images), ("annotations", people)):
-        if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
-            raise GhptDataError(file, field, "is not a list of objects", _HINT)
+    whole = content if isinstance(content, dict) else {"annotations": content}
+    images = _objects(file, "images", whole.get("images", []))
+    people = _objects(file, "annotations", whole.get("annotations"))
     counts = Counter(_key(person.get("image_id")) for person in people)
     check_people(file, "annotations", max(counts.values(), default=0))
     names = {_key(image.get("id")): image.get("file_name") for image in images}
@@ -75,6 +73,12 @@ def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[i
             view, frame = places[image_id]
             views[view].append((frame, joints))
     return views, frames
+
+
+def _objects(file: Path, field: str, listed: object) -> list[dict[str, Any]]:
+    if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
+        raise GhptDataError(file, field, "is not a list of objects", _HINT)
+    return listed
 
 
 def _key(image_id: Any) -> int | str | None:

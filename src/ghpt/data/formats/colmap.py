@@ -90,7 +90,7 @@ def read_colmap(folder: Path) -> list[ColmapCamera]:
         raise GhptDataError(image_file, "", f"is damaged ({error})", _HINT) from error
     check_view_count(camera_file, len(found))
     check_view_count(image_file, len(images))
-    cameras = {number: rest for number, *rest in found}
+    cameras = {number: (model, size, values) for number, model, size, values in found}
     names = _names(image_file, [PurePosixPath(image.name) for image in images])
     rig = []
     for image, (name, other) in zip(images, names, strict=True):

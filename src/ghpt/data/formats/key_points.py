@@ -1,5 +1,6 @@
-"""People's own 2D key points, as a detector wrote them: the format is recognised by its content, or
-named.
+"""People's own 2D key points, as a detector wrote them.
+
+The format is recognised by its content, or named.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ from ghpt.errors import GhptDataError
 __all__ = ["FORMATS", "Detections", "KeyPoints", "read_key_points", "write_key_points"]
 
 _HINT = (
-    "Known: a folder with OpenPose's JSON files in a folder for each camera; COCO results or MMPose's JSON, a file for "
-    "each camera; caliscope's xy_*.csv; an npz file of ghpt; the authors' all_2d_preds.npy; DeepLabCut, SLEAP and "
-    "LightningPose files (docs/calibration.md). Or name it: format=."
+    "Known: a folder with OpenPose's JSON files in a folder for each camera; COCO results or "
+    "MMPose's JSON, a file for each camera; caliscope's xy_*.csv; an npz file of ghpt; the "
+    "authors' all_2d_preds.npy; DeepLabCut, SLEAP and LightningPose files (docs/calibration.md). "
+    "Or name it: format=."
 )
 
 
@@ -81,7 +83,7 @@ FORMATS: dict[str, Callable[[Path, str | None], Detections]] = {
 
 
 def _format_of(path: Path) -> str:
-    """The name of the format, by what a folder has in it or how a file begins."""
+    """Return the name of the format, by what a folder has in it or how a file begins."""
     if not path.is_dir():
         form = _format_of_file(path)
         if form in (None, "openpose"):

@@ -51,8 +51,9 @@ def is_caliscope(text: str) -> bool:
 def read_caliscope(path: Path) -> Detections:
     """Return the one person of the table: 33 landmarks in the views ``cam_<port>``.
 
-    The frame numbers are ``sync_index``. Points beyond the body's (hands, face) are left out. There is no confidence in these files.
-    Raises GhptDataError for a table that is damaged, or that has a point twice.
+    The frame numbers are ``sync_index``. Points beyond the body's (hands, face) are left out. There
+    is no confidence in these files. Raises GhptDataError for a table that is damaged, or that has a
+    point twice.
     """
     table = _table(path)
     body = (table[:, 2] >= 0) & (table[:, 2] < _JOINTS)
@@ -108,20 +109,30 @@ def _lines(handle: io.TextIOBase) -> Iterator[str]:
         yield line
 
 
+def _number(cell: str) -> float:
+    """Return a cell's number; an empty one is a point that was not found."""
+    return float(cell) if cell.strip() else np.nan
+
+
 def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
     line = handle.readline(_LONGEST_LINE)
     if ";" in line or "\t" in line:
-        hint = "Save it with commas between the columns and points in the numbers (a spreadsheet may have changed it)."
+        hint = (
+            "Save it with commas between the columns and points in the numbers "
+            "(a spreadsheet may have changed it)."
+        )
         raise GhptDataError(path, "", "has columns that commas do not part", hint)
     try:
         header = [name.strip() for name in next(csv.reader([line]))]
         columns = [header.index(name) for name in COLUMNS]
-        # an empty cell is a point that was not found
-        empty = {column: lambda cell: float(cell) if cell.strip() else np.nan for column in columns}
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a table without rows
             table = np.loadtxt(
-                _lines(handle), delimiter=",", usecols=columns, converters=empty, ndmin=2
+                _lines(handle),
+                delimiter=",",
+                usecols=columns,
+                converters=dict.fromkeys(columns, _number),
+                ndmin=2,
             )
     except (ValueError, StopIteration, csv.Error) as error:
         raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error

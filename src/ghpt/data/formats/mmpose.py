@@ -25,10 +25,10 @@ _HINT = "It must be a file that MMPose wrote for a video (save_predictions, or p
 
 
 def read_mmpose(path: Path, skeleton: str | None) -> Detections:
-    """Return everybody in a folder with MMPose's file of each camera; the files' names are the views'.
+    """Return everybody in a folder with MMPose's file of each camera.
 
-    Frame numbers are ``frame_id``; the joints' names those of ``meta_info``, if it is there. Raises
-    GhptDataError.
+    The files' names are the views', frame numbers are ``frame_id``, and the joints' names those of
+    ``meta_info``, if it is there. Raises GhptDataError.
     """
     found: list[Detections] = []
     named: dict[tuple[str, ...], Path] = {}

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ghpt.data.formats.skeletons import canonical
+from ghpt.data.formats.validate import finite_points
 from ghpt.data.people.detections import Detections, detections_in_view, merge_views
 from ghpt.errors import GhptDataError
 
@@ -58,7 +59,7 @@ def _read(path: Path, skeleton: str | None, software: str, endings: tuple[str, .
             path, "", f"{software}'s files need the package movement", _INSTALL
         ) from error
     found = []
-    named = {}
+    named: dict[tuple[str, ...], Path] = {}
     for file in files:
         if file.stat().st_size > _LARGEST:
             raise GhptDataError(
@@ -93,7 +94,8 @@ def _view(file: Path, data: Any) -> Detections:
     order = ("time", "individuals", "keypoints")
     position = np.asarray(data["position"].transpose(*order, "space"), dtype=np.float64)[..., :2]
     confidence = np.asarray(data["confidence"].transpose(*order), dtype=np.float64)
-    valid = np.isfinite(position).all(-1) & (np.abs(np.nan_to_num(position)) < 1e6).all(-1)
+    near = np.abs(np.nan_to_num(position)) < 1e6
+    valid = finite_points(position) & near.all(-1)
     # SLEAP's hand-made labels have no score, LightningPose and DeepLabCut a likelihood
     score = np.where(np.isfinite(confidence), confidence, 1.0)
     values = np.where(valid[..., None], np.concatenate([position, score[..., None]], -1), 0)

@@ -7,6 +7,7 @@ import zipfile
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int
@@ -14,6 +15,7 @@ from jaxtyping import Int
 from ghpt.data.formats.skeletons import recognise
 from ghpt.data.formats.validate import (
     check_view_count,
+    finite_points,
     frame_rate,
     npy_header,
     open_input,
@@ -38,7 +40,8 @@ def write_key_points(
     rate_hz: float | None = None,
 ) -> None:
     """Write one person's key points [T V K] as the npz file that ``read_key_points`` reads."""
-    arrays = {
+    # Any: numpy's types take any of the names for its option allow_pickle
+    arrays: dict[str, Any] = {
         "key_points": points.pixels,
         "views": np.array(views, dtype=np.str_),
         "joints": np.array(joints, dtype=np.str_),
@@ -86,7 +89,7 @@ def read_own(path: Path, skeleton: str | None) -> Detections:
     if skeleton is None and "skeleton" in there:
         skeleton = _texts(path, "skeleton")[0]
     joints = _texts(path, "joints") if skeleton is None and "joints" in there else ()
-    finite = np.isfinite(values).all(-1)
+    finite = finite_points(values)
     valid = finite & more.get("seen", finite)
     values = np.where(valid[..., None], values, 0)
     joints = joints or joints_for(

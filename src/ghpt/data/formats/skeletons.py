@@ -103,7 +103,7 @@ _CLEARLY = 0.8
 
 
 def joints_of(where: object, skeleton: str) -> tuple[str, ...]:
-    """The joints of a skeleton by name. Raises GhptDataError, listing the known ones, for another."""
+    """Return the joints of a skeleton by name. Raises GhptDataError for one that is not known."""
     name = skeleton.lower().replace("-", "_")
     if name not in SKELETONS:
         problem = f"there is no skeleton {skeleton!r}"

@@ -1,4 +1,4 @@
-"""npz archives whose arrays are stored as they are, so that they can be written and read in parts."""
+"""npz archives whose arrays are stored as they are: they are written and read in parts."""
 
 import math
 import re
@@ -12,7 +12,8 @@ import numpy as np
 
 _BLOCK = 1 << 20
 _HEADER = re.compile(
-    rb"\{'descr': '(?P<dtype>[<|][bifU]\d{1,7})', 'fortran_order': False, 'shape': \((?P<shape>[\d, ]{0,99})\), \} *\n"
+    rb"\{'descr': '(?P<dtype>[<|][bifU]\d{1,7})', 'fortran_order': False, "
+    rb"'shape': \((?P<shape>[\d, ]{0,99})\), \} *\n"
 )
 
 
@@ -31,8 +32,9 @@ def add_member(
     shape: tuple[int, ...],
     content: IO[bytes] | bytes,
 ) -> None:
-    """Write an array, given as its bytes or as a file of them; the same content gives the same
-    bytes.
+    """Write an array, given as its bytes or as a file of them.
+
+    The same content gives the same bytes.
     """
     info = zipfile.ZipInfo(f"{name}.npy", date_time=(1980, 1, 1, 0, 0, 0))
     info.create_system = 3

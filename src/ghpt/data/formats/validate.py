@@ -1,5 +1,5 @@
-"""Checks of users' cameras, arrays and files; each error names the file, the field, the problem and
-the mend.
+"""Checks of users' cameras, arrays and files; each error names the file, the field, the problem
+and the hint.
 
 No reader here allocates what a file only claims to hold: sizes are compared with the file's own
 first.
@@ -16,7 +16,7 @@ import zlib
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Literal
 
 import numpy as np
 import torch
@@ -93,7 +93,10 @@ def _rotation(where: object, name: str, R: np.ndarray) -> np.ndarray:
     det = np.linalg.det(R)
     if error > 1e-3 or det < 0:
         problem = f"R is not a rotation (|R R^T - I| = {error:.3g}, det = {det:.3g})"
-        hint = "R must be the 3x3 world-to-camera rotation: without scale, not mirrored, not a Rodrigues vector."
+        hint = (
+            "R must be the 3x3 world-to-camera rotation: "
+            "without scale, not mirrored, not a Rodrigues vector."
+        )
         raise GhptDataError(where, f"camera {name}, R", problem, hint)
     if error < 1e-9:
         return R
@@ -148,14 +151,14 @@ def frame_rate(where: object, value: float | int) -> float | None:
 
 
 def read_flag(where: object, field: str, value: object) -> bool:
-    """A file's true or false, which may be written 1 or 0. Raises GhptDataError for anything else."""
+    """Return a file's true or false, which may be written 1 or 0. Raises GhptDataError."""
     if type(value) is bool or (type(value) is int and value in (0, 1)):
         return bool(value)
     raise GhptDataError(where, field, f"is {value!r}, not true or false", "Write true or false.")
 
 
 def read_name(where: object, field: str, value: object) -> str:
-    """A file's name of a camera, which may be a number. Raises GhptDataError for anything else."""
+    """Return a file's name of a camera, which may be a number. Raises GhptDataError."""
     if type(value) is int or (isinstance(value, str) and value.strip()):
         return str(value)
     raise GhptDataError(where, field, f"is {value!r}, not a name", "Give each camera a name.")
@@ -178,7 +181,7 @@ def numbers_in(value: object) -> np.ndarray | None:
 
 
 def _all_numbers(value: object, depth: int = 3) -> bool:
-    """Whether all that is in lists, at most so ``depth`` of them within one another, is a number."""
+    """Return whether all that is in lists, of at most this depth, is a number."""
     if isinstance(value, list | tuple):
         return depth > 0 and all(_all_numbers(item, depth - 1) for item in value)
     return type(value) in (int, float)
@@ -194,9 +197,15 @@ def check_array(
     return array
 
 
+def finite_points(pixels: np.ndarray) -> np.ndarray:
+    """Return which points [..., 2] have two finite coordinates."""
+    return np.asarray(np.isfinite(pixels).all(-1))
+
+
 def read_npy(path: Path, shape: Shape, kinds: str) -> np.ndarray:
-    """A read-only memory map of an npy file that holds exactly an array of this form; else
-    GhptDataError.
+    """Return a read-only memory map of an npy file.
+
+    Raises GhptDataError unless it holds exactly an array of this form.
     """
     with open_input(path) as handle:
         found, order, dtype = npy_header(path, "", handle, path.stat().st_size)
@@ -204,11 +213,11 @@ def read_npy(path: Path, shape: Shape, kinds: str) -> np.ndarray:
     _check_form(path, "", found, dtype, shape, kinds)
     if math.prod(found) == 0:
         return np.empty(found, dtype)
-    return np.asarray(np.memmap(path, dtype, "r", offset, found, order))
+    return np.asarray(np.memmap(path, dtype, "r", offset, found, order=order))
 
 
 def read_npz(path: Path, fields: dict[str, tuple[Shape, str]]) -> dict[str, np.ndarray]:
-    """The named arrays of an npz file, of these shapes and kinds; else GhptDataError."""
+    """Return the named arrays of an npz file. Raises GhptDataError unless all have these forms."""
     arrays = {}
     try:
         with open_input(path) as handle, zipfile.ZipFile(handle) as archive:
@@ -276,7 +285,7 @@ def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
 
 
 def open_input(path: Path) -> io.BufferedReader:
-    """Open a user's file for reading. Raises GhptDataError if there is none, or it cannot be read."""
+    """Open a user's file for reading. Raises GhptDataError if that cannot be done."""
     try:
         return open(path, "rb")
     except FileNotFoundError as error:
@@ -313,9 +322,9 @@ def _check_form(
 
 
 def npy_header(
-    where: object, field: str, handle: io.BufferedIOBase, size: int, pickled: bool = False
-) -> tuple[tuple[int, ...], str, np.dtype]:
-    """Shape, order and dtype of the npy array in ``handle``, which then stands at its data.
+    where: object, field: str, handle: IO[bytes], size: int, pickled: bool = False
+) -> tuple[tuple[int, ...], Literal["C", "F"], np.dtype]:
+    """Return shape, order and dtype of the npy array in ``handle``, which then stands at its data.
 
     Raises GhptDataError unless what follows is as long as the header claims (``size`` counts from
     the start).

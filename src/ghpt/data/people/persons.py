@@ -9,7 +9,7 @@ from collections.abc import Sequence as Items
 import numpy as np
 from jaxtyping import Int
 
-from ghpt.data.datasets.detections import undistorted
+from ghpt.data.datasets.detections import undistort_key_points
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.skeletons import joints17
 from ghpt.data.people.association import associate
@@ -87,7 +87,7 @@ def undistort_view(points: KeyPoints, cameras: CameraSet, camera: int) -> KeyPoi
     """
     K = cameras.K[camera].numpy()
     distortion = cameras.distortion[camera].numpy()
-    pixels, valid = undistorted(points.pixels, points.valid, K, distortion)
+    pixels, valid = undistort_key_points(points.pixels, points.valid, K, distortion)
     return KeyPoints(pixels, points.confidence, valid)
 
 
@@ -158,16 +158,8 @@ def _across_views(
     indices = [np.flatnonzero(people.view == view) for view in at]
     index = np.concatenate(indices)
     camera = np.repeat(np.arange(len(at)), [len(each) for each in indices])
-    points = ideal[index]
-    found = associate(
-        cameras.cameras,
-        len(people.frame),
-        people.row[index],
-        camera,
-        points.pixels,
-        points.valid,
-        points.confidence,
-    )
+    rows = people.row[index]
+    found = associate(cameras.cameras, len(people.frame), rows, camera, ideal[index])
     persons = []
     for members in found:
         chosen = np.full((len(people.frame), len(people.views)), -1)

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Int
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.skeletons import joints17, recognise
 from ghpt.data.formats.stored_npz import Member, members_of, read_rows, text_table
-from ghpt.data.formats.validate import check_view_count, frame_rate
+from ghpt.data.formats.validate import check_view_count, finite_points, frame_rate
 from ghpt.data.people.detections import joints_for
 from ghpt.data.people.matching import match_views
 from ghpt.data.people.persons import undistort_view
@@ -64,7 +64,7 @@ class StoredFile:
     def read(self, rows: Rows) -> KeyPoints:
         """Return the key points [N V K] of some rows, which rise."""
         pixels = self._read("key_points", rows).astype(np.float64)
-        valid = np.isfinite(pixels).all(-1)
+        valid = finite_points(pixels)
         if "seen" in self.members:
             valid &= self._read("seen", rows)
         confidence = np.ones(valid.shape)

@@ -1,8 +1,11 @@
-"""The bodies of successive frames as people: tracks of what stays near, joined where they can be
-one.
+"""The bodies of successive frames as people.
+
+What stays near is a track; tracks that can be one person's are joined.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -18,70 +21,104 @@ _LEAST_JOINTS = 4
 """Joints that two bodies must share to be compared."""
 
 
-def extent(
+@dataclass(frozen=True)
+class Bodies:
+    """G bodies of some frames, in any order."""
+
+    frame: Int[np.ndarray, " G"]
+    points: Float[np.ndarray, "G J 3"]
+    valid: Bool[np.ndarray, "G J"]
+
+    def __len__(self) -> int:
+        return len(self.frame)
+
+
+def box_diagonal(
     points: Float[np.ndarray, "N J D"], valid: Bool[np.ndarray, "N J"]
 ) -> Float[np.ndarray, " N"]:
-    """Diagonal of the box around what is seen; 0 for nothing."""
+    """Return the diagonal of the box around the valid points; 0 where there is none."""
     low = np.where(valid[..., None], points, np.inf).min(1)
     high = np.where(valid[..., None], points, -np.inf).max(1)
-    return np.linalg.norm(
-        np.where(np.isfinite(low), high - np.where(np.isfinite(low), low, 0), 0), axis=-1
-    )
+    known = np.isfinite(low)
+    extent = np.where(known, high - np.where(known, low, 0), 0)
+    return np.linalg.norm(extent, axis=-1)
 
 
-def tracks(
-    frame: Int[np.ndarray, " G"], bodies: Float[np.ndarray, "G J 3"], known: Bool[np.ndarray, "G J"]
-) -> Int[np.ndarray, " G"]:
-    """The number of each body's track: in each frame bodies go to the tracks whose last body is
-    nearest.
+def track_bodies(bodies: Bodies) -> Int[np.ndarray, " G"]:
+    """Return the number of each body's track.
+
+    In each frame bodies go to the tracks whose last body is nearest.
     """
-    track = np.full(len(frame), -1)
-    order = np.argsort(frame, kind="stable")
+    track = np.full(len(bodies), -1)
     last = np.zeros(0, np.int64)
     count = 0
-    for now in np.split(order, np.flatnonzero(np.diff(frame[order])) + 1) if len(order) else ():
-        cost = _apart(bodies, known, last, now)
+    for now in _split_by(bodies.frame):
+        cost = _distances(bodies, last, now)
         rows, columns = linear_sum_assignment(np.minimum(cost, 10 * _NEAR))
         near = cost[rows, columns] < _NEAR
         track[now[columns[near]]] = track[last[rows[near]]]
         new = now[track[now] < 0]
         track[new] = count + np.arange(len(new))
         count += len(new)
-        last = np.concatenate([now, np.delete(last, rows[near])])[:_MOST_TRACKS]
+        others = np.delete(last, rows[near])
+        last = np.concatenate([now, others])[:_MOST_TRACKS]
     return track
 
 
-def _apart(
-    bodies: np.ndarray, known: np.ndarray, last: Int[np.ndarray, " A"], now: Int[np.ndarray, " B"]
-) -> Float[np.ndarray, "A B"]:
-    both = known[last][:, None] & known[now]
-    distance = np.linalg.norm(bodies[last][:, None] - bodies[now], axis=-1)
-    count = both.sum(-1)
-    ordered = np.sort(np.where(both, distance, np.inf), axis=-1)
-    middle = np.take_along_axis(ordered, np.maximum(count - 1, 0)[..., None] // 2, -1)[..., 0]
-    return np.where(count >= _LEAST_JOINTS, middle, np.inf) / np.maximum(
-        extent(bodies[now], known[now]), 1e-9
-    )
-
-
-def joined(
+def join_tracks(
     frames: int,
-    frame: Int[np.ndarray, " G"],
+    bodies: Bodies,
     track: Int[np.ndarray, " G"],
     worth: Float[np.ndarray, " G"],
     members: Int[np.ndarray, "G V"],
 ) -> list[Int[np.ndarray, "T V"]]:
-    """Tracks that are never there at once, joined; by what they are worth together."""
+    """Return the members [T V] of each person, the best first; -1 where there is none.
+
+    A person's tracks are never there at once. Persons are ordered by what their bodies are worth
+    together.
+    """
     total = np.bincount(track, worth) if len(track) else np.zeros(0)
-    order = np.argsort(track, kind="stable")
-    bodies = np.split(order, np.flatnonzero(np.diff(track[order])) + 1) if len(order) else []
-    people: list[tuple[float, np.ndarray]] = []
+    of_track = _split_by(track)
+    persons: list[np.ndarray] = []
+    worths: list[float] = []
     for number in np.argsort(-total, kind="stable"):
-        of = bodies[number]
-        alone = (i for i, (_, chosen) in enumerate(people) if not (chosen[frame[of]] >= 0).any())
-        if (place := next(alone, None)) is None:
-            place = len(people)
-            people.append((0.0, np.full((frames, members.shape[1]), -1)))
-        people[place][1][frame[of]] = members[of]
-        people[place] = (people[place][0] + float(total[number]), people[place][1])
-    return [chosen for _, chosen in sorted(people, key=lambda person: -person[0])]
+        own = of_track[number]
+        rows = bodies.frame[own]
+        free = (i for i, person in enumerate(persons) if not (person[rows] >= 0).any())
+        place = next(free, None)
+        if place is None:
+            place = len(persons)
+            persons.append(np.full((frames, members.shape[1]), -1))
+            worths.append(0.0)
+        persons[place][rows] = members[own]
+        worths[place] += float(total[number])
+    order = sorted(range(len(persons)), key=lambda place: -worths[place])
+    return [persons[place] for place in order]
+
+
+def _split_by(number: Int[np.ndarray, " G"]) -> list[Int[np.ndarray, " N"]]:
+    """Return the positions of each number, in the order of the numbers."""
+    if not len(number):
+        return []
+    order = np.argsort(number, kind="stable")
+    starts = np.flatnonzero(np.diff(number[order])) + 1
+    return np.split(order, starts)
+
+
+def _distances(
+    bodies: Bodies, last: Int[np.ndarray, " A"], now: Int[np.ndarray, " B"]
+) -> Float[np.ndarray, "A B"]:
+    """Return the median distance of the joints that two bodies share, in heights of the second.
+
+    It is inf where they share too few.
+    """
+    both = bodies.valid[last][:, None] & bodies.valid[now]
+    offset = bodies.points[last][:, None] - bodies.points[now]
+    distance = np.linalg.norm(offset, axis=-1)
+    count = both.sum(-1)
+    ordered = np.sort(np.where(both, distance, np.inf), axis=-1)
+    middle = np.maximum(count - 1, 0)[..., None] // 2
+    median = np.take_along_axis(ordered, middle, -1)[..., 0]
+    median = np.where(count >= _LEAST_JOINTS, median, np.inf)
+    height = box_diagonal(bodies.points[now], bodies.valid[now])
+    return median / np.maximum(height, 1e-9)

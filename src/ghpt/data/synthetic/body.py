@@ -1,10 +1,9 @@
-"""A kinematic body of 17 joints: segment lengths, forward kinematics, and the volume that hides
-joints.
-"""
+"""A kinematic body of 17 joints: its size, forward kinematics, and what its volume hides."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Float
@@ -12,61 +11,90 @@ from scipy.spatial.transform import Rotation
 
 from ghpt.skeleton import JOINT, JOINTS, PELVIS, THORAX
 
-SEGMENTS = (
-    "pelvis",
-    "lumbar",
-    "thorax",
-    "neck",
-    "right_clavicle",
-    "right_upper_arm",
-    "right_forearm",
-    "left_clavicle",
-    "left_upper_arm",
-    "left_forearm",
-    "right_thigh",
-    "right_shank",
-    "left_thigh",
-    "left_shank",
-)
-"""The rigid parts, parents first: the order of every array of joint angles."""
 
-SEGMENT = {name: index for index, name in enumerate(SEGMENTS)}
+class Segment(IntEnum):
+    """The rigid segments, parents first: the order of every array of joint angles."""
+
+    PELVIS = 0
+    LUMBAR = 1
+    THORAX = 2
+    NECK = 3
+    RIGHT_CLAVICLE = 4
+    RIGHT_UPPER_ARM = 5
+    RIGHT_FOREARM = 6
+    LEFT_CLAVICLE = 7
+    LEFT_UPPER_ARM = 8
+    LEFT_FOREARM = 9
+    RIGHT_THIGH = 10
+    RIGHT_SHANK = 11
+    LEFT_THIGH = 12
+    LEFT_SHANK = 13
+
+
+SEGMENTS = tuple(Segment)
+
+
+@dataclass(frozen=True)
+class Side:
+    """The segments of one side of the body."""
+
+    clavicle: Segment
+    upper_arm: Segment
+    forearm: Segment
+    thigh: Segment
+    shank: Segment
+
+
+RIGHT = Side(
+    clavicle=Segment.RIGHT_CLAVICLE,
+    upper_arm=Segment.RIGHT_UPPER_ARM,
+    forearm=Segment.RIGHT_FOREARM,
+    thigh=Segment.RIGHT_THIGH,
+    shank=Segment.RIGHT_SHANK,
+)
+LEFT = Side(
+    clavicle=Segment.LEFT_CLAVICLE,
+    upper_arm=Segment.LEFT_UPPER_ARM,
+    forearm=Segment.LEFT_FOREARM,
+    thigh=Segment.LEFT_THIGH,
+    shank=Segment.LEFT_SHANK,
+)
 
 _PARENTS = {
-    "lumbar": "pelvis",
-    "thorax": "lumbar",
-    "neck": "thorax",
-    "right_clavicle": "thorax",
-    "right_upper_arm": "right_clavicle",
-    "right_forearm": "right_upper_arm",
-    "left_clavicle": "thorax",
-    "left_upper_arm": "left_clavicle",
-    "left_forearm": "left_upper_arm",
-    "right_thigh": "pelvis",
-    "right_shank": "right_thigh",
-    "left_thigh": "pelvis",
-    "left_shank": "left_thigh",
+    Segment.LUMBAR: Segment.PELVIS,
+    Segment.THORAX: Segment.LUMBAR,
+    Segment.NECK: Segment.THORAX,
+    Segment.RIGHT_CLAVICLE: Segment.THORAX,
+    Segment.RIGHT_UPPER_ARM: Segment.RIGHT_CLAVICLE,
+    Segment.RIGHT_FOREARM: Segment.RIGHT_UPPER_ARM,
+    Segment.LEFT_CLAVICLE: Segment.THORAX,
+    Segment.LEFT_UPPER_ARM: Segment.LEFT_CLAVICLE,
+    Segment.LEFT_FOREARM: Segment.LEFT_UPPER_ARM,
+    Segment.RIGHT_THIGH: Segment.PELVIS,
+    Segment.RIGHT_SHANK: Segment.RIGHT_THIGH,
+    Segment.LEFT_THIGH: Segment.PELVIS,
+    Segment.LEFT_SHANK: Segment.LEFT_THIGH,
 }
 
-_JOINT_TREE = {
-    "right_hip": ("pelvis", "pelvis"),
-    "left_hip": ("pelvis", "pelvis"),
-    "right_knee": ("right_hip", "right_thigh"),
-    "left_knee": ("left_hip", "left_thigh"),
-    "right_ankle": ("right_knee", "right_shank"),
-    "left_ankle": ("left_knee", "left_shank"),
-    "spine": ("pelvis", "lumbar"),
-    "thorax": ("spine", "thorax"),
-    "nose": ("thorax", "neck"),
-    "head_top": ("thorax", "neck"),
-    "right_shoulder": ("thorax", "right_clavicle"),
-    "left_shoulder": ("thorax", "left_clavicle"),
-    "right_elbow": ("right_shoulder", "right_upper_arm"),
-    "left_elbow": ("left_shoulder", "left_upper_arm"),
-    "right_wrist": ("right_elbow", "right_forearm"),
-    "left_wrist": ("left_elbow", "left_forearm"),
+_JOINT_TREE: dict[str, tuple[str, Segment]] = {
+    "right_hip": ("pelvis", Segment.PELVIS),
+    "left_hip": ("pelvis", Segment.PELVIS),
+    "right_knee": ("right_hip", Segment.RIGHT_THIGH),
+    "left_knee": ("left_hip", Segment.LEFT_THIGH),
+    "right_ankle": ("right_knee", Segment.RIGHT_SHANK),
+    "left_ankle": ("left_knee", Segment.LEFT_SHANK),
+    "spine": ("pelvis", Segment.LUMBAR),
+    "thorax": ("spine", Segment.THORAX),
+    "nose": ("thorax", Segment.NECK),
+    "head_top": ("thorax", Segment.NECK),
+    "right_shoulder": ("thorax", Segment.RIGHT_CLAVICLE),
+    "left_shoulder": ("thorax", Segment.LEFT_CLAVICLE),
+    "right_elbow": ("right_shoulder", Segment.RIGHT_UPPER_ARM),
+    "left_elbow": ("left_shoulder", Segment.LEFT_UPPER_ARM),
+    "right_wrist": ("right_elbow", Segment.RIGHT_FOREARM),
+    "left_wrist": ("left_elbow", Segment.LEFT_FOREARM),
 }
-"""Joint -> (joint that it hangs on, segment that carries it)."""
+"""For each joint the joint that it hangs on, and the segment that carries it."""
 
 _PROPORTIONS = {
     "hip": (0.0, 0.074, -0.005),
@@ -90,30 +118,44 @@ are shortened to the joint centres.
 FOOT_HEIGHT = 0.039
 """Height of the ankle above the floor in statures (same source)."""
 
-CAPSULES = tuple(
-    (JOINT[a], JOINT[b], radius)
-    for a, b, radius in (
-        ("right_hip", "right_knee", 0.042),
-        ("left_hip", "left_knee", 0.042),
-        ("right_knee", "right_ankle", 0.029),
-        ("left_knee", "left_ankle", 0.029),
-        ("right_shoulder", "right_elbow", 0.027),
-        ("left_shoulder", "left_elbow", 0.027),
-        ("right_elbow", "right_wrist", 0.021),
-        ("left_elbow", "left_wrist", 0.021),
-        ("right_hip", "right_shoulder", 0.055),
-        ("left_hip", "left_shoulder", 0.055),
-        ("pelvis", "thorax", 0.062),
-        ("thorax", "head_top", 0.048),
-    )
-)
-"""The volume of the body: segments between two joints, with their radius in statures."""
 
-_LEGS = tuple(
-    (JOINT[f"{side}_{lower}"], JOINT[f"{side}_{upper}"])
-    for lower, upper in (("ankle", "knee"), ("knee", "hip"))
-    for side in ("right", "left")
+@dataclass(frozen=True)
+class Capsule:
+    """A part of the body's volume: what is within ``radius`` statures of a line of two joints."""
+
+    start: int
+    end: int
+    radius: float
+
+
+def _capsule(start: str, end: str, radius: float) -> Capsule:
+    return Capsule(JOINT[start], JOINT[end], radius)
+
+
+CAPSULES = (
+    _capsule("right_hip", "right_knee", 0.042),
+    _capsule("left_hip", "left_knee", 0.042),
+    _capsule("right_knee", "right_ankle", 0.029),
+    _capsule("left_knee", "left_ankle", 0.029),
+    _capsule("right_shoulder", "right_elbow", 0.027),
+    _capsule("left_shoulder", "left_elbow", 0.027),
+    _capsule("right_elbow", "right_wrist", 0.021),
+    _capsule("left_elbow", "left_wrist", 0.021),
+    _capsule("right_hip", "right_shoulder", 0.055),
+    _capsule("left_hip", "left_shoulder", 0.055),
+    _capsule("pelvis", "thorax", 0.062),
+    _capsule("thorax", "head_top", 0.048),
 )
+"""The volume of the body."""
+
+_LEG_BONES = (
+    (JOINT["right_ankle"], JOINT["right_knee"]),
+    (JOINT["left_ankle"], JOINT["left_knee"]),
+    (JOINT["right_knee"], JOINT["right_hip"]),
+    (JOINT["left_knee"], JOINT["left_hip"]),
+)
+_LEG_STATURES = 0.491
+"""Length of a leg from hip to ankle in statures, of ``_PROPORTIONS``."""
 
 
 @dataclass(frozen=True)
@@ -129,106 +171,123 @@ class Body:
 
 
 def random_body(rng: np.random.Generator) -> Body:
-    """A person drawn from adults: stature 1.73 +- 0.08 m, proportions +- 3 %, sides that differ by
-    about 1 %.
+    """Draw a person from adults: stature 1.73 +- 0.08 m, proportions +- 3 %.
+
+    The sides differ by about 1 %.
     """
     stature = float(np.clip(rng.normal(1730.0, 80.0), 1530.0, 1930.0))
-    proportion = dict(
-        zip(_PROPORTIONS, np.exp(rng.normal(0.0, 0.03, len(_PROPORTIONS))), strict=True)
-    )
-    side = np.exp(rng.normal(0.0, 0.008, len(JOINTS)))
+    factors = np.exp(rng.normal(0.0, 0.03, len(_PROPORTIONS)))
+    proportion = dict(zip(_PROPORTIONS, factors, strict=True))
+    asymmetry = np.exp(rng.normal(0.0, 0.008, len(JOINTS)))
     offsets = np.zeros((len(JOINTS), 3))
     for joint in _JOINT_TREE:
         kind = joint.removeprefix("right_").removeprefix("left_")
         offset = np.array(_PROPORTIONS[kind]) * stature * proportion[kind]
         if kind != joint:
-            offset = offset * side[JOINT[joint]]
-        offsets[JOINT[joint]] = offset * np.array(
-            [1.0, -1.0 if joint.startswith("right") else 1.0, 1.0]
-        )
+            offset = offset * asymmetry[JOINT[joint]]
+        sideways = -1.0 if joint.startswith("right") else 1.0
+        offsets[JOINT[joint]] = offset * np.array([1.0, sideways, 1.0])
     return Body(stature, offsets)
 
 
 def pose(body: Body, angles: Float[np.ndarray, "T S 3"]) -> Float[np.ndarray, "T J 3"]:
-    """Forward kinematics: joints in mm with the pelvis at the origin, z up.
+    """Return the joints of joint angles, in mm with the pelvis at the origin, z up.
 
     ``angles`` are flexion, abduction (of the trunk: bending to the left) and inward rotation (of
-    the trunk: turning left) of each of ``SEGMENTS`` in its parent's frame, radians; flexion of the
-    trunk is forward, of the shank backward. The pelvis' turn is the heading. The same angles on
-    both sides are mirror images.
+    the trunk: rotation to the left) of each of ``SEGMENTS`` in its parent's frame, radians; flexion
+    of the trunk is forward, of the shank backward. The pelvis' rotation is the heading. The same
+    angles on both sides are mirror images.
     """
-    local = Rotation.from_euler("YXZ", (angles * _SIGNS).reshape(-1, 3)).as_matrix()
-    world = local.reshape(*angles.shape, 3)
-    heading_first = (angles[:, 0] * _SIGNS[0])[:, [2, 0, 1]]
-    world[:, 0] = Rotation.from_euler("ZYX", heading_first).as_matrix()
-    for name, parent in _PARENTS.items():
-        world[:, SEGMENT[name]] = world[:, SEGMENT[parent]] @ world[:, SEGMENT[name]]
+    orientation = _segment_orientations(angles)
     joints = np.zeros((len(angles), len(JOINTS), 3))
-    for joint, (base, segment) in _JOINT_TREE.items():
-        joints[:, JOINT[joint]] = (
-            joints[:, JOINT[base]] + world[:, SEGMENT[segment]] @ body.offsets[JOINT[joint]]
-        )
+    for joint, (parent, segment) in _JOINT_TREE.items():
+        offset = orientation[:, segment] @ body.offsets[JOINT[joint]]
+        joints[:, JOINT[joint]] = joints[:, JOINT[parent]] + offset
     return joints
 
 
+def _segment_orientations(angles: Float[np.ndarray, "T S 3"]) -> Float[np.ndarray, "T S 3 3"]:
+    """Return the rotation of each segment's frame to the world."""
+    signed = angles * _SIGNS
+    local = Rotation.from_euler("YXZ", signed.reshape(-1, 3)).as_matrix()
+    orientation = local.reshape(*angles.shape, 3)
+    heading_first = signed[:, Segment.PELVIS][:, [2, 0, 1]]
+    pelvis = Rotation.from_euler("ZYX", heading_first)
+    orientation[:, Segment.PELVIS] = pelvis.as_matrix()
+    for segment, parent in _PARENTS.items():
+        orientation[:, segment] = orientation[:, parent] @ orientation[:, segment]
+    return orientation
+
+
 def stature(points: Float[np.ndarray, "T J 3"]) -> float:
-    """The person's stature (mm) from the legs, which are 0.491 of it of ``_PROPORTIONS``."""
-    length = [np.linalg.norm(points[:, a] - points[:, b], axis=-1) for a, b in _LEGS]
-    return float(np.median(np.sum(length, axis=0)) / 2.0 / 0.491)
+    """Return the person's stature (mm), from the length of the legs."""
+    bones = [points[:, a] - points[:, b] for a, b in _LEG_BONES]
+    lengths = [np.linalg.norm(bone, axis=-1) for bone in bones]
+    both_legs = np.median(np.sum(lengths, axis=0))
+    return float(both_legs / 2.0 / _LEG_STATURES)
 
 
 def trunk_frame(points: Float[np.ndarray, "T J 3"]) -> Float[np.ndarray, "T 3 3"]:
-    """Columns: forward, left and up of the trunk, in the world."""
-    up = points[:, THORAX] - points[:, PELVIS]
-    up = up / np.linalg.norm(up, axis=-1, keepdims=True).clip(min=1e-9)
+    """Return the trunk's axes in the world as columns: forward, left and up."""
+    up = _normalise(points[:, THORAX] - points[:, PELVIS])
     across = points[:, JOINT["left_hip"]] - points[:, JOINT["right_hip"]]
-    forward = np.cross(across, up)
-    forward /= np.linalg.norm(forward, axis=-1, keepdims=True).clip(min=1e-9)
-    return np.stack([forward, np.cross(up, forward), up], axis=-1)
+    forward = _normalise(np.cross(across, up))
+    left = np.cross(up, forward)
+    return np.stack([forward, left, up], axis=-1)
 
 
-def occlusion(in_camera: Float[np.ndarray, "T J 3"], person: float) -> Float[np.ndarray, "T J"]:
-    """How far the body hides each joint from a camera, 0 to 1: its image lies within a capsule that
-    is nearer.
+def _normalise(vector: Float[np.ndarray, "*T 3"]) -> Float[np.ndarray, "*T 3"]:
+    length = np.linalg.norm(vector, axis=-1, keepdims=True)
+    return vector / length.clip(min=1e-9)
+
+
+def occlusion(in_camera: Float[np.ndarray, "T J 3"], stature: float) -> Float[np.ndarray, "T J"]:
+    """Return how far the body hides each joint from a camera, 0 to 1.
+
+    A joint is hidden where its image lies within a capsule that is nearer. Joints are in the
+    camera's frame, mm.
     """
-    ends = np.array([capsule[:2] for capsule in CAPSULES])
-    radii = np.array([capsule[2] * person for capsule in CAPSULES], dtype=np.float32)
+    start = [capsule.start for capsule in CAPSULES]
+    end = [capsule.end for capsule in CAPSULES]
+    radii = np.array([capsule.radius * stature for capsule in CAPSULES], dtype=np.float32)
     x, y, depth = np.moveaxis(in_camera, -1, 0)
     depth = depth.clip(min=1.0)
     x = x / depth
     y = y / depth
-    (ax, bx), (ay, by), (near_a, near_b) = (
-        (v[:, ends[:, 0]], v[:, ends[:, 1]]) for v in (x, y, depth)
-    )
     # one by one: reductions over a last axis of two numbers would take most of the time
-    axis_x, axis_y, axis_depth = (v[:, None] for v in (bx - ax, by - ay, near_b - near_a))
-    off_x = x[..., None] - ax[:, None]
-    off_y = y[..., None] - ay[:, None]
-    along = (off_x * axis_x + off_y * axis_y) / (axis_x**2 + axis_y**2).clip(min=1e-12)
-    along = along.clip(0.0, 1.0)
-    nearest = near_a[:, None] + along * axis_depth
-    distance = np.sqrt((off_x - along * axis_x) ** 2 + (off_y - along * axis_y) ** 2) * nearest
-    inside = ((1.15 - distance / radii) * np.float32(2.5)).clip(0.0, 1.0)
-    behind = (
-        (depth[..., None] - nearest - np.float32(0.5) * radii) * np.float32(50.0 / person)
-    ).clip(0.0, 1.0)
-    own = (ends == np.arange(len(JOINTS))[:, None, None]).any(axis=-1)
-    return np.where(own, np.float32(0.0), inside * behind).max(axis=-1)
+    start_depth = depth[:, None, start]
+    axis_x = x[:, None, end] - x[:, None, start]
+    axis_y = y[:, None, end] - y[:, None, start]
+    axis_depth = depth[:, None, end] - start_depth
+    offset_x = x[..., None] - x[:, None, start]
+    offset_y = y[..., None] - y[:, None, start]
+    square_length = (axis_x**2 + axis_y**2).clip(min=1e-12)
+    position = (offset_x * axis_x + offset_y * axis_y) / square_length
+    position = position.clip(0.0, 1.0)
+    axis_point_depth = start_depth + position * axis_depth
+    apart_x = offset_x - position * axis_x
+    apart_y = offset_y - position * axis_y
+    distance = np.sqrt(apart_x**2 + apart_y**2) * axis_point_depth
+    inside = (1.15 - distance / radii) * np.float32(2.5)
+    farther = depth[..., None] - axis_point_depth - np.float32(0.5) * radii
+    behind = farther * np.float32(50.0 / stature)
+    hidden = inside.clip(0.0, 1.0) * behind.clip(0.0, 1.0)
+    joint = np.arange(len(JOINTS))[:, None]
+    own = (joint == start) | (joint == end)
+    return np.where(own, np.float32(0.0), hidden).max(axis=-1)
 
 
 def _segment_signs() -> Float[np.ndarray, "S 3"]:
-    # About y (left), x (forward), z (up): a positive turn about y leans the trunk forward and
-    # swings a hanging limb backward; a positive turn about x tips the trunk right and a hanging
+    # About y (left), x (forward), z (up): a positive rotation about y leans the trunk forward and
+    # swings a hanging limb backward; a positive rotation about x tips the trunk right and a hanging
     # limb to the left.
     signs = np.tile([-1.0, 1.0, -1.0], (len(SEGMENTS), 1))
-    for name in SEGMENTS:
-        row = signs[SEGMENT[name]]
-        if name.startswith("right"):
-            row *= [1.0, -1.0, -1.0]
-        if name.endswith("shank"):
-            row[0] = 1.0
-        if name in ("pelvis", "lumbar", "thorax", "neck"):
-            row[:] = [1.0, -1.0, 1.0]
+    for segment in (RIGHT.clavicle, RIGHT.upper_arm, RIGHT.forearm, RIGHT.thigh, RIGHT.shank):
+        signs[segment] *= [1.0, -1.0, -1.0]
+    for segment in (RIGHT.shank, LEFT.shank):
+        signs[segment, 0] = 1.0
+    for segment in (Segment.PELVIS, Segment.LUMBAR, Segment.THORAX, Segment.NECK):
+        signs[segment] = [1.0, -1.0, 1.0]
     return signs
 
 

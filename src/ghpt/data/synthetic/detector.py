@@ -1,10 +1,9 @@
-"""A model of a 2D key-point detector: what it would have seen of a moving 3D body through real
-lenses.
+"""A model of a 2D key-point detector: what it would detect of a moving body through real lenses.
 
 Every error persists over time and knows the body: joints are defined a little differently than in
-the truth, pixel noise grows with the person in the image, what the body hides is found worse, sides
-are exchanged, and key points jump away or are missed for a while. All lengths are fractions of the
-person's stature.
+the truth, pixel noise grows with the person in the image, what the body hides is found worse, left
+and right are exchanged, and key points jump away or are missed for a while. All lengths are
+fractions of the person's stature.
 """
 
 from __future__ import annotations
@@ -19,24 +18,31 @@ from scipy.special import expit, ndtr
 from torch import Tensor
 
 from ghpt.data.synthetic.body import occlusion, stature, trunk_frame
-from ghpt.data.synthetic.random_processes import generator, process
+from ghpt.data.synthetic.random_processes import gaussian_process, generator
 from ghpt.geometry import lens
 from ghpt.geometry.cameras import CameraSet
 from ghpt.skeleton import BONES, JOINT, JOINTS, MIRROR, PELVIS
 
-SWAPS = tuple(
-    tuple((JOINT[f"right_{part}"], JOINT[f"left_{part}"]) for part in parts)
-    for parts in (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist"))
-)
-"""The pairs of joints that are exchanged together: legs, arms."""
 
-_ON = {a: b for a, b in BONES if JOINTS[a].split("_")[-1] in ("ankle", "knee", "hip")}
-_ON |= {b: a for a, b in BONES if JOINTS[b].split("_")[-1] in ("elbow", "wrist", "shoulder")}
-_LIMBS = list(_ON), list(_ON.values())
-"""Limb joints, and the joint that each hangs on."""
+def _pairs(*names: str) -> tuple[tuple[int, int], ...]:
+    return tuple((JOINT[f"right_{name}"], JOINT[f"left_{name}"]) for name in names)
+
+
+FLIPPED_TOGETHER = (_pairs("hip", "knee", "ankle"), _pairs("shoulder", "elbow", "wrist"))
+"""The pairs of joints whose left and right are exchanged together: legs, arms."""
 
 KINDS = tuple(name.removeprefix("right_").removeprefix("left_") for name in JOINTS)
 """The joints without their sides."""
+
+
+def _limb_joints() -> tuple[list[int], list[int]]:
+    """Return the joints of arms and legs, and the joint that each hangs on."""
+    parent = {a: b for a, b in BONES if KINDS[a] in ("ankle", "knee", "hip")}
+    parent |= {b: a for a, b in BONES if KINDS[b] in ("elbow", "wrist", "shoulder")}
+    return list(parent), list(parent.values())
+
+
+_LIMB_JOINTS, _LIMB_PARENTS = _limb_joints()
 
 
 @dataclass(frozen=True)
@@ -44,9 +50,18 @@ class SimulatedDetections:
     """What one detector says about T frames in V views."""
 
     key_points: Float[np.ndarray, "T V J 2"]
-    """Undistorted pixels, float32; 0 where not seen."""
+    """Undistorted pixels, float32; 0 where not valid."""
     confidence: Float[np.ndarray, "T V J"]
     valid: Bool[np.ndarray, "T V J"]
+
+
+@dataclass(frozen=True)
+class ViewDetections:
+    """The same of one view."""
+
+    key_points: Float[np.ndarray, "T J 2"]
+    confidence: Float[np.ndarray, "T J"]
+    valid: Bool[np.ndarray, "T J"]
 
 
 @dataclass(frozen=True)
@@ -60,9 +75,41 @@ class Processes:
     miss: Float[np.ndarray, "T J"]
     confidence: Float[np.ndarray, "T J"]
 
-    def every(self, stride: int) -> Processes:
-        """The same processes at every ``stride``-th frame."""
-        return Processes(**{name: value[::stride] for name, value in vars(self).items()})
+    def subsample(self, stride: int) -> Processes:
+        """Return the same processes at every ``stride``-th frame."""
+        sampled = {name: value[::stride] for name, value in vars(self).items()}
+        return Processes(**sampled)
+
+
+@dataclass(frozen=True)
+class BodyError:
+    """What all views share of a take's errors, before it is scaled."""
+
+    bias: Float[np.ndarray, "J 4"]
+    """Difference between the detector's and the truth's definition of each joint: along the limb,
+    and forward, left and up in the trunk's frame.
+    """
+    drift: Float[np.ndarray, "T J 3"]
+    """Slow error in the world's frame."""
+
+
+@dataclass(frozen=True)
+class _Projection:
+    """One camera's image of a take, before the detector errs."""
+
+    in_camera: Float[np.ndarray, "T J 3"]
+    """True joints in the camera's frame, mm."""
+    stature: float
+    """mm."""
+    stature_pixels: Float[np.ndarray, "T 1"]
+    """The person's stature in the image."""
+    hidden: Float[np.ndarray, "T J"]
+    """How far the body hides each joint, 0 to 1."""
+    ideal: Float[np.ndarray, "T J 2"]
+    """Pixels of the joints by the detector's definition in a pinhole camera."""
+    raw: Float[np.ndarray, "T J 2"]
+    """The same through the lens."""
+    in_front: Bool[np.ndarray, "T J"]
 
 
 @dataclass(frozen=True)
@@ -130,109 +177,128 @@ class Detector:
         the other views. Joints whose truth is unknown must hold finite numbers; mask them
         afterwards.
         """
-        shown = self.shown(
-            points, self.body_error(len(points), rate_hz, seed, subject, take), familiar
-        )
+        frames = len(points)
+        body_error = self.draw_body_error(frames, rate_hz, seed, subject, take)
+        apparent = self.displace_joints(points, body_error, familiar)
         views = []
         for view, name in enumerate(rig.names):
-            processes = self.processes(len(points), rate_hz, generator(seed, "camera", take, name))
-            views.append(self.view(points, shown, rig, view, processes, familiar))
-        return SimulatedDetections(*(np.stack(field, axis=1) for field in zip(*views, strict=True)))
-
-    def body_error(
-        self, frames: int, rate_hz: float, seed: int, subject: str, take: str
-    ) -> tuple[Float[np.ndarray, "J 4"], Float[np.ndarray, "T J 3"]]:
-        """Unit joint-definition bias (along the limb, and in the trunk's frame) and unit drift."""
-        bias = _symmetric(
-            generator(self.bias_seed, "joint definition").normal(size=(len(JOINTS), 4))
-        )
-        own = generator(seed, "subject", subject).normal(size=(len(JOINTS), 4))
-        bias = np.sqrt(1.0 - self.bias_of_subject) * bias + np.sqrt(self.bias_of_subject) * own
-        drift = process(
-            generator(seed, "drift", take), (len(JOINTS), 3), frames, self.drift_seconds * rate_hz
-        )
-        return bias / 2.0, drift / np.sqrt(3.0)
-
-    def processes(self, frames: int, rate_hz: float, rng: np.random.Generator) -> Processes:
-        """Draw what one camera's errors of a take are made of."""
-        joints = len(JOINTS)
-        white = rng.standard_normal((frames, joints, 2), dtype=np.float32)
-        quick = process(rng, (joints, 2), frames, self.noise_seconds * rate_hz)
-        slow = process(rng, (joints, 2), frames, self.noise_slow_seconds * rate_hz)
-        shares = np.array(
-            [self.noise_white, 1.0 - self.noise_white - self.noise_slow, self.noise_slow]
-        )
-        shares = np.sqrt(shares).astype(np.float32)
-        return Processes(
-            noise=shares[0] * white + shares[1] * quick + shares[2] * slow,
-            outlier=process(rng, (joints,), frames, self.outlier_seconds * rate_hz),
-            direction=process(rng, (joints, 2), frames, self.outlier_seconds * rate_hz),
-            flip=process(rng, (len(SWAPS),), frames, self.swap_seconds * rate_hz),
-            miss=process(rng, (joints,), frames, self.miss_seconds * rate_hz),
-            confidence=process(rng, (joints,), frames, self.noise_seconds * rate_hz),
+            camera_rng = generator(seed, "camera", take, name)
+            processes = self.draw_processes(frames, rate_hz, camera_rng)
+            views.append(self.detect_view(points, apparent, rig, view, processes, familiar))
+        return SimulatedDetections(
+            key_points=np.stack([view.key_points for view in views], axis=1),
+            confidence=np.stack([view.confidence for view in views], axis=1),
+            valid=np.stack([view.valid for view in views], axis=1),
         )
 
-    def shown(
+    def draw_body_error(
+        self,
+        frames: int,
+        rate_hz: float,
+        seed: int,
+        subject: str,
+        take: str,
+    ) -> BodyError:
+        """Draw the bias of the joints' definition and the drift of a take, both of unit size."""
+        shape = (len(JOINTS), 4)
+        common = _mirror_sides(generator(self.bias_seed, "joint definition").normal(size=shape))
+        own = generator(seed, "subject", subject).normal(size=shape)
+        common_share = np.sqrt(1.0 - self.bias_of_subject)
+        own_share = np.sqrt(self.bias_of_subject)
+        bias = common_share * common + own_share * own
+        drift_rng = generator(seed, "drift", take)
+        persistence = self.drift_seconds * rate_hz
+        drift = gaussian_process(drift_rng, (len(JOINTS), 3), frames, persistence)
+        return BodyError(bias / 2.0, drift / np.sqrt(3.0))
+
+    def displace_joints(
         self,
         points: Float[np.ndarray, "T J 3"],
-        body_error: tuple[Float[np.ndarray, "J 4"], Float[np.ndarray, "T J 3"]],
+        error: BodyError,
         familiar: bool,
     ) -> Float[np.ndarray, "T J 3"]:
-        """Where the joints are by the detector's definition, the same for all views."""
-        bias, drift = body_error
+        """Return where the joints are by the detector's definition, the same for all views."""
         trunk = trunk_frame(points)
-        vector = bias[:, 1:] @ trunk.mT
-        limb = points[:, _LIMBS[0]] - points[:, _LIMBS[1]]
+        offset = error.bias[:, 1:] @ trunk.mT
+        limb = points[:, _LIMB_JOINTS] - points[:, _LIMB_PARENTS]
         limb /= np.linalg.norm(limb, axis=-1, keepdims=True).clip(min=1e-9)
-        vector[:, _LIMBS[0]] += bias[_LIMBS[0], :1] * limb
-        scale = stature(points) * (self.familiar if familiar else 1.0)
-        return points + scale * (self.bias * vector + self.drift * drift)
+        offset[:, _LIMB_JOINTS] += error.bias[_LIMB_JOINTS, :1] * limb
+        scale = stature(points) * self._familiarity(familiar)
+        return points + scale * (self.bias * offset + self.drift * error.drift)
 
-    def view(
+    def _familiarity(self, familiar: bool) -> float:
+        return self.familiar if familiar else 1.0
+
+    def draw_processes(
+        self,
+        frames: int,
+        rate_hz: float,
+        rng: np.random.Generator,
+    ) -> Processes:
+        """Draw what one camera's errors of a take are made of."""
+        joints = len(JOINTS)
+
+        def draw(shape: tuple[int, ...], seconds: float) -> Float[np.ndarray, "T ..."]:
+            return gaussian_process(rng, shape, frames, seconds * rate_hz)
+
+        white = rng.standard_normal((frames, joints, 2), dtype=np.float32)
+        quick = draw((joints, 2), self.noise_seconds)
+        slow = draw((joints, 2), self.noise_slow_seconds)
+        quick_share = 1.0 - self.noise_white - self.noise_slow
+        variances = np.array([self.noise_white, quick_share, self.noise_slow])
+        deviations = np.sqrt(variances).astype(np.float32)
+        return Processes(
+            noise=deviations[0] * white + deviations[1] * quick + deviations[2] * slow,
+            outlier=draw((joints,), self.outlier_seconds),
+            direction=draw((joints, 2), self.outlier_seconds),
+            flip=draw((len(FLIPPED_TOGETHER),), self.swap_seconds),
+            miss=draw((joints,), self.miss_seconds),
+            confidence=draw((joints,), self.noise_seconds),
+        )
+
+    def detect_view(
         self,
         points: Float[np.ndarray, "T J 3"],
-        shown: Float[np.ndarray, "T J 3"],
+        apparent: Float[np.ndarray, "T J 3"],
         rig: CameraSet,
         view: int,
         processes: Processes,
         familiar: bool,
-    ) -> tuple[Float[np.ndarray, "T J 2"], Float[np.ndarray, "T J"], Bool[np.ndarray, "T J"]]:
-        """Key points (undistorted), confidence and seen of one camera."""
-        K, R, t = (x[view].numpy() for x in (rig.cameras.K, rig.cameras.R, rig.cameras.t))
-        in_camera = (points @ R.T + t).astype(np.float32)
-        person = stature(points)
-        hidden = occlusion(in_camera, person)
-        depth = in_camera[:, PELVIS, 2].clip(min=1.0)
-        pixels = (np.sqrt(K[0, 0] * K[1, 1]) * person / depth)[
-            :, None
-        ]  # the person's size in the image
+    ) -> ViewDetections:
+        """Detect the key points of one camera; ``apparent`` is of ``displace_joints``."""
+        projection = _project(points, apparent, rig, view)
+        K = rig.K[view]
+        distortion = rig.distortion[view]
+        raw = projection.raw
+        error = self._familiarity(familiar) * self._error(projection.hidden, processes)
+        flipped = self._flip(projection, processes)
+        found = flipped + projection.stature_pixels[..., None] * error
 
-        target = shown @ R.T + t
-        in_front = target[..., 2] > 0.05 * person
-        safe = np.where(in_front[..., None], target, [0.0, 0.0, 1.0])
-        ideal = torch.from_numpy((safe @ K.T)[..., :2] / safe[..., 2:])
-        raw = _distort(ideal, rig.cameras.K[view], rig.distortion[view]).numpy()
+        missing_rate = _rate(self.miss_rate, self.miss_rate_occluded, projection.hidden)
+        found_at_all = ndtr(processes.miss) > missing_rate
+        before_camera = projection.in_front & (projection.in_camera[..., 2] > 0.0)
+        inside = _inside_image(found, rig.image_size[view].numpy())
+        key_points, undistorted = _undistort(found, raw, projection.ideal, K, distortion)
+        valid = inside & before_camera & found_at_all & undistorted
+        size = np.linalg.norm(found - raw, axis=-1) / projection.stature_pixels
+        confidence = self._confidence(size, processes)
+        return ViewDetections(
+            key_points=np.where(valid[..., None], key_points, 0.0).astype(np.float32),
+            confidence=np.where(valid, confidence, 0.0).astype(np.float32),
+            valid=valid,
+        )
 
-        scale = self.familiar if familiar else 1.0
+    def _error(
+        self,
+        hidden: Float[np.ndarray, "T J"],
+        processes: Processes,
+    ) -> Float[np.ndarray, "T J 2"]:
+        """Return noise and outliers in statures."""
         relative = np.array([self.joints[kind] for kind in KINDS])
-        spread = self.noise * (1.0 + (self.occluded_noise - 1.0) * hidden) * relative
-        error = scale * (
-            spread[..., None] * processes.noise + self._outliers(hidden, relative, processes)
-        )
-        flipped = self._swap(raw, in_camera, person, processes)
-        found = flipped + pixels[..., None] * error
-
-        size = np.linalg.norm(found - raw, axis=-1) / pixels
-        missing = _rate(self.miss_rate, self.miss_rate_occluded, hidden)
-        inside = ((found >= -0.5) & (found <= rig.size[view].numpy() - 0.5)).all(axis=-1)
-        valid = inside & in_front & (in_camera[..., 2] > 0.0) & (ndtr(processes.miss) > missing)
-        key_points, undone = _undistort(
-            found, raw, ideal.numpy(), rig.cameras.K[view], rig.distortion[view]
-        )
-        valid &= undone
-        key_points = np.where(valid[..., None], key_points, 0.0).astype(np.float32)
-        confidence = np.where(valid, self._confidence(size, processes), 0.0).astype(np.float32)
-        return key_points, confidence, valid
+        occluded = 1.0 + (self.occluded_noise - 1.0) * hidden
+        deviation = self.noise * occluded * relative
+        noise = deviation[..., None] * processes.noise
+        return noise + self._outliers(hidden, relative, processes)
 
     def _outliers(
         self,
@@ -240,71 +306,112 @@ class Detector:
         relative: Float[np.ndarray, " J"],
         processes: Processes,
     ) -> Float[np.ndarray, "T J 2"]:
-        """Offsets of exponential length, while the process is above the quantile that the rate
-        leaves; continuous in time, because the length is a function of how far it is above.
+        """Return offsets while the process exceeds the quantile that the rate leaves.
+
+        Their length is exponential, and continuous in time because it is a function of the excess.
         """
-        rate = (relative * _rate(self.outlier_rate, self.outlier_rate_occluded, hidden)).clip(
-            1e-6, 0.9
-        )
-        above = (ndtr(processes.outlier) - (1.0 - rate)) / rate
-        length = -self.outlier_size * np.log1p(-above.clip(0.0, 1.0 - 1e-4))
-        direction = processes.direction / np.linalg.norm(
-            processes.direction, axis=-1, keepdims=True
-        ).clip(min=1e-6)
+        rate = relative * _rate(self.outlier_rate, self.outlier_rate_occluded, hidden)
+        rate = rate.clip(1e-6, 0.9)
+        excess = (ndtr(processes.outlier) - (1.0 - rate)) / rate
+        length = -self.outlier_size * np.log1p(-excess.clip(0.0, 1.0 - 1e-4))
+        norm = np.linalg.norm(processes.direction, axis=-1, keepdims=True)
+        direction = processes.direction / norm.clip(min=1e-6)
         return length[..., None] * direction
 
-    def _swap(
-        self,
-        raw: Float[np.ndarray, "T J 2"],
-        in_camera: Float[np.ndarray, "T J 3"],
-        person: float,
-        processes: Processes,
-    ) -> Float[np.ndarray, "T J 2"]:
+    def _flip(self, projection: _Projection, processes: Processes) -> Float[np.ndarray, "T J 2"]:
         """Exchange left and right of legs or arms: likelier from the side and from behind."""
-        raw = raw.copy()
-        for group, pairs in enumerate(SWAPS):
+        pixels = projection.raw.copy()
+        in_camera = projection.in_camera
+        for group, pairs in enumerate(FLIPPED_TOGETHER):
             right, left = pairs[0]
             across = in_camera[:, left] - in_camera[:, right]
-            facing = across[:, 0] / np.linalg.norm(across, axis=-1).clip(
-                min=1e-9
-            )  # 1: to the camera, -1: away
-            rate = self.swap_rate * (
-                0.2 + 2.0 * np.exp(-((facing / 0.35) ** 2)) + 0.6 * (facing < 0)
-            )
+            width = np.linalg.norm(across, axis=-1)
+            facing = across[:, 0] / width.clip(min=1e-9)  # 1: to the camera, -1: away
+            from_side = np.exp(-((facing / 0.35) ** 2))
+            rate = self.swap_rate * (0.2 + 2.0 * from_side + 0.6 * (facing < 0))
             now = ndtr(processes.flip[:, group]) > 1.0 - rate
             for a, b in pairs:
-                raw[now, a], raw[now, b] = raw[now, b], raw[now, a]
-        return raw
+                pixels[now, a], pixels[now, b] = pixels[now, b], pixels[now, a]
+        return pixels
 
     def _confidence(
-        self, size: Float[np.ndarray, "T J"], processes: Processes
+        self,
+        size: Float[np.ndarray, "T J"],
+        processes: Processes,
     ) -> Float[np.ndarray, "T J"]:
-        known = np.log(size.clip(min=0.01 * self.noise) / (1.25 * self.noise))
-        # 0.8: the spread of the logarithm of an error's size, which chance must be compared with
-        by_chance = 0.8 * np.sqrt(1.0 / self.confidence_knowledge**2 - 1.0) * processes.confidence
-        return expit(self.confidence_typical - self.confidence_slope * (known + by_chance))
+        """Return the confidence of an error of this size, in statures."""
+        log_size = np.log(size.clip(min=0.01 * self.noise) / (1.25 * self.noise))
+        # 0.8: the deviation of the logarithm of an error's size, which chance is compared with
+        chance = 0.8 * np.sqrt(1.0 / self.confidence_knowledge**2 - 1.0) * processes.confidence
+        return expit(self.confidence_typical - self.confidence_slope * (log_size + chance))
 
 
-def _symmetric(bias: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:
-    """The left side's values mirrored to the right; nothing sideways on the midline."""
-    mirrored = bias[list(MIRROR)] * [1.0, 1.0, -1.0, 1.0]
-    right = np.array([name.startswith("right") for name in JOINTS])[:, None]
-    middle = np.array(MIRROR) == np.arange(len(JOINTS))
-    bias = np.where(right, mirrored, bias)
-    bias[middle, 2] = 0.0
-    return bias
+def _project(
+    points: Float[np.ndarray, "T J 3"],
+    apparent: Float[np.ndarray, "T J 3"],
+    rig: CameraSet,
+    view: int,
+) -> _Projection:
+    """Project the true and the apparent joints of a take (world, mm) into one camera."""
+    cameras = rig.cameras
+    K = cameras.K[view].numpy()
+    R = cameras.R[view].numpy()
+    t = cameras.t[view].numpy()
+    in_camera = (points @ R.T + t).astype(np.float32)
+    person = stature(points)
+    depth = in_camera[:, PELVIS, 2].clip(min=1.0)
+    stature_pixels = np.sqrt(K[0, 0] * K[1, 1]) * person / depth
+    target = apparent @ R.T + t
+    in_front = target[..., 2] > 0.05 * person
+    safe = np.where(in_front[..., None], target, [0.0, 0.0, 1.0])
+    homogeneous = safe @ K.T
+    ideal = homogeneous[..., :2] / safe[..., 2:]
+    raw = _distort(torch.from_numpy(ideal), rig.K[view], rig.distortion[view])
+    return _Projection(
+        in_camera=in_camera,
+        stature=person,
+        stature_pixels=stature_pixels[:, None],
+        hidden=occlusion(in_camera, person),
+        ideal=ideal,
+        raw=raw.numpy(),
+        in_front=in_front,
+    )
+
+
+def _inside_image(
+    pixels: Float[np.ndarray, "T J 2"],
+    size: np.ndarray,
+) -> Bool[np.ndarray, "T J"]:
+    inside = (pixels >= -0.5) & (pixels <= size - 0.5)
+    return inside.all(axis=-1)
+
+
+def _mirror_sides(bias: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:
+    """Mirror the left side's values to the right; nothing is sideways on the midline."""
+    mirror = np.array(MIRROR)
+    mirrored = bias[mirror] * [1.0, 1.0, -1.0, 1.0]
+    right = np.array([name.startswith("right") for name in JOINTS])
+    symmetric = np.where(right[:, None], mirrored, bias)
+    midline = mirror == np.arange(len(JOINTS))
+    symmetric[midline, 2] = 0.0
+    return symmetric
 
 
 def _rate(
-    visible: float, occluded: float, hidden: Float[np.ndarray, "T J"]
+    visible: float,
+    occluded: float,
+    hidden: Float[np.ndarray, "T J"],
 ) -> Float[np.ndarray, "T J"]:
     return visible + (occluded - visible) * hidden
 
 
 def _distort(
-    pixels: Float[Tensor, "T J 2"], K: Float[Tensor, "3 3"], coefficients: Float[Tensor, " C"]
+    pixels: Float[Tensor, "T J 2"],
+    K: Float[Tensor, "3 3"],
+    coefficients: Float[Tensor, " C"],
 ) -> Float[Tensor, "T J 2"]:
-    return lens.distort(pixels.flatten(0, 1), K, coefficients).unflatten(0, pixels.shape[:2])
+    distorted = lens.distort(pixels.flatten(0, 1), K, coefficients)
+    return distorted.unflatten(0, pixels.shape[:2])
 
 
 def _undistort(
@@ -314,9 +421,10 @@ def _undistort(
     K: Float[Tensor, "3 3"],
     coefficients: Float[Tensor, " C"],
 ) -> tuple[Float[np.ndarray, "T J 2"], Bool[np.ndarray, "T J"]]:
-    """Ideal pixels of found ones, and whether that worked: fixed-point steps from the truth
-    (``raw`` through the lens, ``ideal`` without), which is close, take a tenth of the time of the
-    general ``lens.undistort``.
+    """Return the ideal pixels of found ones, and whether there are such.
+
+    Fixed-point steps from the truth (``raw`` through the lens, ``ideal`` without), which is close,
+    take a tenth of the time of the general ``lens.undistort``.
     """
     target = torch.from_numpy(found)
     point = torch.from_numpy(ideal)
@@ -324,4 +432,5 @@ def _undistort(
     for _ in range(4):
         point = point + error
         error = target - _distort(point, K, coefficients)
-    return (point + error).numpy(), (error.abs() < 0.1).all(dim=-1).numpy()
+    converged = (error.abs() < 0.1).all(dim=-1)
+    return (point + error).numpy(), converged.numpy()

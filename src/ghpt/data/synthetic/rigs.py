@@ -1,12 +1,11 @@
-"""The real camera rigs whose numbers the package carries, and the paper's five arrangements of
-them.
-"""
+"""The real camera rigs that the package carries, and the paper's five arrangements of them."""
 
 from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from typing import Any
@@ -29,68 +28,87 @@ of name.
 """
 
 
+@dataclass(frozen=True)
+class _Camera:
+    """One camera as the package's JSON files have it, in the file's unit of length."""
+
+    K: list[list[int | float]]
+    distortion: list[int | float]
+    size: list[int]
+    R: list[list[int | float]]
+    t: list[int | float]
+
+
 def human36m_rig(subject: str) -> CameraSet:
-    """Human3.6M's four cameras as they stood for a subject, ``S1`` to ``S11``; mm, world z up."""
-    table = _load("human36m_cameras.json")
-    names = tuple(table["intrinsics"])
-    if f"{subject}/{names[0]}" not in table["extrinsics"]:
-        known = sorted(
-            {key.split("/")[0] for key in table["extrinsics"]}, key=lambda name: int(name[1:])
-        )
-        raise GhptDataError(
-            "Human3.6M", "subject", f"no subject {subject!r}", f"There are {', '.join(known)}."
-        )
-    return _rig(
-        names,
-        [table["intrinsics"][name] | table["extrinsics"][f"{subject}/{name}"] for name in names],
-        mm_per_unit=1.0,
-    )
+    """Return Human3.6M's four cameras as they stood for a subject, ``S1`` to ``S11``.
+
+    They are in mm, world z up. Raises GhptDataError for an unknown subject.
+    """
+    cameras = _human36m_cameras()
+    if subject not in cameras:
+        known = sorted(cameras, key=lambda name: int(name.removeprefix("S")))
+        problem = f"no subject {subject!r}"
+        raise GhptDataError("Human3.6M", "subject", problem, f"There are {', '.join(known)}.")
+    return _rig(cameras[subject], mm_per_unit=1.0)
 
 
 def panoptic_rig(numbers: Sequence[int]) -> CameraSet:
-    """HD cameras of CMU Panoptic Studio by number (sequence 160906_band1); mm, world y down.
+    """Return HD cameras of CMU Panoptic Studio by number (sequence 160906_band1).
 
-    Raises GhptDataError for an unknown number, a camera listed twice, or fewer than two cameras.
+    They are in mm, world y down. Raises GhptDataError for an unknown number, a camera listed twice,
+    or fewer than two cameras.
     """
-    table = _load("panoptic_hd_cameras.json")["cameras"]
-    unknown = [number for number in numbers if str(number) not in table]
+    cameras = _panoptic_cameras()
+    unknown = [number for number in numbers if number not in cameras]
     if unknown:
-        raise GhptDataError(
-            "Panoptic",
-            "cameras",
-            f"no HD camera {unknown[0]}",
-            f"HD cameras are 0 to {len(table) - 1}.",
-        )
-    twice = [number for number, count in Counter(numbers).items() if count > 1]
-    if twice:
-        raise GhptDataError(
-            "Panoptic", "cameras", f"camera {twice[0]} is listed twice", "List each camera once."
-        )
+        hint = f"HD cameras are 0 to {len(cameras) - 1}."
+        raise GhptDataError("Panoptic", "cameras", f"no HD camera {unknown[0]}", hint)
+    repeated = [number for number, count in Counter(numbers).items() if count > 1]
+    if repeated:
+        problem = f"camera {repeated[0]} is listed twice"
+        raise GhptDataError("Panoptic", "cameras", problem, "List each camera once.")
     if len(numbers) < 2:
-        raise GhptDataError(
-            "Panoptic",
-            "cameras",
-            f"{len(numbers)} listed: {list(numbers)}",
-            "Triangulation needs at least two.",
-        )
-    return _rig(
-        tuple(f"00_{number:02d}" for number in numbers),
-        [table[str(n)] for n in numbers],
-        mm_per_unit=10.0,
-    )
+        problem = f"{len(numbers)} listed: {list(numbers)}"
+        raise GhptDataError("Panoptic", "cameras", problem, "Triangulation needs at least two.")
+    return _rig({f"00_{number:02d}": cameras[number] for number in numbers}, mm_per_unit=10.0)
 
 
 @cache
+def _human36m_cameras() -> dict[str, dict[str, _Camera]]:
+    """Return the cameras by subject and name."""
+    table = _load("human36m_cameras.json")
+    intrinsics: dict[str, dict[str, Any]] = table["intrinsics"]
+    extrinsics: dict[str, dict[str, Any]] = table["extrinsics"]
+    cameras: dict[str, dict[str, _Camera]] = {}
+    for key, pose in extrinsics.items():
+        subject, name = key.split("/")
+        cameras.setdefault(subject, {})[name] = _Camera(**intrinsics[name], **pose)
+    # in the order of the intrinsics, which is that of the names
+    return {subject: {n: views[n] for n in intrinsics} for subject, views in cameras.items()}
+
+
+@cache
+def _panoptic_cameras() -> dict[int, _Camera]:
+    """Return the HD cameras by number."""
+    table = _load("panoptic_hd_cameras.json")
+    entries: dict[str, dict[str, Any]] = table["cameras"]
+    return {int(number): _Camera(**entry) for number, entry in entries.items()}
+
+
 def _load(name: str) -> dict[str, Any]:
-    return json.loads(
-        resources.files("ghpt.data.synthetic").joinpath(name).read_text(encoding="utf-8")
-    )
+    file = resources.files("ghpt.data.synthetic") / name
+    return json.loads(file.read_text(encoding="utf-8"))
 
 
-def _rig(names: tuple[str, ...], entries: list[dict[str, Any]], mm_per_unit: float) -> CameraSet:
-    def stack(field: str) -> Tensor:
-        return torch.tensor([entry[field] for entry in entries], dtype=torch.float64)
+def _rig(views: Mapping[str, _Camera], mm_per_unit: float) -> CameraSet:
+    K = _stack([view.K for view in views.values()])
+    R = _stack([view.R for view in views.values()])
+    t = _stack([view.t for view in views.values()])
+    distortion = _stack([view.distortion for view in views.values()])
+    size = torch.tensor([view.size for view in views.values()])
+    cameras = Cameras(K, R, t * mm_per_unit)
+    return CameraSet.from_cameras(tuple(views), cameras, distortion, size)
 
-    cameras = Cameras(stack("K"), stack("R"), stack("t") * mm_per_unit)
-    size = stack("size").to(torch.int64)
-    return CameraSet.from_cameras(names, cameras, stack("distortion"), size)
+
+def _stack(numbers: Sequence[Sequence[Any]]) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64)

@@ -6,14 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
+from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation, triangulate
-from ghpt.models.estimators.classical import Estimator, Linear, everywhere, otherwise, person_scale
+from ghpt.models.estimators.classical import (
+    Estimator,
+    Linear,
+    fall_back,
+    fill_frames,
+    person_scale,
+)
 from ghpt.observations import Observations
 
 
@@ -21,7 +28,7 @@ from ghpt.observations import Observations
 class LoRansac(Estimator):
     """pycolmap's LO-RANSAC over views for each joint, and its inliers triangulated together.
 
-    ``threshold``: an inlier's largest reprojection error, as a fraction of the person's size in
+    ``threshold``: an inlier's largest reprojection error, as a fraction of the person's scale in
     that view. ``seed`` fixes its draws. Runs on the CPU, joint by joint.
     """
 
@@ -34,50 +41,61 @@ class LoRansac(Estimator):
     def inlier_threshold(
         self, batch: Observations, points: Float[Tensor, "B J 3"]
     ) -> Float[Tensor, " B"]:
-        return everywhere(self.threshold, batch)
+        return fill_frames(self.threshold, batch)
 
     def triangulate(self, batch: Observations) -> Triangulation:
-        usable = batch.valid & valid_key_points(batch.cameras, batch.key_points)
-        size = person_scale(batch.key_points, usable).double()
-        usable &= (size > 0)[..., None]
-        # in units of the person's size one threshold holds for all views
-        K = batch.cameras.K.double() / torch.where(size > 0, size, 1.0)[..., None, None]
-        rays = (batch.key_points.double() / size.clamp(min=1e-12)[..., None, None]).cpu().numpy()
-        inliers = torch.zeros_like(batch.valid, device="cpu")
+        valid = batch.valid & valid_key_points(batch.cameras, batch.key_points)
+        scale = person_scale(batch.key_points, valid).double()
+        valid &= (scale > 0)[..., None]
+        # in units of the person's scale one threshold holds for all views
+        K = batch.cameras.K.double() / torch.where(scale > 0, scale, 1.0)[..., None, None]
+        key_points = batch.key_points.double() / scale.clamp(min=1e-12)[..., None, None]
+        rig = Cameras(K, batch.cameras.R, batch.cameras.t).to("cpu", torch.float64)
+        inliers = self._find_inliers(rig, key_points.cpu().numpy(), valid.cpu().numpy())
+        weights = inliers.to(batch.key_points)
+        robust = triangulate(batch.cameras, batch.key_points, weights)
+        return fall_back(robust, Linear().triangulate(batch))
+
+    def _find_inliers(
+        self,
+        cameras: Cameras,
+        key_points: Float[np.ndarray, "B V J 2"],
+        valid: Bool[np.ndarray, "B V J"],
+    ) -> Bool[Tensor, "B V J"]:
         options = pycolmap.EstimateTriangulationOptions()
         options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
         options.ransac.max_error = self.threshold
         options.ransac.random_seed = self.seed
-        rig = [x.double().cpu().numpy() for x in (K, batch.cameras.R, batch.cameras.t)]
-        mask = usable.cpu().numpy()
-        for frame in range(len(batch)):
-            cameras, poses = pycolmap_cameras(*(x[frame] for x in rig), mask[frame].any(-1))
-            for joint in range(mask.shape[-1]):
-                views = np.flatnonzero(mask[frame, :, joint])
+        inliers = torch.zeros(valid.shape, dtype=torch.bool)
+        for frame in range(len(valid)):
+            intrinsics, poses = pycolmap_cameras(cameras.index(frame), valid[frame].any(-1))
+            for joint in range(valid.shape[-1]):
+                views = np.flatnonzero(valid[frame, :, joint]).tolist()
                 if len(views) < 2:
                     continue
                 found = pycolmap.estimate_triangulation(
-                    rays[frame, views, joint],
-                    [poses[v] for v in views],
-                    [cameras[v] for v in views],
+                    key_points[frame, views, joint],
+                    [poses[view] for view in views],
+                    [intrinsics[view] for view in views],
                     options,
                 )
                 if found is not None:
-                    inliers[frame, views[np.asarray(found["inliers"], dtype=bool)], joint] = True
-        weights = inliers.to(batch.key_points)
-        return otherwise(
-            triangulate(batch.cameras, batch.key_points, weights), Linear().triangulate(batch)
-        )
+                    mask = np.asarray(found["inliers"], dtype=bool)
+                    inliers[frame, np.array(views)[mask], joint] = True
+        return inliers
 
 
 def pycolmap_cameras(
-    K: np.ndarray, R: np.ndarray, t: np.ndarray, valid: np.ndarray
+    cameras: Cameras, valid: Bool[np.ndarray, " V"]
 ) -> tuple[dict[int, pycolmap.Camera], dict[int, pycolmap.Rigid3d]]:
-    """The valid cameras by view: pycolmap refuses others."""
-    cameras = {}
+    """Return the intrinsics and poses of the valid cameras by view: pycolmap refuses others."""
+    K = cameras.K.numpy()
+    intrinsics = {}
     poses = {}
-    for v in np.flatnonzero(valid).tolist():
-        pinhole = [K[v, 0, 0], K[v, 1, 1], K[v, 0, 2], K[v, 1, 2]]
-        cameras[v] = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=pinhole)
-        poses[v] = pycolmap.Rigid3d(pycolmap.Rotation3d(R[v]), t[v])
-    return cameras, poses
+    for view in np.flatnonzero(valid).tolist():
+        pinhole = [K[view, 0, 0], K[view, 1, 1], K[view, 0, 2], K[view, 1, 2]]
+        camera = pycolmap.Camera(model="PINHOLE", width=1, height=1, params=pinhole)
+        rotation = pycolmap.Rotation3d(cameras.R[view].numpy())
+        intrinsics[view] = camera
+        poses[view] = pycolmap.Rigid3d(rotation, cameras.t[view].numpy())
+    return intrinsics, poses

@@ -1,4 +1,4 @@
-"""Which joints nothing explains: fewer than two of the views see them where they were put."""
+"""Joints that nothing explains: fewer than two of the views see them where they were put."""
 
 from __future__ import annotations
 
@@ -38,45 +38,62 @@ class Rejection:
         check_positive(limit=self.limit)
 
     def fitted(
-        self, batch: Observations, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
+        self,
+        batch: Observations,
+        points: Float[Tensor, "B J 3"],
+        has_position: Bool[Tensor, "B J"],
     ) -> Rejection:
-        """The same with the extent of the person in these frames."""
-        return replace(self, extent=float(self._extent(batch, points, placed)))
+        """Return the same rule with the extent of the person in these frames."""
+        distance = _ray_distance(batch, points, has_position)
+        return replace(self, extent=float(_person_extent(batch, distance)))
 
     @torch.no_grad()
     def explained(
-        self, batch: Observations, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
+        self,
+        batch: Observations,
+        points: Float[Tensor, "B J 3"],
+        has_position: Bool[Tensor, "B J"],
     ) -> Bool[Tensor, "B J"]:
-        """Which of the ``placed`` joints two views explain; all of them where the person's extent
-        is not known.
+        """Return which of the joints with a position two views explain.
+
+        These are all of them where the person's extent is not known.
         """
-        distance, used, _ = _distances(batch, points, placed)
-        extent = self._extent(batch, points, placed) if self.extent is None else self.extent
+        distance = _ray_distance(batch, points, has_position)
+        extent = self.extent
+        if extent is None:
+            extent = float(_person_extent(batch, distance))
         if not extent > 0:
-            return placed
-        return ((distance <= self.limit * extent) & used).sum(1) >= 2
-
-    @staticmethod
-    def _extent(
-        batch: Observations, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
-    ) -> Float[Tensor, ""]:
-        _, used, depth = _distances(batch, points, placed)
-        middle = torch.where(used, depth, torch.nan).nanmedian(-1).values
-        size = person_scale(batch.key_points, batch.valid).double() * middle / _focal(batch)[..., 0]
-        whole = (batch.valid.sum(-1) >= _FEW) & (size > 0)
-        return torch.where(whole, size, torch.nan).nanmedian().nan_to_num(0.0)
+            return has_position
+        near = (distance.mm <= self.limit * extent) & distance.valid
+        return near.sum(1) >= 2
 
 
-def _distances(
-    batch: Observations, points: Float[Tensor, "B J 3"], placed: Bool[Tensor, "B J"]
-) -> tuple[Float[Tensor, "B V J"], Bool[Tensor, "B V J"], Float[Tensor, "B V J"]]:
-    """How far each joint is from each view's ray (mm), where that can be told, and the joint's
-    depth (mm).
-    """
+@dataclass(frozen=True)
+class _RayDistance:
+    """How far each joint is from each view's ray."""
+
+    mm: Float[Tensor, "B V J"]
+    valid: Bool[Tensor, "B V J"]
+    depth: Float[Tensor, "B V J"]
+    """The joint's depth in the view, mm."""
+
+
+def _ray_distance(
+    batch: Observations, points: Float[Tensor, "B J 3"], has_position: Bool[Tensor, "B J"]
+) -> _RayDistance:
     projected, depth = project(batch.cameras, points)
-    pixels = (projected - batch.key_points).norm(dim=-1)
-    used = batch.valid & placed[:, None] & (depth > 0) & torch.isfinite(pixels)
-    return pixels * depth / _focal(batch), used, depth
+    error = (projected - batch.key_points).norm(dim=-1)
+    valid = batch.valid & has_position[:, None] & (depth > 0) & torch.isfinite(error)
+    return _RayDistance(error * depth / _focal(batch), valid, depth)
+
+
+def _person_extent(batch: Observations, distance: _RayDistance) -> Float[Tensor, ""]:
+    """Return the median extent of the person over frames and views, mm; 0 where none is known."""
+    depth = torch.where(distance.valid, distance.depth, torch.nan).nanmedian(-1).values
+    scale = person_scale(batch.key_points, batch.valid).double()
+    extent = scale * depth / _focal(batch)[..., 0]
+    known = (batch.valid.sum(-1) >= _FEW) & (extent > 0)
+    return torch.where(known, extent, torch.nan).nanmedian().nan_to_num(0.0)
 
 
 def _focal(batch: Observations) -> Float[Tensor, "B V 1"]:

@@ -1,18 +1,21 @@
 """metrics.json: all numbers of a test run, computed from its predictions alone."""
 
+from __future__ import annotations
+
 import math
-from pathlib import Path
+from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
 from ghpt.data.datasets.human36m import DAMAGED
-from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.metrics.pose_prior import PARTS, PosePrior
-from ghpt.models.pose.predictions import Predictions
+from ghpt.models.pose.schema import PosePredictions
 from ghpt.observations import PoseEstimate, Truth
 from ghpt.skeleton import JOINTS
 
@@ -39,19 +42,44 @@ NAMES = (
 _CHUNK = 2048
 
 
-class _Selection:
-    """All metrics of one selection."""
+@dataclass(frozen=True)
+class _Groups:
+    """Distinct labels in their order, and which of them each recording has."""
 
-    def __init__(self, actions: int, subjects: int) -> None:
-        self.absolute, self.relative, self.aligned = (
-            MPJPE(kind, actions, len(JOINTS)) for kind in ("absolute", "relative", "aligned")
-        )
-        self.prior = PosePrior(subjects)
+    labels: list[str]
+    of_recording: Int[Tensor, " R"]
+
+    @staticmethod
+    def from_labels(labels: np.ndarray) -> _Groups:
+        """Return the groups of the recordings that have these labels."""
+        distinct, of_recording = np.unique(labels, return_inverse=True)
+        return _Groups(distinct.tolist(), torch.from_numpy(of_recording))
+
+
+class _Metrics:
+    """All metrics of one aggregation or baseline."""
+
+    def __init__(self, actions: _Groups, subjects: _Groups) -> None:
+        count = len(actions.labels)
+        self.absolute = MPJPE("absolute", count, len(JOINTS))
+        self.relative = MPJPE("relative", count, len(JOINTS))
+        self.aligned = MPJPE("aligned", count, len(JOINTS))
+        self.prior = PosePrior(len(subjects.labels))
+        self.actions = actions
+        self.subjects = subjects
         # One process reads the predictions of all; the others have nothing to add.
         for metric in (self.absolute, self.relative, self.aligned, self.prior):
             metric.distributed_available_fn = lambda: False
 
-    def numbers(self) -> dict[str, float | None]:
+    def update(self, estimate: PoseEstimate, truth: Truth, recording: Int[Tensor, " B"]) -> None:
+        """Add frames of these recordings."""
+        action = self.actions.of_recording[recording]
+        for metric in (self.absolute, self.relative, self.aligned):
+            metric.update(estimate, truth, action)
+        self.prior.update(estimate, self.subjects.of_recording[recording])
+
+    def means(self) -> dict[str, float | None]:
+        """Return the four means."""
         relative = self.relative.compute()
         return {
             "mpjpe_absolute": _number(self.absolute.compute().mean),
@@ -60,24 +88,24 @@ class _Selection:
             "mpjpe_6_joints": _number(relative.six_joints),
         }
 
-    def update(
-        self,
-        estimate: PoseEstimate,
-        truth: Truth,
-        action: Int[Tensor, " B"],
-        subject: Int[Tensor, " B"],
-    ) -> None:
-        for metric in (self.absolute, self.relative, self.aligned):
-            metric.update(estimate, truth, action)
-        self.prior.update(estimate, subject)
+    def numbers(self) -> dict[str, Any]:
+        """Return all numbers."""
+        relative = self.relative.compute()
+        per_action = torch.atleast_1d(relative.per_group)
+        priors = {}
+        for subject, row in zip(self.subjects.labels, self.prior.compute(), strict=True):
+            priors[subject] = _by_name(PARTS, row)
+        return {
+            **self.means(),
+            "coverage": _number(self.absolute.compute().coverage),
+            "per_joint": _by_name(JOINTS, relative.per_joint),
+            "per_action": _by_name(self.actions.labels, per_action),
+            "pose_prior": priors,
+        }
 
 
-def _number(value: Float[Tensor, ""]) -> float | None:
-    return None if math.isnan(value.item()) else value.item()
-
-
-def evaluate(predictions: Predictions) -> dict[str, Any]:
-    """The content of metrics.json; lengths in mm, null where nothing could be measured.
+def evaluate_poses(predictions: PosePredictions) -> dict[str, Any]:
+    """Return the content of metrics.json; lengths in mm, null where nothing could be measured.
 
     ``selections[name]``: ``mpjpe_absolute``, ``mpjpe_relative`` (to the pelvis), ``mpjpe_aligned``
     (Procrustes), ``mpjpe_6_joints`` (relative; elbows, wrists, knees), ``coverage`` (estimated
@@ -85,31 +113,25 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
     ``pose_prior`` (S^2 by subject and part) and, where the data hold damaged takes,
     ``without_damaged`` (the four means again).
     """
-    actions = sorted(set(predictions.recording_action))
-    subjects = sorted(set(predictions.recording_subject))
-    action_of = torch.tensor([actions.index(a) for a in predictions.recording_action])
-    subject_of = torch.tensor([subjects.index(s) for s in predictions.recording_subject])
-    damaged = torch.tensor([name in DAMAGED for name in predictions.recording_name])
-    names = sorted(
-        predictions.names, key=lambda n: (NAMES.index(n) if n in NAMES else len(NAMES), n)
-    )
-    whole = {name: _Selection(len(actions), len(subjects)) for name in names}
-    sound = (
-        {name: _Selection(len(actions), len(subjects)) for name in names} if damaged.any() else {}
-    )
+    tables = predictions.tables
+    actions = _Groups.from_labels(tables.recording_action)
+    subjects = _Groups.from_labels(tables.recording_subject)
+    damaged = torch.tensor([name in DAMAGED for name in tables.recording_name.tolist()])
+    rank = {name: place for place, name in enumerate(NAMES)}
+    names = sorted(predictions.names, key=lambda name: (rank.get(name, len(NAMES)), name))
+    whole = {name: _Metrics(actions, subjects) for name in names}
+    sound = {name: _Metrics(actions, subjects) for name in names} if damaged.any() else {}
     for chunk in predictions.chunks(_CHUNK):
-        keep = ~damaged[chunk.recording]
-        action = action_of[chunk.recording]
-        subject = subject_of[chunk.recording]
-        for name in names:
-            estimate = chunk.estimates[name]
-            whole[name].update(estimate, chunk.truth, action, subject)
+        recording = chunk.sample.recording
+        truth = chunk.sample.as_truth()
+        keep = ~damaged[recording]
+        for name, estimate in chunk.estimates.items():
+            whole[name].update(estimate, truth, recording)
             if sound:
-                kept = estimate.rows(keep)
-                sound[name].update(kept, chunk.truth.rows(keep), action[keep], subject[keep])
-    selections = {name: _selection(whole[name], actions, subjects) for name in names}
+                sound[name].update(estimate.rows(keep), truth.rows(keep), recording[keep])
+    selections = {name: metrics.numbers() for name, metrics in whole.items()}
     for name, metrics in sound.items():
-        selections[name]["without_damaged"] = metrics.numbers()
+        selections[name]["without_damaged"] = metrics.means()
     meta = predictions.meta
     return {
         "format_version": FORMAT_VERSION,
@@ -120,23 +142,9 @@ def evaluate(predictions: Predictions) -> dict[str, Any]:
     }
 
 
-def _selection(metrics: _Selection, actions: list[str], subjects: list[str]) -> dict[str, Any]:
-    relative = metrics.relative.compute()
-    prior = metrics.prior.compute()
-    return {
-        **metrics.numbers(),
-        "coverage": _number(metrics.absolute.compute().coverage),
-        "per_joint": dict(zip(JOINTS, map(_number, relative.per_joint), strict=True)),
-        "per_action": dict(
-            zip(actions, map(_number, torch.atleast_1d(relative.per_group)), strict=True)
-        ),
-        "pose_prior": {
-            subject: dict(zip(PARTS, map(_number, row), strict=True))
-            for subject, row in zip(subjects, prior, strict=True)
-        },
-    }
+def _by_name(names: Iterable[str], values: Tensor) -> dict[str, float | None]:
+    return {name: _number(value) for name, value in zip(names, values, strict=True)}
 
 
-def write_metrics(path: str | Path, metrics: dict[str, Any]) -> None:
-    """Write ``evaluate``'s result as metrics.json."""
-    write_json(path, metrics)
+def _number(value: Float[Tensor, ""]) -> float | None:
+    return None if math.isnan(value.item()) else value.item()

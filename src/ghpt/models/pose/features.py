@@ -10,47 +10,53 @@ from ghpt.skeleton import BONES, JOINT, PELVIS
 _LEFT = JOINT["left_shoulder"]
 _RIGHT = JOINT["right_shoulder"]
 
+Points = Float[Tensor, "*B J 3"]
+Joints = Bool[Tensor, "*B J"]
 
-def centre_on_pelvis(
-    points: Float[Tensor, "*B J 3"], estimated: Bool[Tensor, "*B J"]
-) -> Float[Tensor, "*B J 3"]:
-    """Move the pelvis, or the mean of the estimated joints where it is missing, to the origin;
-    missing joints too.
+
+def centre_on_pelvis(points: Points, estimated: Joints) -> Points:
+    """Return the points with the pelvis at the origin, where missing joints are too.
+
+    Where the pelvis is missing, the mean of the estimated joints takes its place.
     """
     weight = estimated.to(points.dtype)[..., None]
-    mean = (points * weight).sum(dim=-2) / weight.sum(dim=-2).clamp_min(1)
-    origin = torch.where(estimated[..., PELVIS, None], points[..., PELVIS, :], mean)
-    return torch.where(estimated[..., None], points - origin[..., None, :], 0.0)
+    total = (points * weight).sum(dim=-2)
+    mean = total / weight.sum(dim=-2).clamp_min(1)
+    has_pelvis = estimated[..., PELVIS, None]
+    origin = torch.where(has_pelvis, points[..., PELVIS, :], mean)
+    centred = points - origin[..., None, :]
+    return torch.where(estimated[..., None], centred, 0.0)
 
 
-def torso_normal_to_z(
-    centred: Float[Tensor, "*B J 3"], estimated: Bool[Tensor, "*B J"]
-) -> Float[Tensor, "*B 3 3"]:
-    """The smallest rotation that brings the normal of the plane through both shoulders and the
-    pelvis to the z axis.
+def torso_normal_to_z(centred: Points, estimated: Joints) -> Float[Tensor, "*B 3 3"]:
+    """Return the smallest rotation that brings the torso's normal to the z axis.
 
-    Identity where one of the three is missing or they lie on a line; a half turn where the normal
-    points to -z.
+    The normal is that of the plane through both shoulders and the pelvis. The rotation is the
+    identity where one of the three is missing or they lie on a line, and a half turn where the
+    normal points to -z.
     """
-    left, right, pelvis = (centred[..., j, :] for j in (_LEFT, _RIGHT, PELVIS))
-    normal = torch.linalg.cross(right - left, pelvis - left)
-    complete = estimated[..., _LEFT] & estimated[..., _RIGHT] & estimated[..., PELVIS]
+    left = centred[..., _LEFT, :]
+    across = centred[..., _RIGHT, :] - left
+    down = centred[..., PELVIS, :] - left
+    normal = torch.linalg.cross(across, down)
+    shoulders = estimated[..., _LEFT] & estimated[..., _RIGHT]
+    complete = shoulders & estimated[..., PELVIS]
     z = torch.tensor([0.0, 0.0, 1.0], dtype=centred.dtype, device=centred.device)
-    return rotation_between(torch.where(complete[..., None], normal, z), z.expand_as(normal))
+    normal = torch.where(complete[..., None], normal, z)
+    return rotation_between(normal, z.expand_as(normal))
 
 
-def normalised_coordinates(
-    points: Float[Tensor, "*B J 3"], estimated: Bool[Tensor, "*B J"]
-) -> Float[Tensor, "*B J*3"]:
-    """Pelvis-centred, rotated coordinates in mm, flattened; 0 for missing joints."""
+def normalised_coordinates(points: Points, estimated: Joints) -> Float[Tensor, "*B J*3"]:
+    """Return pelvis-centred, rotated coordinates in mm, flattened; 0 for missing joints."""
     centred = centre_on_pelvis(points, estimated)
-    return (centred @ torso_normal_to_z(centred, estimated).mT).flatten(-2)
+    rotation = torso_normal_to_z(centred, estimated)
+    return (centred @ rotation.mT).flatten(-2)
 
 
-def body_part_lengths(
-    points: Float[Tensor, "*B J 3"], estimated: Bool[Tensor, "*B J"]
-) -> Float[Tensor, "*B L"]:
-    """Lengths (mm) of the 16 parts between adjacent joints; 0 where an end is missing."""
-    a, b = (list(ends) for ends in zip(*BONES, strict=True))
-    length = (points[..., a, :] - points[..., b, :]).norm(dim=-1)
-    return torch.where(estimated[..., a] & estimated[..., b], length, 0.0)
+def bone_lengths(points: Points, estimated: Joints) -> Float[Tensor, "*B L"]:
+    """Return the lengths (mm) of the 16 bones; 0 where an end is missing."""
+    start = [a for a, _ in BONES]
+    end = [b for _, b in BONES]
+    length = (points[..., start, :] - points[..., end, :]).norm(dim=-1)
+    complete = estimated[..., start] & estimated[..., end]
+    return torch.where(complete, length, 0.0)

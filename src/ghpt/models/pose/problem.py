@@ -2,19 +2,27 @@
 subset of views.
 """
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from ghpt.config import build
+from ghpt.data.datasets.frames import Frames
 from ghpt.errors import check
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.metrics.pose_error import joint_errors
-from ghpt.models.pose.features import body_part_lengths, normalised_coordinates
-from ghpt.models.problem import Hypotheses
-from ghpt.observations import Observations, PoseEstimate, Truth
+from ghpt.models.pose.evaluation import evaluate_poses
+from ghpt.models.pose.features import bone_lengths, normalised_coordinates
+from ghpt.models.pose.schema import POSES, PosePredictions, PoseSample, PoseTables
+from ghpt.models.predictions import with_nan
+from ghpt.models.problem import BaselineSettings, Hypotheses, Problem
+from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
+from ghpt.report.report import Report
 from ghpt.skeleton import BONES, JOINTS
 
 
@@ -32,70 +40,116 @@ class PoseHypotheses(Hypotheses):
     """The joints that the frame's views determine; the others are in no hypothesis."""
 
 
-class PoseTriangulation:
-    """Generate, describe, combine and measure 3D poses."""
+class PoseTriangulation(Problem):
+    """3D poses, each triangulated from random views; compared by MPJPE.
+
+    ``coordinates`` and ``lengths``: whether the scorer sees the normalised coordinates, and the
+    lengths of the bones.
+    """
 
     measures = "MPJPE relative to the pelvis"
+    schema = POSES
+    headline = "mpjpe_relative"
 
     def __init__(self, coordinates: bool, lengths: bool) -> None:
-        check(
-            coordinates or lengths,
-            "model.problem",
-            "neither coordinates nor lengths is on",
-            "Switch on at least one kind of features.",
-        )
+        problem = "neither coordinates nor lengths is on"
+        hint = "Switch on at least one kind of features."
+        check(coordinates or lengths, "model.problem", problem, hint)
         self.coordinates = coordinates
         self.lengths = lengths
         self.feature_size = len(JOINTS) * 3 * coordinates + len(BONES) * lengths
 
     @torch.no_grad()
-    def generate(self, batch: Observations, count: int, keys: Int[Tensor, " B"]) -> PoseHypotheses:
-        """Joint by joint a uniformly random subset of at least two seen views, triangulated.
+    def generate(
+        self, observations: Observations, count: int, keys: Int[Tensor, " B"]
+    ) -> PoseHypotheses:
+        """Triangulate each joint from a uniformly random subset of at least two valid views.
 
-        Where a subset is degenerate (parallel rays, a point behind a camera), all seen views stand
+        Where a subset is degenerate (parallel rays, a point behind a camera), all valid views stand
         in for it, so that every hypothesis has every joint that the frame determines.
         """
-        whole = triangulate(batch.cameras, batch.key_points, batch.valid.double())
-        views = random_subsets(batch.valid, count, keys)
-        points, ok = triangulate_subsets(batch.cameras, batch.key_points, batch.valid, views)
+        cameras = observations.cameras
+        key_points = observations.key_points
+        valid = observations.valid
+        whole = triangulate(cameras, key_points, valid.double())
+        views = random_subsets(valid, count, keys)
+        points, ok = triangulate_subsets(cameras, key_points, valid, views)
         points = torch.where(ok[..., None], points, whole.points[:, None])
-        views = torch.where(ok[..., None], views, batch.valid.mT[:, None])
+        views = torch.where(ok[..., None], views, valid.mT[:, None])
         return PoseHypotheses(points.float(), views, whole.ok)
 
     @torch.no_grad()
     def featurize(self, hypotheses: PoseHypotheses) -> Float[Tensor, "B H D"]:
-        """Normalised coordinates and body part lengths, mm."""
-        estimated = hypotheses.estimated[:, None].expand(hypotheses.points.shape[:-1])
-        kinds = [
-            function(hypotheses.points, estimated)
-            for function, wanted in (
-                (normalised_coordinates, self.coordinates),
-                (body_part_lengths, self.lengths),
-            )
-            if wanted
-        ]
-        return torch.cat(kinds, dim=-1)
+        """Return normalised coordinates and bone lengths, mm."""
+        points = hypotheses.points
+        estimated = hypotheses.estimated[:, None].expand(points.shape[:-1])
+        features = []
+        if self.coordinates:
+            features.append(normalised_coordinates(points, estimated))
+        if self.lengths:
+            features.append(bone_lengths(points, estimated))
+        return torch.cat(features, dim=-1)
 
     def aggregate(self, hypotheses: PoseHypotheses, weights: Float[Tensor, "B H"]) -> PoseEstimate:
-        """The weighted average of the poses, taken about the pool's mean so that float32 keeps its
-        digits.
+        """Return the weighted average of the poses.
+
+        It is taken about the pool's mean, so that float32 keeps its digits.
         """
-        centre = hypotheses.points.mean(dim=1, keepdim=True)
-        offset = torch.einsum("bh,bhjc->bjc", weights.to(centre.dtype), hypotheses.points - centre)
+        points = hypotheses.points
+        centre = points.mean(dim=1, keepdim=True)
+        weights = weights.to(centre.dtype)
+        offset = torch.einsum("bh,bhjc->bjc", weights, points - centre)
         return PoseEstimate(centre[:, 0] + offset, hypotheses.estimated)
 
     def as_estimates(self, hypotheses: PoseHypotheses) -> PoseEstimate:
-        estimated = hypotheses.estimated[:, None].expand(hypotheses.points.shape[:-1])
-        return PoseEstimate(hypotheses.points, estimated)
+        """Return all hypotheses as estimates with leading dimensions B H."""
+        points = hypotheses.points
+        estimated = hypotheses.estimated[:, None].expand(points.shape[:-1])
+        return PoseEstimate(points, estimated)
 
     def error(
         self, estimate: PoseEstimate, truth: Truth
     ) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
-        """Pelvis-relative MPJPE (eq:mpjpe) over the joints that are estimated and have a truth, mm."""
+        """Return the pelvis-relative MPJPE (eq:mpjpe), mm, and which frames can be compared.
+
+        The joints that count are estimated and have a truth.
+        """
         extra = (None,) * (estimate.points.dim() - 3)
         points = truth.points[:, *extra].expand_as(estimate.points)
         valid = truth.valid[:, *extra].expand_as(estimate.estimated)
         errors, counted = joint_errors(estimate, Truth(points, valid), "relative")
         number = counted.sum(dim=-1)
-        mean = torch.where(counted, errors, 0.0).sum(dim=-1) / number.clamp_min(1)
-        return mean, (number > 0).flatten(1).all(dim=1) if extra else number > 0
+        total = torch.where(counted, errors, 0.0).sum(dim=-1)
+        has_truth = (number > 0).flatten(1).all(dim=1) if extra else number > 0
+        return total / number.clamp_min(1), has_truth
+
+    def baselines(
+        self, settings: BaselineSettings, model: Any
+    ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
+        """Return the model's view weights, where there are settings for them, and the rest."""
+        learned = {}
+        if settings.view_weights:
+            view_weights = build(settings.view_weights, "view_weights")
+            learned["view_weights"] = view_weights(model)
+        return learned | build(settings.baselines, "baselines")
+
+    def record(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
+        """Return the frames' true poses, recordings and numbers."""
+        observations = batch.observations
+        frame = torch.from_numpy(dataset.frame_numbers(observations.index.tolist()))
+        truth = batch.truth
+        return PoseSample(with_nan(truth), truth.valid, observations.recording, frame)
+
+    def tables(self, dataset: Frames) -> PoseTables:
+        """Return the recordings."""
+        return PoseTables.from_recordings(dataset.recordings)
+
+    def metrics(self, predictions: PosePredictions) -> dict[str, Any]:
+        """Return the content of metrics.json."""
+        return evaluate_poses(predictions)
+
+    def report(self) -> Report:
+        """Return the tables and figures; imported here, since drawing is slow to import."""
+        from ghpt.report.tensorboard import REPORT
+
+        return REPORT

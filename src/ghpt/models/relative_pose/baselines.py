@@ -27,33 +27,52 @@ from ghpt.randomness import key, uniform
 
 
 def size_in_image(batch: PairObservations) -> Float[Tensor, " B"]:
-    """The person's size in the pair's views, in normalised image coordinates; 0 where it has none."""
-    K, pixels, valid = (batch.of_pair(x) for x in (batch.K, batch.key_points, batch.valid))
+    """Return the person's size in the pair's views, in normalised image coordinates.
+
+    It is 0 where nobody is seen.
+    """
+    K = batch.select_pair(batch.K)
+    pixels = batch.select_pair(batch.key_points).double()
+    valid = batch.select_pair(batch.valid)
     focal = (K[..., 0, 0] + K[..., 1, 1]).double() / 2
-    size = person_scale(pixels.double(), valid) / focal[..., None]
+    size = person_scale(pixels, valid) / focal[..., None]
     size = torch.where(size > 0, size, torch.nan).flatten(1)
     none = torch.full((len(size), 1), torch.nan, dtype=size.dtype, device=size.device)
-    return torch.cat((size, none), dim=1).nanmedian(-1).values.nan_to_num(0.0)
+    median = torch.cat((size, none), dim=1).nanmedian(-1).values
+    return median.nan_to_num(0.0)
 
 
 def linear_pose(
     a: Float[Tensor, "*B N 2"], b: Float[Tensor, "*B N 2"], used: Bool[Tensor, "*B N"]
 ) -> tuple[RelativePoseEstimate, Bool[Tensor, "*B"]]:
-    """The 8-point algorithm's pose of the used correspondences, and whether they determine an
-    essential matrix.
+    """Return the 8-point algorithm's pose of the used correspondences.
+
+    Beside it is whether they determine an essential matrix.
     """
     E, determined = eight_point(a, b, used.double())
     R, t, ok = pose_in_front(E, a, b, used & determined[..., None])
     return RelativePoseEstimate(R, t, ok), determined
 
 
+@dataclass(frozen=True)
+class Correspondences:
+    """N points that both cameras of a pair see."""
+
+    a: Float[Tensor, "N 2"]
+    b: Float[Tensor, "N 2"]
+    """Normalised image coordinates in the reference and the target camera, float64."""
+    size: float
+    """The person's size in the images, in these coordinates."""
+    index: Int[Tensor, ""]
+    """The pair's own: the key of its random draws."""
+
+
 class PairBaseline(ABC):
-    """A classical estimator: ``baseline(batch)`` gives float64 poses with t of length 1, each
-    pair's a function of that pair alone.
-    """
+    """A classical estimator of pairs."""
 
     @abstractmethod
-    def __call__(self, batch: PairObservations) -> RelativePoseEstimate: ...
+    def __call__(self, batch: PairObservations) -> RelativePoseEstimate:
+        """Return float64 poses with t of length 1; each is a function of its pair alone."""
 
 
 class EightPoint(PairBaseline):
@@ -65,17 +84,11 @@ class EightPoint(PairBaseline):
 
 
 class Robust(PairBaseline):
-    """An estimator that tells inliers from outliers, pair by pair; ``EightPoint`` where it finds
-    too few.
-    """
+    """An estimator that tells inliers from outliers; ``EightPoint`` where it finds too few."""
 
     @abstractmethod
-    def pose(
-        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> RelativePoseEstimate | None:
-        """The pose of one pair from N >= 8 correspondences (normalised image coordinates) of a
-        person of that ``size``; None where there is none.
-        """
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        """Return the pose of one pair with 8 correspondences or more, None where there is none."""
 
     @torch.no_grad()
     def __call__(self, batch: PairObservations) -> RelativePoseEstimate:
@@ -86,19 +99,25 @@ class Robust(PairBaseline):
         t = linear.t.clone()
         ok = linear.estimated.clone()
         for i in torch.nonzero(determined & (size > 0)).flatten().tolist():
-            found = self.pose(a[i, used[i]], b[i, used[i]], size[i].item(), batch.index[i])
+            own = used[i]
+            pair = Correspondences(a[i, own], b[i, own], size[i].item(), batch.index[i])
+            found = self.pose(pair)
             if found is not None and found.estimated:
-                R[i], t[i], ok[i] = found.R.to(R), found.t.to(t), True
+                R[i] = found.R.to(R)
+                t[i] = found.t.to(t)
+                ok[i] = True
         return RelativePoseEstimate(R, t, ok)
 
 
 @dataclass(frozen=True)
 class Ransac(Robust):
-    """Of ``samples`` random minimal samples the essential matrix with the least truncated squared
-    error (MSAC), then the 8-point algorithm on its inliers.
+    """RANSAC with the 8-point algorithm.
+
+    Of ``samples`` random minimal samples it takes the essential matrix with the least truncated
+    squared error (MSAC), then the 8-point algorithm on its inliers.
 
     ``threshold``: an inlier's largest Sampson error, as a fraction of the person's size. The
-    samples are keyed by ``seed`` and the pair's ``sample``.
+    samples are keyed by ``seed`` and the pair's ``index``.
     """
 
     samples: int
@@ -108,16 +127,16 @@ class Ransac(Robust):
     def __post_init__(self) -> None:
         check_positive(samples=self.samples, threshold=self.threshold)
 
-    def pose(
-        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> RelativePoseEstimate | None:
-        keys = key(self.seed, "pair ransac", sample, device=a.device)
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        a = pair.a
+        b = pair.b
+        keys = key(self.seed, "pair ransac", pair.index, device=a.device)
         chosen = _distinct(uniform(keys, (self.samples, MINIMUM)), len(a))
-        E, ok = eight_point(
-            a[chosen], b[chosen], torch.ones(chosen.shape, dtype=a.dtype, device=a.device)
-        )
-        error = sampson_error(E, a, b) / (self.threshold * size)
-        score = torch.where(ok, (1 - error.square()).clamp_min(0).sum(-1), -1.0)
+        ones = torch.ones(chosen.shape, dtype=a.dtype, device=a.device)
+        E, ok = eight_point(a[chosen], b[chosen], ones)
+        error = sampson_error(E, a, b) / (self.threshold * pair.size)
+        gain = (1 - error.square()).clamp_min(0).sum(-1)
+        score = torch.where(ok, gain, -1.0)
         best = score.argmax()
         inlier = error[best] <= 1
         return linear_pose(a, b, inlier)[0] if ok[best] else None
@@ -125,13 +144,13 @@ class Ransac(Robust):
 
 @dataclass(frozen=True)
 class Usac(Robust):
-    """OpenCV's ``findEssentialMat`` with one of its USAC methods; of the four poses the one with
-    most of its inliers in front.
+    """OpenCV's ``findEssentialMat`` with one of its USAC methods.
 
-    ``threshold``: as a fraction of the person's size. ``pixels``: the person's size that OpenCV
-    sees. Its methods hold constants in pixels (MAGSAC's largest threshold, the cells of the
-    neighbourhoods), so that neither normalised coordinates nor the camera's own resolution would
-    do. Their random state is OpenCV's fixed one.
+    Of the four poses it takes the one with most of its inliers in front. ``threshold``: as a
+    fraction of the person's size. ``pixels``: the person's size that OpenCV sees. Its methods hold
+    constants in pixels (MAGSAC's largest threshold, the cells of the neighbourhoods), so that
+    neither normalised coordinates nor the camera's own resolution would do. Their random state is
+    OpenCV's fixed one.
     """
 
     method: str
@@ -142,49 +161,41 @@ class Usac(Robust):
 
     def __post_init__(self) -> None:
         known = [name for name in dir(cv2) if name.startswith("USAC_")]
-        check(
-            self.method in known,
-            "method",
-            f"is {self.method!r}",
-            f"Choose from {', '.join(known)}.",
-        )
+        hint = f"Choose from {', '.join(known)}."
+        check(self.method in known, "method", f"is {self.method!r}", hint)
         check_positive(threshold=self.threshold, pixels=self.pixels, iterations=self.iterations)
-        check(
-            0 < self.confidence < 1,
-            "confidence",
-            f"is {self.confidence}",
-            "It must be between 0 and 1.",
-        )
+        possible = 0 < self.confidence < 1
+        check(possible, "confidence", f"is {self.confidence}", "It must be between 0 and 1.")
 
-    def pose(
-        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> RelativePoseEstimate | None:
-        focal = self.pixels / size
-        x, y = ((focal * points).cpu().numpy() for points in (a, b))
-        settings = (
-            getattr(cv2, self.method),
-            self.confidence,
-            self.threshold * self.pixels,
-            self.iterations,
-        )
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        focal = self.pixels / pair.size
+        x = (focal * pair.a).cpu().numpy()
+        y = (focal * pair.b).cpu().numpy()
+        K = np.diag([focal, focal, 1.0])
+        method = getattr(cv2, self.method)
+        threshold = self.threshold * self.pixels
         try:
-            E, mask = cv2.findEssentialMat(x, y, np.diag([focal, focal, 1.0]), *settings)
+            E, mask = cv2.findEssentialMat(
+                x, y, K, method, self.confidence, threshold, self.iterations
+            )
         except cv2.error:
             return None
         if E is None or E.shape != (3, 3) or not np.isfinite(E).all():
             return None
-        inlier = torch.from_numpy(mask[:, 0] > 0).to(a.device)
-        pose = RelativePoseEstimate(*pose_in_front(torch.from_numpy(E).to(a), a, b, inlier))
-        return pose if inlier.sum() >= MINIMUM else None
+        inlier = torch.from_numpy(mask[:, 0] > 0).to(pair.a.device)
+        if inlier.sum() < MINIMUM:
+            return None
+        essential = torch.from_numpy(E).to(pair.a)
+        R, t, ok = pose_in_front(essential, pair.a, pair.b, inlier)
+        return RelativePoseEstimate(R, t, ok)
 
 
 @dataclass(frozen=True)
 class PoseLib(Robust):
-    """PoseLib's LO-RANSAC of the 5-point solver, then its refinement on the inliers under a robust
-    loss.
+    """PoseLib's LO-RANSAC of the 5-point solver, then its refinement on the inliers.
 
-    ``threshold`` (largest epipolar error of an inlier) and ``scale`` (of the loss) are fractions of
-    the person's size.
+    The refinement has a robust loss. ``threshold`` (largest epipolar error of an inlier) and
+    ``scale`` (of the loss) are fractions of the person's size.
     """
 
     threshold: float
@@ -195,37 +206,34 @@ class PoseLib(Robust):
 
     def __post_init__(self) -> None:
         check_positive(threshold=self.threshold, scale=self.scale, iterations=self.iterations)
-        check(
-            self.loss in _LOSSES, "loss", f"is {self.loss!r}", f"Choose from {', '.join(_LOSSES)}."
-        )
+        hint = f"Choose from {', '.join(_LOSSES)}."
+        check(self.loss in _LOSSES, "loss", f"is {self.loss!r}", hint)
 
-    def pose(
-        self, a: Float[Tensor, "N 2"], b: Float[Tensor, "N 2"], size: float, sample: Int[Tensor, ""]
-    ) -> RelativePoseEstimate | None:
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
         # pixels in units of the person's size
-        camera = {
-            "model": "PINHOLE",
-            "width": 1,
-            "height": 1,
-            "params": [1 / size, 1 / size, 0.0, 0.0],
-        }
+        focal = 1 / pair.size
+        parameters = [focal, focal, 0.0, 0.0]
+        camera = {"model": "PINHOLE", "width": 1, "height": 1, "params": parameters}
         ransac = {
             "max_epipolar_error": self.threshold,
             "max_iterations": self.iterations,
             "seed": self.seed,
         }
         bundle = {"loss_type": self.loss, "loss_scale": self.scale}
-        x, y = ((points / size).cpu().numpy() for points in (a, b))
+        x = (pair.a / pair.size).cpu().numpy()
+        y = (pair.b / pair.size).cpu().numpy()
         found, info = poselib.estimate_relative_pose(x, y, camera, camera, ransac, bundle)
         t = torch.tensor(found.t)
-        if info["num_inliers"] < MINIMUM or not torch.isfinite(t).all() or not t.any():
+        determined = torch.isfinite(t).all() and t.any()
+        if info["num_inliers"] < MINIMUM or not determined:
             return None
         return RelativePoseEstimate(torch.tensor(found.R), t / t.norm(), torch.tensor(True))
 
 
 def _distinct(draws: Float[Tensor, "S T"], count: int) -> Int[Tensor, "S T"]:
-    """T distinct numbers below ``count`` from T uniform draws, every subset equally likely (Floyd's
-    algorithm).
+    """Return T distinct numbers below ``count`` from T uniform draws, by Floyd's algorithm.
+
+    Every subset is equally likely.
     """
     chosen = torch.full(draws.shape, -1, dtype=torch.int64, device=draws.device)
     for i, last in enumerate(range(count - draws.shape[1], count)):

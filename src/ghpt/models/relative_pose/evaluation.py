@@ -1,11 +1,10 @@
-"""metrics.json of the camera problem: all numbers of a test run, computed from its predictions
-alone.
-"""
+"""metrics.json of the camera problem: all numbers of a test run, from its predictions alone."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -23,7 +22,7 @@ from ghpt.metrics.relative_pose import (
     translation_error,
 )
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.models.relative_pose.predictions import PairChunk, PairPredictions
+from ghpt.models.relative_pose.schema import PairChunk, PairPredictions
 
 FORMAT_VERSION = 1
 NAMES = (*AGGREGATIONS, "eight_point", "ransac", "usac_magsac", "usac_accurate", "poselib", "rig")
@@ -37,8 +36,9 @@ _CHUNK = 512
 
 
 def evaluate_pairs(predictions: PairPredictions) -> dict[str, Any]:
-    """The content of metrics.json; mm, pixels and degrees, null where nothing could be measured.
+    """Return the content of metrics.json.
 
+    Lengths are mm, images pixels, angles degrees; null where nothing could be measured.
     ``selections[name]["pairs"]["1-2"]`` (places in the arrangement, from 1): the six errors of
     ``ERRORS`` as medians over all draws of all rigs, in which a draw without an estimate counts as
     infinitely bad (an infinite median is null); ``coverage`` (draws estimated / draws); ``mean``
@@ -46,30 +46,24 @@ def evaluate_pairs(predictions: PairPredictions) -> dict[str, Any]:
     median E_2D and E_3D when the other part is the true one. A selection's own numbers are means
     over its pairs. A draw's E_2D and E_3D are means over the points that count.
     """
-    names = sorted(
-        predictions.names, key=lambda n: (NAMES.index(n) if n in NAMES else len(NAMES), n)
-    )
-    errors, pair, draw = _all_errors(predictions, names)
-    pairs = [tuple(ab) for ab in np.unique(pair, axis=0).tolist()]
+    rank = {name: place for place, name in enumerate(NAMES)}
+    names = sorted(predictions.names, key=lambda name: (rank.get(name, len(NAMES)), name))
+    measured = _measure(predictions, names)
+    pairs = [tuple(views) for views in np.unique(measured.pair, axis=0).tolist()]
     selections = {}
     for name in names:
-        numbers = {
-            pair_name(ab): _numbers({e: v[(pair == ab).all(-1)] for e, v in errors[name].items()})
-            for ab in pairs
+        of_pairs = {pair_name(pair): _pair_numbers(measured.select(name, pair)) for pair in pairs}
+        means = {
+            key: _mean([numbers[key] for numbers in of_pairs.values()])
+            for key in (*ERRORS, "coverage")
         }
-        selections[name] = {
-            **{
-                key: _mean([of_pair[key] for of_pair in numbers.values()])
-                for key in (*ERRORS, "coverage")
-            },
-            "pairs": numbers,
-        }
+        selections[name] = means | {"pairs": of_pairs}
     meta = predictions.meta
     return {
         "format_version": FORMAT_VERSION,
         **{key: meta.get(key) for key in ("data", "source", "split", "problem", "frames")},
-        "draws": len(np.unique(draw)),
-        "cameras": list(predictions.camera_name[0]),
+        "draws": len(np.unique(measured.draw)),
+        "cameras": predictions.tables.camera_name[0].tolist(),
         **{key: meta.get(key) for key in ("seed", "provenance")},
         "selections": selections,
     }
@@ -83,106 +77,123 @@ def pair_name(pair: tuple[int, int]) -> str:
 def pair_errors(
     predictions: PairPredictions, chunk: PairChunk, name: str
 ) -> dict[str, Float[Tensor, " B"]]:
-    """Each row's errors under a selection: ``ERRORS``, and E_2D and E_3D of each part ``ALONE``;
-    inf where it was not estimated or no point counts.
+    """Return each row's errors under a selection: ``ERRORS``, and E_2D and E_3D of each ``ALONE``.
+
+    An error is inf where the pose was not estimated, and where no point counts.
     """
     estimate = chunk.estimates[name]
-    truth = _pair_cameras(predictions, chunk.rig, chunk.pair)
-    points = predictions.points[chunk.rig]
-    whole = _with_target(truth, estimate.R, estimate.t)
+    sample = chunk.sample
+    truth = predictions.tables.cameras.index((sample.rig[:, None], sample.pair))
+    points = predictions.tables.points[sample.rig]
     errors = {
-        "E_R": quaternion_error(estimate.R, chunk.truth_R),
-        "E_t": translation_error(estimate.t, chunk.truth_t),
-        "E_2D": _mean_over_points(*error_2d(whole, truth, points)),
-        "E_3D": _mean_over_points(*error_3d(whole, truth, points)),
-        "rotation_deg": rotation_deg(estimate.R, chunk.truth_R),
-        "translation_deg": translation_deg(estimate.t, chunk.truth_t),
+        "E_R": quaternion_error(estimate.R, sample.truth_R),
+        "E_t": translation_error(estimate.t, sample.truth_t),
+        "rotation_deg": rotation_deg(estimate.R, sample.truth_R),
+        "translation_deg": translation_deg(estimate.t, sample.truth_t),
     }
-    for part, (R, t) in zip(
-        ALONE, ((estimate.R, chunk.truth_t), (chunk.truth_R, estimate.t)), strict=True
-    ):
-        mixed = _with_target(truth, R, t)
-        errors[f"E_2D {part}"] = _mean_over_points(*error_2d(mixed, truth, points))
-        errors[f"E_3D {part}"] = _mean_over_points(*error_3d(mixed, truth, points))
+    tried = {
+        "": (estimate.R, estimate.t),
+        " estimated_R": (estimate.R, sample.truth_t),
+        " estimated_t": (sample.truth_R, estimate.t),
+    }
+    for part, (R, t) in tried.items():
+        cameras = _with_target(truth, R, t)
+        errors["E_2D" + part] = _mean_over_points(*error_2d(cameras, truth, points))
+        errors["E_3D" + part] = _mean_over_points(*error_3d(cameras, truth, points))
     return {key: torch.where(estimate.estimated, value, torch.inf) for key, value in errors.items()}
 
 
 def errors_of_pair(
     predictions: PairPredictions, pair: tuple[int, int], error: str
 ) -> dict[str, list[float]]:
-    """One of ``ERRORS`` on a pair of views (from 0) in each draw, by name, in the file's order; inf
-    where a draw was not estimated. A sweep over the number of frames plots these.
+    """Return one of ``ERRORS`` on a pair of views (from 0) in each draw, by name.
+
+    The draws are in the file's order; inf where one was not estimated. A sweep over the number of
+    frames plots these.
     """
-    errors, pairs, _ = _all_errors(predictions, list(predictions.names))
-    rows = (pairs == pair).all(-1)
-    return {name: values[error][rows].tolist() for name, values in errors.items()}
+    measured = _measure(predictions, list(predictions.names))
+    return {name: measured.select(name, pair)[error].tolist() for name in predictions.names}
 
 
 def camera_after(
     reference: Cameras, R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"]
 ) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"]]:
-    """World to target camera, of the relative pose after the reference camera (of each of B,
-    without a view axis).
+    """Return R and t from the world to the target camera of a relative pose.
+
+    The reference cameras have no view axis.
     """
-    return R @ reference.R, (R @ reference.t[..., None])[..., 0] + t
-
-
-def _pair_cameras(
-    predictions: PairPredictions, rig: Int[Tensor, " B"], pair: Int[Tensor, "B 2"]
-) -> Cameras:
-    """The true reference and target cameras, leading dimensions B 2."""
-    return predictions.cameras.index((rig[:, None], pair))
+    shifted = (R @ reference.t[..., None])[..., 0]
+    return R @ reference.R, shifted + t
 
 
 def _with_target(truth: Cameras, R: Float[Tensor, "B 3 3"], t: Float[Tensor, "B 3"]) -> Cameras:
+    """Return the true reference cameras with the targets of these relative poses."""
     reference = truth.index((slice(None), 0))
     target_R, target_t = camera_after(reference, R, t)
-    return Cameras(
-        truth.K, torch.stack((reference.R, target_R), 1), torch.stack((reference.t, target_t), 1)
-    )
+    both_R = torch.stack((reference.R, target_R), 1)
+    both_t = torch.stack((reference.t, target_t), 1)
+    return Cameras(truth.K, both_R, both_t)
 
 
 def _mean_over_points(errors: Float[Tensor, "B P"], counted: Tensor) -> Float[Tensor, " B"]:
-    return torch.where(
-        counted.any(-1), (errors * counted).sum(-1) / counted.sum(-1).clamp_min(1), torch.inf
-    )
+    """Return the mean over the points that count, inf where none does."""
+    total = (errors * counted).sum(-1)
+    mean = total / counted.sum(-1).clamp_min(1)
+    return torch.where(counted.any(-1), mean, torch.inf)
 
 
-def _all_errors(
-    predictions: PairPredictions, names: list[str]
-) -> tuple[dict[str, dict[str, np.ndarray]], np.ndarray, np.ndarray]:
-    """Every row's errors under each name, its pair and its draw. A row is a few numbers, so all are
-    held at once.
-    """
+@dataclass(frozen=True)
+class _Measured:
+    """The errors of all rows: a row is a few numbers, so all are held at once."""
+
+    errors: Mapping[str, Mapping[str, Float[np.ndarray, " N"]]]
+    """By name, then by error."""
+    pair: Int[np.ndarray, "N 2"]
+    draw: Int[np.ndarray, " N"]
+
+    def select(self, name: str, pair: tuple[int, ...]) -> dict[str, Float[np.ndarray, " D"]]:
+        """Return the errors under a name on a pair, draw by draw."""
+        rows = (self.pair == pair).all(-1)
+        return {error: values[rows] for error, values in self.errors[name].items()}
+
+
+def _measure(predictions: PairPredictions, names: Sequence[str]) -> _Measured:
+    """Return the errors of every row under each name."""
     parts: dict[str, dict[str, list[Tensor]]] = {name: {} for name in names}
     pair = []
     draw = []
     for chunk in predictions.chunks(_CHUNK):
-        pair.append(chunk.pair)
-        draw.append(chunk.draw)
-        for name in names:
+        pair.append(chunk.sample.pair)
+        draw.append(chunk.sample.draw)
+        for name, collected in parts.items():
             for error, values in pair_errors(predictions, chunk, name).items():
-                parts[name].setdefault(error, []).append(values)
+                collected.setdefault(error, []).append(values)
     errors = {
-        name: {e: torch.cat(v).numpy() for e, v in each.items()} for name, each in parts.items()
+        name: {error: torch.cat(values).numpy() for error, values in collected.items()}
+        for name, collected in parts.items()
     }
-    return errors, torch.cat(pair).numpy(), torch.cat(draw).numpy()
+    return _Measured(errors, torch.cat(pair).numpy(), torch.cat(draw).numpy())
 
 
-def _numbers(errors: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """A pair's entry of metrics.json, from the errors of its draws."""
+def _pair_numbers(errors: Mapping[str, Float[np.ndarray, " D"]]) -> dict[str, Any]:
+    """Return a pair's entry of metrics.json, from the errors of its draws."""
     median = {error: _finite(np.median(values)) for error, values in errors.items()}
-    measured = {error: errors[error][np.isfinite(errors[error])] for error in ERRORS}
+    mean: dict[str, float | None] = {}
+    deviation: dict[str, float | None] = {}
+    for error in ERRORS:
+        values = errors[error]
+        measured = values[np.isfinite(values)]
+        mean[error] = _finite(measured.mean()) if len(measured) else None
+        deviation[error] = _finite(measured.std(ddof=1)) if len(measured) > 1 else None
+    alone = {
+        part: {error: median[f"{error} {part}"] for error in ("E_2D", "E_3D")} for part in ALONE
+    }
     return {
         **{error: median[error] for error in ERRORS},
         "coverage": float(np.isfinite(errors["E_R"]).mean()),
-        "mean": {error: _finite(v.mean()) if len(v) else None for error, v in measured.items()},
-        "deviation": {
-            error: _finite(v.std(ddof=1)) if len(v) > 1 else None for error, v in measured.items()
-        },
-        **{
-            part: {error: median[f"{error} {part}"] for error in ("E_2D", "E_3D")} for part in ALONE
-        },
+        "mean": mean,
+        "deviation": deviation,
+        **alone,
     }
 
 
@@ -190,9 +201,9 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def _mean(values: list[float | None]) -> float | None:
-    return (
-        None
-        if None in values or not values
-        else float(np.mean([v for v in values if v is not None]))
-    )
+def _mean(values: Sequence[float | None]) -> float | None:
+    """Return the mean, None where a value is missing or there is none."""
+    known = [value for value in values if value is not None]
+    if not known or len(known) < len(values):
+        return None
+    return float(np.mean(known))

@@ -1,11 +1,13 @@
-"""The camera problem (paper, section 3.2): a hypothesis is the relative pose of two cameras from T
-correspondences.
+"""The camera problem (paper, section 3.2): relative poses of two cameras.
+
+A hypothesis is the relative pose from T random correspondences.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,7 +15,9 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt import randomness
-from ghpt.data.datasets.pairs import PairSettings
+from ghpt.config import build
+from ghpt.data.datasets.frames import Sampling
+from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.errors import check
 from ghpt.geometry.cameras import project
 from ghpt.geometry.epipolar import (
@@ -27,13 +31,22 @@ from ghpt.geometry.epipolar import (
     robust_weights,
 )
 from ghpt.geometry.rotations import average_rotation
-from ghpt.models.problem import Hypotheses
-from ghpt.observations import PairObservations, PairTruth, RelativePoseEstimate
+from ghpt.models.problem import BaselineSettings, Hypotheses, Problem
+from ghpt.models.relative_pose.evaluation import evaluate_pairs
+from ghpt.models.relative_pose.schema import PAIRS, PairPredictions, PairSample, RigTables
+from ghpt.observations import (
+    Labelled,
+    LabelledRecording,
+    PairObservations,
+    PairTruth,
+    RelativePoseEstimate,
+)
+from ghpt.report.report import Report
 
 CHEIRALITY = 256
-"""Correspondences, evenly over all, that tell which of four poses has them in front: more would
-only repeat it.
-"""
+"""Correspondences, evenly over all, that tell which of four poses has them in front.
+
+More would only repeat it."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +67,8 @@ class RelativePoseHypotheses(Hypotheses):
     """The joints that both cameras see."""
 
 
-class RelativePose:
-    """Generate, describe, combine and measure relative camera poses.
+class RelativePose(Problem):
+    """Relative poses of two cameras, each from random correspondences; compared by E_3D.
 
     ``frames``, ``draws``, ``points``: see ``PairSettings``. ``sample``: T, the correspondences of a
     hypothesis; at most half of those that both cameras see, but 8 at least. ``refine``: how often
@@ -66,6 +79,8 @@ class RelativePose:
     """
 
     measures = "E_3D"
+    schema = PAIRS
+    headline = "E_3D"
 
     def __init__(
         self,
@@ -78,9 +93,8 @@ class RelativePose:
         scale: Callable[[RelativePoseEstimate, PairObservations], Tensor],
         largest_error: float,
     ) -> None:
-        check(
-            sample >= MINIMUM, "sample", f"is {sample}", f"The 8-point algorithm needs {MINIMUM}."
-        )
+        hint = f"The 8-point algorithm needs {MINIMUM}."
+        check(sample >= MINIMUM, "sample", f"is {sample}", hint)
         check(refine >= 0, "refine", f"is {refine}", "It must be >= 0 (0: the paper).")
         check(features >= 2, "features", f"is {features}", "It must be >= 2.")
         check(largest_error > 0, "largest_error", f"is {largest_error}", "It must be > 0 (mm).")
@@ -93,46 +107,49 @@ class RelativePose:
 
     @torch.no_grad()
     def generate(
-        self, batch: PairObservations, count: int, keys: Int[Tensor, " B"]
+        self, observations: PairObservations, count: int, keys: Int[Tensor, " B"]
     ) -> RelativePoseHypotheses:
-        """The normalised 8-point algorithm on T random correspondences, then ``refine`` times on
-        all, reweighted.
+        """Apply the normalised 8-point algorithm to T random correspondences.
 
-        Where they are degenerate or no pose has most points in front, all correspondences stand in
-        for them.
+        Then ``refine`` times to all of them, reweighted. Where they are degenerate or no pose has
+        most points in front, all correspondences stand in for them.
         """
-        a, b, both = batch.correspondences()
-        subsets = torch.cat((random_subsets(both, count, self.sample, keys), both[:, None]), dim=1)
+        a, b, both = observations.correspondences()
+        drawn = random_subsets(both, count, self.sample, keys)
+        subsets = torch.cat((drawn, both[:, None]), dim=1)  # the last one: all of them
         E, determined = eight_point_subsets(a, b, subsets.double())
         for _ in range(self.refine):
-            E, determined = eight_point_subsets(
-                a, b, robust_weights(E, a, b, both) * determined[..., None]
-            )
+            weights = robust_weights(E, a, b, both) * determined[..., None]
+            E, determined = eight_point_subsets(a, b, weights)
         some = slice(None, None, -(-a.shape[1] // CHEIRALITY))
-        R, t, ok = poses_in_front(
-            E, a[:, some], b[:, some], both[:, None, some] & determined[..., None]
-        )
+        used = both[:, None, some] & determined[..., None]
+        R, t, ok = poses_in_front(E, a[:, some], b[:, some], used)
         R = torch.where(ok[..., None, None], R, R[:, -1:])[:, :-1]
         t = torch.where(ok[..., None], t, t[:, -1:])[:, :-1]
         estimated = ok[:, -1]
-        length = self.scale(RelativePoseEstimate(R, t, estimated[:, None].expand(-1, count)), batch)
+        unscaled = RelativePoseEstimate(R, t, estimated[:, None].expand(-1, count))
+        length = self.scale(unscaled, observations)
         return RelativePoseHypotheses(R, t * length[..., None], estimated, a, b, both)
 
     @torch.no_grad()
     def featurize(self, hypotheses: RelativePoseHypotheses) -> Float[Tensor, "B H D"]:
-        """The distances (mm) between corresponding rays, sorted: D evenly spaced quantiles of them,
-        so that missing joints and another number of frames change nothing but their precision.
+        """Return the distances (mm) between corresponding rays, sorted.
+
+        They are D evenly spaced quantiles, so that missing joints and another number of frames
+        change nothing but their precision.
         """
-        h = hypotheses
-        length = h.t.norm(dim=-1, keepdim=True)
-        direction = h.t / torch.where(length > 0, length, 1.0)
-        distances = ray_distances(h.R, direction, h.a, h.b).float() * length.float()
-        return quantiles(distances, h.both[:, None].expand_as(distances), self.feature_size)
+        t = hypotheses.t
+        length = t.norm(dim=-1, keepdim=True)
+        direction = t / torch.where(length > 0, length, 1.0)
+        unit_distances = ray_distances(hypotheses.R, direction, hypotheses.a, hypotheses.b)
+        distances = unit_distances.float() * length.float()
+        both = hypotheses.both[:, None].expand_as(distances)
+        return quantiles(distances, both, self.feature_size)
 
     def aggregate(
         self, hypotheses: RelativePoseHypotheses, weights: Float[Tensor, "B H"]
     ) -> RelativePoseEstimate:
-        """Weighted average of the rotations' quaternions and of the translations.
+        """Return the weighted average of the rotations' quaternions and of the translations.
 
         The quaternions are sign-aligned and summed (``average_rotation``). The direction of t is
         that of the weighted sum, its length the weighted mean of the lengths: a sum of unequal
@@ -143,87 +160,133 @@ class RelativePose:
         total = torch.einsum("bh,bhc->bc", weights, hypotheses.t)
         length = (weights * hypotheses.t.norm(dim=-1)).sum(-1, keepdim=True)
         norm = total.norm(dim=-1, keepdim=True)
-        return RelativePoseEstimate(
-            R, total * length / torch.where(norm > 0, norm, 1.0), hypotheses.estimated
-        )
+        t = total * length / torch.where(norm > 0, norm, 1.0)
+        return RelativePoseEstimate(R, t, hypotheses.estimated)
 
     def as_estimates(self, hypotheses: RelativePoseHypotheses) -> RelativePoseEstimate:
+        """Return all hypotheses as estimates with leading dimensions B H."""
         estimated = hypotheses.estimated[:, None].expand(hypotheses.t.shape[:-1])
         return RelativePoseEstimate(hypotheses.R, hypotheses.t, estimated)
 
     def error(
         self, estimate: RelativePoseEstimate, truth: PairTruth
     ) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
-        """E_3D (eq:reprojection-3d-error), mm: the mean distance of random points from what the
-        estimated pair makes of their true images. A point that it cannot see in front of both
-        cameras has ``largest_error``.
+        """Return E_3D (eq:reprojection-3d-error), mm, and which pairs can be compared.
+
+        It is the mean distance of random points from what the estimated pair makes of their true
+        images. A point that it cannot see in front of both cameras has ``largest_error``.
         """
         cameras = truth.cameras
         pixels, depth = project(cameras, truth.points)
-        x = normalise(cameras.K, pixels)
+        images = normalise(cameras.K, pixels)
         in_a = truth.points @ cameras.R[:, 0].mT + cameras.t[:, 0, None]
         # linear triangulation counts a ray's distance by its camera's focal length
         focal = torch.linalg.det(cameras.K)
         share_a = (focal[:, 0] / focal.sum(-1))[:, None, None]
         extra = (None,) * (estimate.t.dim() - 2)
-        a, b, in_a, share_a = (v[:, *extra] for v in (x[:, 0], x[:, 1], in_a, share_a))
+        a = images[:, 0][:, *extra]
+        b = images[:, 1][:, *extra]
+        in_a = in_a[:, *extra]
+        share_a = share_a[:, *extra]
         alpha, beta = depths(estimate.R, estimate.t, a, b)
         on_a = homogeneous(a) * alpha[..., None]
         on_b = (homogeneous(b) * beta[..., None] - estimate.t[..., None, :]) @ estimate.R
-        distance = (
-            (share_a * on_a + (1 - share_a) * on_b - in_a)
-            .norm(dim=-1)
-            .clamp(max=self.largest_error)
-        )
-        distance = torch.where((alpha > 0) & (beta > 0), distance, self.largest_error)
+        between = share_a * on_a + (1 - share_a) * on_b
+        distance = (between - in_a).norm(dim=-1).clamp(max=self.largest_error)
+        in_front = (alpha > 0) & (beta > 0)
+        distance = torch.where(in_front, distance, self.largest_error)
         visible = (depth > 0).all(dim=1)
         share = visible / visible.sum(-1, keepdim=True).clamp_min(1)
         error = (distance * share[:, *extra]).sum(-1)
-        return error, visible.any(-1) & (
-            estimate.estimated.all(-1) if extra else estimate.estimated
-        )
+        estimated = estimate.estimated.all(-1) if extra else estimate.estimated
+        return error, visible.any(-1) & estimated
+
+    def dataset(self, recordings: Sequence[LabelledRecording], sampling: Sampling) -> Pairs:
+        """Return pairs of cameras with random frames of their rig."""
+        return Pairs(recordings, self.pairs, sampling.seed, sampling.train_samples)
+
+    def baselines(
+        self, settings: BaselineSettings, model: Any
+    ) -> Mapping[str, Callable[[PairObservations], RelativePoseEstimate]]:
+        """Return the classical estimators."""
+        return build(settings.camera_baselines, "camera_baselines")
+
+    def from_baseline(
+        self, estimate: RelativePoseEstimate, observations: PairObservations
+    ) -> RelativePoseEstimate:
+        """Return the estimate with the length of t that the problem's ``scale`` gives it."""
+        length = self.scale(estimate, observations)
+        return replace(estimate, t=estimate.t * length[..., None])
+
+    def record(self, batch: Labelled[PairObservations, PairTruth], dataset: Pairs) -> PairSample:
+        """Return the pairs' true relative poses, rigs, draws and views."""
+        R, t = batch.truth.relative_pose()
+        observations = batch.observations
+        return PairSample(R, t, observations.rig, observations.draw, observations.pair)
+
+    def tables(self, dataset: Pairs) -> RigTables:
+        """Return the true rigs."""
+        return RigTables.from_rigs(dataset.rigs)
+
+    def meta(self) -> dict[str, Any]:
+        """Return the number of frames of a pair."""
+        return {"frames": self.pairs.frames}
+
+    def metrics(self, predictions: PairPredictions) -> dict[str, Any]:
+        """Return the content of metrics.json."""
+        return evaluate_pairs(predictions)
+
+    def report(self) -> Report:
+        """Return the tables and figures; imported here, since drawing is slow to import."""
+        from ghpt.report.pair_tensorboard import REPORT
+
+        return REPORT
 
 
 def random_subsets(
     both: Bool[Tensor, "B N"], count: int, size: int, keys: Int[Tensor, " B"]
 ) -> Bool[Tensor, "B H N"]:
-    """For each hypothesis ``size`` random usable correspondences: at most half of them, 8 at least,
-    all if fewer.
+    """Return for each hypothesis ``size`` random correspondences that both views see.
+
+    There are at most half of all, but 8 at least; all where there are fewer.
     """
-    number = both.shape[-1]
-    size = (both.sum(-1) // 2).clamp(MINIMUM, max(size, MINIMUM)).clamp_max(number)
+    total = both.shape[-1]
+    half = both.sum(-1) // 2
+    sizes = half.clamp(MINIMUM, max(size, MINIMUM)).clamp_max(total)
     # a hash of 64 bits makes two numbers to order the correspondences by
-    order = randomness.bits(keys, (count, -(-number // 2))).view(torch.int32)[..., :number]
+    bits = randomness.bits(keys, (count, -(-total // 2)))
+    order = bits.view(torch.int32)[..., :total]
     order = torch.where(both[:, None], order, torch.iinfo(torch.int32).max)
-    chosen = order.topk(int(size.max()) if len(size) else 0, dim=-1, largest=False).indices
-    first = (torch.arange(chosen.shape[-1], device=both.device) < size[:, None, None]).expand_as(
-        chosen
-    )
-    return torch.zeros_like(order, dtype=torch.bool).scatter(-1, chosen, first) & both[:, None]
+    most = int(sizes.max()) if len(sizes) else 0
+    chosen = order.topk(most, dim=-1, largest=False).indices
+    within = torch.arange(most, device=both.device) < sizes[:, None, None]
+    none = torch.zeros_like(order, dtype=torch.bool)
+    return none.scatter(-1, chosen, within.expand_as(chosen)) & both[:, None]
 
 
 def quantiles(
     values: Float[Tensor, "*B N"], mask: Bool[Tensor, "*B N"], count: int
 ) -> Float[Tensor, "*B D"]:
-    """``count`` evenly spaced quantiles (0 to 1, linear between order statistics) of the values in
-    the mask; else 0.
+    """Return ``count`` evenly spaced quantiles, from 0 to 1, of the values in the mask.
+
+    They are linear between order statistics, and 0 where the mask is empty.
     """
-    ordered = _sorted(torch.where(mask, values, torch.inf))
+    ordered = _sort(torch.where(mask, values, torch.inf))
     number = mask.sum(-1, keepdim=True)
-    place = torch.linspace(0, 1, count, dtype=values.dtype, device=values.device) * (
-        number - 1
-    ).clamp_min(0)
+    last = (number - 1).clamp_min(0)
+    levels = torch.linspace(0, 1, count, dtype=values.dtype, device=values.device)
+    place = levels * last
     low = place.floor().long()
-    high = torch.minimum(low + 1, (number - 1).clamp_min(0))
+    high = torch.minimum(low + 1, last)
     below = ordered.gather(-1, low)
     above = ordered.gather(-1, high)
-    found = torch.where(high > low, torch.lerp(below, above, place - low), below)
+    between = torch.lerp(below, above, place - low)
+    found = torch.where(high > low, between, below)
     return torch.where(number > 0, found, 0.0)
 
 
-def _sorted(values: Float[Tensor, "*B N"]) -> Float[Tensor, "*B N"]:
+def _sort(values: Float[Tensor, "*B N"]) -> Float[Tensor, "*B N"]:
     if values.device.type != "cpu":
         return values.sort(dim=-1).values
-    return torch.from_numpy(
-        np.sort(values.numpy(), axis=-1)
-    )  # torch also makes the indices, 8 times slower
+    # torch also makes the indices, 8 times slower
+    return torch.from_numpy(np.sort(values.numpy(), axis=-1))

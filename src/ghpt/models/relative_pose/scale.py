@@ -151,9 +151,9 @@ class BodyScale(Scale):
     def __call__(
         self, estimate: RelativePoseEstimate, batch: PairObservations
     ) -> Float[Tensor, "*B"]:
-        key_points = batch.of_pair(batch.key_points)
-        valid = batch.of_pair(batch.valid)
-        K = batch.of_pair(batch.K).double()
+        key_points = batch.select_pair(batch.key_points)
+        valid = batch.select_pair(batch.valid)
+        K = batch.select_pair(batch.K).double()
         lengths = torch.tensor(self.lengths, dtype=torch.float64)
         scales = [
             self._of_pair(

@@ -1,7 +1,9 @@
-"""The work of the ablations: a model's selections on several sets of frames, at several pool sizes
-and temperatures.
-"""
+"""The action of the ablations: a model's selections at several pool sizes and temperatures."""
 
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,43 +17,60 @@ from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
 from ghpt.skeleton import JOINTS
 
-AGGREGATIONS = ("weight", "average", "best")
+SELECTIONS = ("weight", "average", "best")
+
+
+@dataclass(frozen=True)
+class PoolSetting:
+    """A number of hypotheses and a temperature; None: the model's own."""
+
+    hypotheses: int | None = None
+    temperature: float | None = None
 
 
 @torch.no_grad()
-def evaluate(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
-    """Test the model of ``dependencies["model"]`` on each data module of ``config["sets"]`` under each of
-    ``config["settings"]``, pairs of a number of hypotheses and a temperature (None: the model's
-    own).
+def measure_pools(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
+    """Test the model of the dependency ``model`` on each of ``splits`` with each of ``pools``.
 
-    result.json: set -> for each setting selection -> pelvis-relative MPJPE (mm). A smaller pool is
-    the beginning of a larger one, the same that test.py draws with so many hypotheses.
+    ``splits`` holds a DataModule by a split's name, ``pools`` holds `PoolSetting`s. result.json:
+    split -> for each pool, selection -> pelvis-relative MPJPE (mm). A smaller pool is the beginning
+    of a larger one, the same that test.py draws with so many hypotheses.
     """
     model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
     model.eval()
-    settings = [(h or model.hypotheses, t or model.temperature) for h, t in config["settings"]]
+    pools = [PoolSetting(**pool) for pool in config["pools"]]
     result = {}
-    for name, set_of_frames in config["sets"].items():
-        data = build(set_of_frames, "data")
+    for name, settings in config["splits"].items():
+        data = build(settings, "data")
         data.setup("test")
-        result[name] = errors(model, data.frames["test"], settings, data.batch_size)
+        result[name] = measure_frames(model, data.frames["test"], pools, data.batch_size)
     write_json(folder / "result.json", result)
 
 
-def errors(
-    model: StochasticEstimator, frames: Frames, settings: list[tuple[int, float]], batch_size: int
+def measure_frames(
+    model: StochasticEstimator, frames: Frames, pools: Sequence[PoolSetting], batch_size: int
 ) -> list[dict[str, float]]:
-    """Pelvis-relative MPJPE (mm) of the selections under each setting."""
-    metrics = [{name: MPJPE("relative", 1, len(JOINTS)) for name in AGGREGATIONS} for _ in settings]
-    model.hypotheses = max(count for count, _ in settings)
+    """Return the pelvis-relative MPJPE (mm) of the selections with each pool."""
+    metrics = [_PoolMetrics(model, pool) for pool in pools]
+    model.hypotheses = max(of_pool.hypotheses for of_pool in metrics)
     for first in range(0, len(frames), batch_size):
         batch = frames[range(first, min(first + batch_size, len(frames)))]
         pool = model.sample(batch.observations, "test", batch.truth)
-        for each, (count, temperature) in zip(metrics, settings, strict=True):
-            part = pool.first(count).with_temperature(temperature)
-            for name, metric in each.items():
-                group = torch.zeros_like(batch.observations.index)
+        group = torch.zeros_like(batch.observations.index)
+        for of_pool in metrics:
+            part = pool.first(of_pool.hypotheses).with_temperature(of_pool.temperature)
+            for name, metric in of_pool.metrics.items():
                 metric.update(part.estimate(name), batch.truth, group)
-    return [
-        {name: metric.compute().mean.item() for name, metric in each.items()} for each in metrics
-    ]
+    return [of_pool.compute() for of_pool in metrics]
+
+
+class _PoolMetrics:
+    """The errors of the selections with one pool."""
+
+    def __init__(self, model: StochasticEstimator, pool: PoolSetting) -> None:
+        self.hypotheses = pool.hypotheses or model.hypotheses
+        self.temperature = pool.temperature or model.temperature
+        self.metrics = {name: MPJPE("relative", 1, len(JOINTS)) for name in SELECTIONS}
+
+    def compute(self) -> dict[str, float]:
+        return {name: metric.compute().mean.item() for name, metric in self.metrics.items()}

@@ -1,263 +1,312 @@
-"""Ablations over a quantity: temperature, hypotheses, training samples; a table and a figure each."""
+"""Ablations over a quantity, with a table and a figure each."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from dataclasses import dataclass
 
-from ghpt.paper.ablations.tasks import BASE, CHANCE, DEFAULT, NOTE, SETS, evaluated, number, trained
-from ghpt.paper.engine.artefact import Claim, Results, Section, Spread, signed
+from ghpt.paper.ablations.actions import PoolSetting
+from ghpt.paper.ablations.tasks import (
+    BASE,
+    CHANCE,
+    DEFAULT,
+    NOTE,
+    SPLITS,
+    evaluate_model,
+    read_error,
+    train_variant,
+)
+from ghpt.paper.engine.artefact import Claim, Number, Results, Section, Spread, figure_block, signed
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
-from ghpt.paper.robustness.figure import LABELS, Panel, curves
-from ghpt.report.tables import NAMES, NONE, markdown
-
-Place = float | int
-"""A number of hypotheses, say."""
-Row = tuple[str, str, int]
-"""Task, selection, number of the setting."""
-Lines = Mapping[str, Mapping[Place, Row]]
-"""Style -> place -> what stands there."""
+from ghpt.paper.robustness.figure import LABELS, Line, Panel, draw_curves
+from ghpt.report.document import Block, Paragraph, Table
+from ghpt.report.tables import NAMES, NONE
 
 
-def default(setup: Setup, *keys: str) -> Any:
-    """Of the configuration of training."""
-    value: Any = setup.trained(BASE).config
-    for key in keys:
-        value = value[key]
-    return value
+@dataclass(frozen=True)
+class Source:
+    """Where an error stands: a task, a selection, and the number of the pool."""
+
+    task: str
+    selection: str
+    pool: int = 0
 
 
-def levels(setup: Setup, name: str, *keys: str) -> list[Place]:
-    """Of ``sizes.ablation``, and the default, which ``keys`` lead to."""
-    return sorted({*setup.sizes["ablation"][name], default(setup, *keys)})
+@dataclass(frozen=True)
+class SweepLine:
+    """A column of the table and a line of the figure."""
+
+    label: str
+    sources: Mapping[Number, Source]
+    """By the quantity, such as a number of hypotheses."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a sweep varies."""
+
+    name: str
+    """The name of its figure."""
+    label: str
+    """The head of its table and the label of the axis."""
+    default: Number
+    about: str
+
+
+Errors = Mapping[str, Mapping[Number, Spread]]
+"""Style -> quantity -> error (mm)."""
+
+
+@dataclass(frozen=True)
+class Defaults:
+    """The defaults of training that the sweeps vary."""
+
+    temperature: float
+    hypotheses: int
+    samples: int
+
+    @classmethod
+    def of(cls, setup: Setup) -> Defaults:
+        """Return the defaults in a setup's configuration of training."""
+        config = setup.trained(BASE).config
+        model = config["model"]
+        samples = config["data"]["train_samples"]
+        return cls(float(model["temperature"]), model["hypotheses"], samples)
 
 
 def temperature_tasks(setup: Setup) -> dict[str, Task]:
-    values = levels(setup, "temperature", "model", "temperature")
+    """Return models trained with each temperature, and the default's tested with each."""
+    default = Defaults.of(setup).temperature
+    values = _temperatures(setup)
+    pools = [PoolSetting(temperature=value) for value in values]
+    trainings = {DEFAULT: BASE, **{data: data for data in _novel(setup)}}
     tasks = {
-        name: evaluated(setup, setup.trained(data), [(None, value) for value in values])
-        for name, data in {DEFAULT: BASE, **{novel: novel for novel in _novel(setup)}}.items()
+        name: evaluate_model(setup, setup.trained(data), pools) for name, data in trainings.items()
     }
     for value in values:
-        if value != default(setup, "model", "temperature"):
-            model = trained(setup, BASE, f"model.temperature={value}", name=f"temperature{value:g}")
-            tasks[f"{value:g}"] = evaluated(setup, model)
+        if value != default:
+            override = f"model.temperature={value}"
+            model = train_variant(setup, BASE, override, name=f"temperature{value:g}")
+            tasks[f"{value:g}"] = evaluate_model(setup, model)
     return tasks
 
 
-def _novel(setup: Setup) -> list[str]:
-    """The first other training set, if there is one: what a temperature is worth depends on it."""
-    return setup.sizes["ablation"]["also_trained_on"][:1]
+def _temperatures(setup: Setup) -> list[float]:
+    return sorted({*setup.sizes.ablation.temperature, Defaults.of(setup).temperature})
+
+
+def _novel(setup: Setup) -> Sequence[str]:
+    """Return the first other training set, if any: what a temperature is worth depends on it."""
+    return setup.sizes.ablation.also_trained_on[:1]
 
 
 def temperature(results: Results) -> Section:
+    """Return the section of the temperature."""
     setup = results.setup
-    values, usual = (
-        f(setup, *x, "model", "temperature") for f, x in ((levels, ("temperature",)), (default, ()))
-    )
-    lines: dict[str, Mapping[Place, Row]] = {
-        "weight": {
-            v: (DEFAULT, "weight", i) if v == usual else (f"{v:g}", "weight", 0)
-            for i, v in enumerate(values)
-        },
-        "tested": {v: (DEFAULT, "weight", i) for i, v in enumerate(values)},
-        "average": {v: (DEFAULT, "average", i) for i, v in enumerate(values)},
+    default = Defaults.of(setup).temperature
+    values = _temperatures(setup)
+    trained = {value: Source(f"{value:g}", "weight") for value in values}
+    trained[default] = Source(DEFAULT, "weight", values.index(default))
+    lines = {
+        "weight": SweepLine("trained and tested with it", trained),
+        "tested": SweepLine(
+            f"trained with {default:g}, tested with it", _pool_sources(DEFAULT, "weight", values)
+        ),
+        "average": SweepLine(LABELS["average"], _pool_sources(DEFAULT, "average", values)),
     }
-    labels = LABELS | {
-        "weight": "trained and tested with it",
-        "tested": f"trained with {usual:g}, tested with it",
-    }
-    for novel in _novel(setup):
-        lines["trained"] = {v: (novel, "weight", i) for i, v in enumerate(values)}
-        labels["trained"] = f"the same, trained on {NAMES[novel]}"
-    text = (
-        "The temperature divides the logits before the softmax. Low, the weights gather on the best-scored hypotheses; "
-        "high, they become the average."
+    for data in _novel(setup):
+        label = f"the same, trained on {NAMES[data]}"
+        lines["trained"] = SweepLine(label, _pool_sources(data, "weight", values))
+    about = (
+        "The temperature divides the logits before the softmax. Low, the weights gather on the "
+        "best-scored hypotheses; high, they become the average."
     )
-    return _section(results, "temperature", "temperature", lines, labels, text, usual)
+    return _section(results, Quantity("temperature", "temperature", default, about), lines)
+
+
+def _pool_sources(task: str, selection: str, values: Sequence[Number]) -> dict[Number, Source]:
+    """Return the sources of a task that was tested with a pool for each value."""
+    return {value: Source(task, selection, index) for index, value in enumerate(values)}
 
 
 def hypotheses_tasks(setup: Setup) -> dict[str, Task]:
-    values = levels(setup, "hypotheses", "model", "hypotheses")
-    usual = default(setup, "model", "hypotheses")
-    tasks = {
-        DEFAULT: evaluated(
-            setup, setup.trained(BASE), [(value, None) for value in values], seconds=30.0
-        )
-    }
-    for value in setup.sizes["ablation"]["hypotheses_trained"]:
-        if value != usual:
-            seconds = 4 + 16 * value / usual
-            model = trained(
-                setup, BASE, f"model.hypotheses={value}", name=f"hypotheses{value}", seconds=seconds
+    """Return the default's model tested with each number, and models trained with some."""
+    default = Defaults.of(setup).hypotheses
+    pools = [PoolSetting(hypotheses=value) for value in _hypotheses(setup)]
+    tasks = {DEFAULT: evaluate_model(setup, setup.trained(BASE), pools, seconds=30.0)}
+    for value in setup.sizes.ablation.hypotheses_trained:
+        if value != default:
+            model = train_variant(
+                setup,
+                BASE,
+                f"model.hypotheses={value}",
+                name=f"hypotheses{value}",
+                seconds=4 + 16 * value / default,
             )
-            tasks[f"{value}"] = evaluated(setup, model, [(usual, None)])
+            tasks[f"{value}"] = evaluate_model(setup, model, [PoolSetting(hypotheses=default)])
     return tasks
+
+
+def _hypotheses(setup: Setup) -> list[int]:
+    return sorted({*setup.sizes.ablation.hypotheses, Defaults.of(setup).hypotheses})
 
 
 def hypotheses(results: Results) -> Section:
+    """Return the section of the number of hypotheses."""
     setup = results.setup
-    values, usual = (
-        f(setup, *x, "model", "hypotheses") for f, x in ((levels, ("hypotheses",)), (default, ()))
+    default = Defaults.of(setup).hypotheses
+    values = _hypotheses(setup)
+    weight = f"learned, trained with {default}, tested with it"
+    labels = {"weight": weight, "average": LABELS["average"], "best": LABELS["best"]}
+    lines = {
+        name: SweepLine(label, _pool_sources(DEFAULT, name, values))
+        for name, label in labels.items()
+    }
+    trained = sorted({*setup.sizes.ablation.hypotheses_trained, default})
+    sources: dict[Number, Source] = {value: Source(f"{value}", "weight") for value in trained}
+    sources[default] = Source(DEFAULT, "weight", values.index(default))
+    lines["trained"] = SweepLine(f"learned, trained with it, tested with {default}", sources)
+    about = (
+        "Hypotheses in a pool. A smaller pool is the beginning of a larger one. The best "
+        "hypothesis looks at the truth."
     )
-    lines: dict[str, Mapping[Place, Row]] = {
-        name: {v: (DEFAULT, name, i) for i, v in enumerate(values)}
-        for name in ("weight", "average", "best")
-    }
-    taught = sorted({*setup.sizes["ablation"]["hypotheses_trained"], usual})
-    lines["trained"] = {
-        v: (DEFAULT, "weight", values.index(usual)) if v == usual else (f"{v}", "weight", 0)
-        for v in taught
-    }
-    labels = LABELS | {
-        "weight": f"learned, trained with {usual}, tested with it",
-        "trained": f"learned, trained with it, tested with {usual}",
-    }
-    text = "Hypotheses in a pool. A smaller pool is the beginning of a larger one. The best hypothesis looks at the truth."
-    return _section(results, "hypotheses", "hypotheses", lines, labels, text, usual)
+    return _section(results, Quantity("hypotheses", "hypotheses", default, about), lines)
 
 
 def samples_tasks(setup: Setup) -> dict[str, Task]:
-    usual = default(setup, "data", "train_samples")
-    hypotheses = default(setup, "model", "hypotheses")
-    pool = setup.sizes["ablation"]["samples_hypotheses"]
+    """Return models trained with each number of samples, in smaller pools."""
+    defaults = Defaults.of(setup)
+    pool = setup.sizes.ablation.samples_hypotheses
     tasks = {"model": setup.trained(BASE)}
-    for value in levels(setup, "samples", "data", "train_samples"):
-        changes = [f"model.hypotheses={pool}"]
-        seconds = 4 + 25 * value / usual * pool / hypotheses
+    for value in _samples(setup):
+        overrides = [f"model.hypotheses={pool}"]
         name = f"hypotheses{pool}"
-        if value != usual:
-            changes = [*changes, f"data.train_samples={value}"]
+        if value != defaults.samples:
+            overrides.append(f"data.train_samples={value}")
             name = f"samples{value}-{name}"
-        model = trained(setup, BASE, *changes, name=name, seconds=seconds)
-        tasks[f"{value}"] = evaluated(setup, model, [(hypotheses, None)])
+        seconds = 4 + 25 * value / defaults.samples * pool / defaults.hypotheses
+        model = train_variant(setup, BASE, *overrides, name=name, seconds=seconds)
+        tested = [PoolSetting(hypotheses=defaults.hypotheses)]
+        tasks[f"{value}"] = evaluate_model(setup, model, tested)
     return tasks
 
 
+def _samples(setup: Setup) -> list[int]:
+    return sorted({*setup.sizes.ablation.samples, Defaults.of(setup).samples})
+
+
 def samples(results: Results) -> Section:
+    """Return the section of the number of training samples."""
     setup = results.setup
-    values, usual = (
-        f(setup, *x, "data", "train_samples") for f, x in ((levels, ("samples",)), (default, ()))
+    defaults = Defaults.of(setup)
+    values = _samples(setup)
+    pool = setup.sizes.ablation.samples_hypotheses
+    lines = {}
+    for name in ("weight", "average"):
+        sources: dict[Number, Source] = {value: Source(f"{value}", name) for value in values}
+        lines[name] = SweepLine(LABELS[name], sources)
+    about = (
+        "Training samples, each seen once, in batches of 16: a model trained on 50 has had four "
+        "steps. More samples mean more steps too, as in appendix C, where an iteration is a "
+        f"sample. All models of this sweep are trained with {pool} hypotheses, for the sake of "
+        f"time, and tested with {defaults.hypotheses}; what that costs is in ablation-hypotheses."
     )
-    name = {v: f"{v}" for v in values}
-    pool = setup.sizes["ablation"]["samples_hypotheses"]
-    tested = default(setup, "model", "hypotheses")
-    lines: Lines = {
-        "weight": {v: (name[v], "weight", 0) for v in values},
-        "average": {v: (name[v], "average", 0) for v in values},
-    }
-    text = (
-        "Training samples, each seen once, in batches of 16: a model trained on 50 has had four steps. More samples "
-        f"mean more steps too, as in appendix C, where an iteration is a sample. All models of this sweep are trained "
-        f"with {pool} hypotheses, for the sake of time, and tested with {tested}; what that costs is in "
-        "ablation-hypotheses."
-    )
-    claims = [_enough(results, name, usual), _minutes(results)]
-    return _section(results, "samples", "training samples", lines, LABELS, text, usual, claims)
+    quantity = Quantity("samples", "training samples", defaults.samples, about)
+    claims = [_enough_claim(results, values, defaults.samples), _minutes_claim(results)]
+    return _section(results, quantity, lines, claims)
 
 
-def _enough(results: Results, tasks: Mapping[Place, str], usual: Place) -> Claim:
-    """Appendix C on the number of samples."""
-    errors = {n: number(results, task, "test").mean for n, task in tasks.items()}
-    best = min(errors, key=lambda n: errors[n])
-    by = (
-        f"{errors[usual]:.1f} mm of {usual:g}; the best of {', '.join(f'{n:g}' for n in tasks)} is {best:g} with "
-        f"{errors[best]:.1f} mm ({signed(100 * (errors[best] / errors[usual] - 1))} %)"
-    )
+def _enough_claim(results: Results, values: Sequence[int], default: int) -> Claim:
+    """Return what appendix C says of the number of samples."""
+    errors = {value: read_error(results, f"{value}", "test").mean for value in values}
+    best = min(errors, key=errors.__getitem__)
+    gain = signed(100 * (errors[best] / errors[default] - 1))
+    tested = ", ".join(f"{value:g}" for value in values)
     return Claim(
         "best results with only 500 samples (held if within 1 % of the best)",
         "C",
-        errors[usual] <= 1.01 * errors[best],
-        by,
+        errors[default] <= 1.01 * errors[best],
+        f"{errors[default]:.1f} mm of {default:g}; the best of {tested} is {best:g} with "
+        f"{errors[best]:.1f} mm ({gain} %)",
     )
 
 
-def _minutes(results: Results) -> Claim:
-    seconds = Spread(tuple(about["seconds"] for about in results.read("model", "task.json")))
-    return Claim(
-        "about 3 minutes to train",
-        "C",
-        seconds.mean <= 180,
-        f"{seconds.mean:.0f} s on a processor, beside other work",
-    )
+def _minutes_claim(results: Results) -> Claim:
+    seconds = results.spread("model", "seconds", file="task.json").mean
+    evidence = f"{seconds:.0f} s on a processor, beside other work"
+    return Claim("about 3 minutes to train", "C", seconds <= 180, evidence)
 
 
 def _section(
     results: Results,
-    name: str,
-    head: str,
-    lines: Lines,
-    labels: Mapping[str, str],
-    text: str,
-    usual: Place,
+    quantity: Quantity,
+    lines: Mapping[str, SweepLine],
     claims: Sequence[Claim] = (),
 ) -> Section:
-    """A table with a row for each place, and a panel for each set."""
-    numbers = {
-        split: {
-            style: {
-                x: number(results, task, split, selection, i)
-                for x, (task, selection, i) in row.items()
-            }
-            for style, row in lines.items()
-        }
-        for split in SETS
-    }
-    panels = [
-        Panel(
-            f"{head}; {SETS[split]}",
-            {style: (list(row), list(row.values())) for style, row in rows.items()},
-            logarithmic=True,
-            mark=usual,
-        )
-        for split, rows in numbers.items()
-    ]
+    """Return a table with a row for each value of the quantity, and a panel for each split."""
+    labels = {style: line.label for style, line in lines.items()}
+    errors = {split: _errors(results, lines, split) for split in SPLITS}
+    panels = [_panel(quantity, split, errors[split]) for split in SPLITS]
     data = results.display_name(BASE)
-    figure = curves(
-        panels,
-        f"{data}, trained on its training subjects unless said",
-        "pelvis-relative MPJPE, mm",
-        labels,
-        False,
-    )
-    body = [
-        f"{text} Trained and tested on Human3.6M unless said.",
-        f"![Pelvis-relative MPJPE against {head}, {data}](ablation_{name}.svg)",
-        *(
-            f"Pelvis-relative MPJPE, mm, {SETS[split]}:\n\n{_table(head, numbers[split], labels, usual)}"
-            for split in SETS
-        ),
-        _chosen(numbers["validation"]["weight"], numbers["test"]["weight"], usual),
+    heading = f"{data}, trained on its training subjects unless said"
+    figure = draw_curves(panels, heading, "pelvis-relative MPJPE, mm", labels, share=False)
+    name = f"ablation_{quantity.name}"
+    caption = f"Pelvis-relative MPJPE against {quantity.label}, {data}"
+    blocks: list[Block] = [
+        Paragraph(f"{quantity.about} Trained and tested on Human3.6M unless said."),
+        figure_block(name, caption),
     ]
-    return Section(data, "\n\n".join(body), {f"ablation_{name}": figure}, claims=claims)
+    for split, shown in SPLITS.items():
+        blocks.append(Paragraph(f"Pelvis-relative MPJPE, mm, {shown}:"))
+        blocks.append(_table(quantity, errors[split], labels))
+    blocks.append(Paragraph(_choice(errors, quantity.default)))
+    return Section(data, blocks, {name: figure}, claims=claims)
 
 
-def _table(
-    head: str, lines: Mapping[str, Mapping[Place, Spread]], labels: Mapping[str, str], usual: Place
-) -> str:
-    """A row for each place, a column for each line."""
-    places = sorted({x for row in lines.values() for x in row})
-    return markdown(
-        [head, *(labels.get(name, name) for name in lines)],
-        [
-            [f"{x:g}{' (default)' * (x == usual)}", *(_text(row.get(x)) for row in lines.values())]
-            for x in places
-        ],
+def _errors(
+    results: Results, lines: Mapping[str, SweepLine], split: str
+) -> dict[str, dict[Number, Spread]]:
+    """Return the errors of each line on a split."""
+    errors: dict[str, dict[Number, Spread]] = {}
+    for style, line in lines.items():
+        errors[style] = {
+            value: read_error(results, source.task, split, source.selection, source.pool)
+            for value, source in line.sources.items()
+        }
+    return errors
+
+
+def _panel(quantity: Quantity, split: str, errors: Errors) -> Panel:
+    lines = {
+        style: Line(list(by_value), list(by_value.values())) for style, by_value in errors.items()
+    }
+    label = f"{quantity.label}; {SPLITS[split]}"
+    return Panel(label, lines, logarithmic=True, mark=quantity.default)
+
+
+def _table(quantity: Quantity, errors: Errors, labels: Mapping[str, str]) -> Table:
+    """Return a table with a row for each value of the quantity and a column for each line."""
+    values = sorted({value for by_value in errors.values() for value in by_value})
+    rows = []
+    for value in values:
+        name = f"{value:g} (default)" if value == quantity.default else f"{value:g}"
+        of_value = [by_value.get(value) for by_value in errors.values()]
+        rows.append([name, *(NONE if error is None else error.text() for error in of_value)])
+    return Table([quantity.label, *(labels[style] for style in errors)], rows)
+
+
+def _choice(errors: Mapping[str, Errors], default: Number) -> str:
+    """Return what the validation subject would choose, and what that is worth on the test."""
+    validation = {value: error.mean for value, error in errors["validation"]["weight"].items()}
+    test = {value: error.mean for value, error in errors["test"]["weight"].items()}
+    best = min(validation, key=validation.__getitem__)
+    gain = signed(100 * (validation[best] / validation[default] - 1))
+    worth = signed(100 * (test[best] / test[default] - 1))
+    if validation[best] > (1 - CHANCE) * validation[default]:
+        least = "" if best == default else f" (the least error is at {best:g}, {gain} %)"
+        return f"Validation keeps the default, {default:g}{least}. {NOTE}"
+    return (
+        f"Validation would choose {best:g} ({gain} % against the default); on the test subjects "
+        f"that is {worth} %."
     )
-
-
-def _chosen(validation: Mapping[Place, Spread], test: Mapping[Place, Spread], usual: Place) -> str:
-    """What the validation subject would choose, and what that is worth on the test."""
-    best = min(validation, key=lambda x: validation[x].mean)
-    gain, worth = (
-        signed(100 * (errors[best].mean / errors[usual].mean - 1)) for errors in (validation, test)
-    )
-    if validation[best].mean > (1 - CHANCE) * validation[usual].mean:
-        least = "" if best == usual else f" (the least error is at {best:g}, {gain} %)"
-        return f"Validation keeps the default, {usual:g}{least}. {NOTE}"
-    return f"Validation would choose {best:g} ({gain} % against the default); on the test subjects that is {worth} %."
-
-
-def _text(spread: Spread | None) -> str:
-    return NONE if spread is None else spread.text()

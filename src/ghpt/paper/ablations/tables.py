@@ -1,5 +1,6 @@
-"""Ablations: one setting of the pose model changed at a time; validation chooses, the test says
-what it is worth.
+"""Ablations: one setting of the pose model changed at a time.
+
+Validation chooses, and the test says what the choice is worth.
 """
 
 from __future__ import annotations
@@ -8,11 +9,20 @@ from collections.abc import Mapping, Sequence
 from functools import partial
 
 from ghpt.paper.ablations import sweeps
-from ghpt.paper.ablations.tasks import BASE, CHANCE, NOTE, SETS, evaluated, number, trained
+from ghpt.paper.ablations.tasks import (
+    BASE,
+    CHANCE,
+    NOTE,
+    SPLITS,
+    evaluate_model,
+    read_error,
+    train_variant,
+)
 from ghpt.paper.engine.artefact import Artefact, Results, Section, Spread, signed
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
-from ghpt.report.tables import NAMES, markdown
+from ghpt.report.document import Paragraph, Table
+from ghpt.report.tables import NAMES
 
 Variants = Mapping[str, str]
 """Name -> experiment of conf/experiment; none for the default."""
@@ -29,69 +39,74 @@ SELECTION: Variants = {
 
 
 def _tasks(setup: Setup, variants: Variants) -> dict[str, Task]:
-    def model(data: str, experiment: str) -> Task:
-        if not experiment:
-            return setup.trained(data)
-        return trained(setup, data, f"experiment={experiment}", name=experiment)
+    splits: dict[str, tuple[str, ...]] = {}
+    for data in setup.sizes.ablation.also_trained_on:
+        splits[data] = ("test",)
+    splits[BASE] = tuple(SPLITS)
+    tasks = {}
+    for data, of_data in splits.items():
+        for name, experiment in variants.items():
+            model = _train(setup, data, experiment)
+            tasks[f"{data}: {name}"] = evaluate_model(setup, model, splits=of_data)
+    return tasks
 
-    splits = dict.fromkeys(setup.sizes["ablation"]["also_trained_on"], ("test",)) | {
-        BASE: tuple(SETS)
-    }
-    return {
-        f"{data}: {name}": evaluated(setup, model(data, experiment), splits=of_data)
-        for data, of_data in splits.items()
-        for name, experiment in variants.items()
-    }
+
+def _train(setup: Setup, data: str, experiment: str) -> Task:
+    if not experiment:
+        return setup.trained(data)
+    return train_variant(setup, data, f"experiment={experiment}", name=experiment)
 
 
 def _section(results: Results, variants: Variants, about: str) -> Section:
-    novel = [(data, "test") for data in results.setup.sizes["ablation"]["also_trained_on"]]
-    columns = [*((BASE, split) for split in SETS), *novel]
-    numbers = {
-        name: [number(results, f"{data}: {name}", split) for data, split in columns]
-        for name in variants
-    }
-    usual = next(iter(variants))
-    average = [number(results, f"{data}: {usual}", split, "average") for data, split in columns]
-    rows = [[name, *(s.text() for s in spreads)] for name, spreads in numbers.items()]
-    rows.append(["average of the same pool", *(s.text() for s in average)])
-    head = [
-        "MPJPE, mm",
-        *(
-            SETS[split] if data == BASE else f"test, trained on {NAMES[data]}"
-            for data, split in columns
-        ),
+    novel = [(data, "test") for data in results.setup.sizes.ablation.also_trained_on]
+    columns = [*((BASE, split) for split in SPLITS), *novel]
+    errors = {}
+    for name in variants:
+        errors[name] = [read_error(results, f"{data}: {name}", split) for data, split in columns]
+    default = next(iter(variants))
+    average = [
+        read_error(results, f"{data}: {default}", split, "average") for data, split in columns
     ]
-    table = "Pelvis-relative MPJPE of the weighted selection on Human3.6M, trained on Human3.6M unless said."
-    body = [f"{about} {table}", markdown(head, rows), _chosen(numbers)]
-    return Section(results.display_name(BASE), "\n\n".join(body))
+    rows = errors | {"average of the same pool": average}
+    header = [
+        SPLITS[split] if data == BASE else f"test, trained on {NAMES[data]}"
+        for data, split in columns
+    ]
+    text = (
+        f"{about} Pelvis-relative MPJPE of the weighted selection on Human3.6M, trained on "
+        "Human3.6M unless said."
+    )
+    table = Table(
+        ["MPJPE, mm", *header],
+        [[name, *(error.text() for error in of_row)] for name, of_row in rows.items()],
+    )
+    return Section(results.display_name(BASE), [Paragraph(text), table, Paragraph(_choice(errors))])
 
 
-def _chosen(numbers: Mapping[str, Sequence[Spread]]) -> str:
-    """What the validation subject would choose, and what each other setting changes."""
-    usual = next(iter(numbers))
-    best = min(numbers, key=lambda name: numbers[name][0].mean)
-    tied = numbers[best][0].mean > (1 - CHANCE) * numbers[usual][0].mean
-    parts = ["Validation keeps the default." if tied else f"Validation would choose: {best}."]
-    for name, spreads in numbers.items():
-        if name != usual:
-            changes = (
-                100 * (a.mean / b.mean - 1) for a, b in zip(spreads, numbers[usual], strict=True)
-            )
-            parts.append(
-                f"Against the default, {name}: {', '.join(f'{signed(change)} %' for change in changes)}."
-            )
-    return " ".join([*parts, NOTE])
+def _choice(errors: Mapping[str, Sequence[Spread]]) -> str:
+    """Return what the validation subject would choose, and what each other setting changes."""
+    default = next(iter(errors))
+    best = min(errors, key=lambda name: errors[name][0].mean)
+    tied = errors[best][0].mean > (1 - CHANCE) * errors[default][0].mean
+    sentences = ["Validation keeps the default." if tied else f"Validation would choose: {best}."]
+    for name, of_variant in errors.items():
+        if name != default:
+            changes = _changes(of_variant, errors[default])
+            sentences.append(f"Against the default, {name}: {changes}.")
+    return " ".join([*sentences, NOTE])
+
+
+def _changes(errors: Sequence[Spread], default: Sequence[Spread]) -> str:
+    """Return the changes against the default in each column."""
+    pairs = zip(errors, default, strict=True)
+    changes = [100 * (error.mean / usual.mean - 1) for error, usual in pairs]
+    return ", ".join(f"{signed(change)} %" for change in changes)
 
 
 def _training(label: str, title: str, variants: Variants, about: str) -> Artefact:
-    return Artefact(
-        label,
-        "ablation",
-        title,
-        partial(_tasks, variants=variants),
-        partial(_section, variants=variants, about=about),
-    )
+    tasks = partial(_tasks, variants=variants)
+    section = partial(_section, variants=variants, about=about)
+    return Artefact(label, "ablation", title, tasks, section)
 
 
 ARTEFACTS = (
@@ -99,8 +114,8 @@ ARTEFACTS = (
         "ablation-gumbel",
         "Gumbel noise in training",
         GUMBEL,
-        "With the noise the weights of training are drawn from the Gumbel-softmax, without it they are the plain "
-        "softmax of the test.",
+        "With the noise the weights of training are drawn from the Gumbel-softmax, without it they "
+        "are the plain softmax of the test.",
     ),
     _training(
         "ablation-features",
@@ -112,8 +127,8 @@ ARTEFACTS = (
         "ablation-selection",
         "The hypothesis of the estimation loss",
         SELECTION,
-        "The estimation loss is that of the weighted average, or of one hypothesis drawn from the weights (its "
-        "gradient is that of the weights).",
+        "The estimation loss is that of the weighted average, or of one hypothesis drawn from the "
+        "weights (its gradient is that of the weights).",
     ),
     Artefact(
         "ablation-temperature",

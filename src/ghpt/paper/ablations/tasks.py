@@ -1,19 +1,20 @@
-"""The tasks of the ablations: a model with a setting changed, and its errors on validation and test
-subjects.
-"""
+"""The tasks of the ablations: a model with a setting changed, and its errors on two splits."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import asdict
 
+from ghpt.paper.ablations.actions import PoolSetting
 from ghpt.paper.engine.artefact import Results, Spread
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
 
+ACTION = "ghpt.paper.ablations.actions.measure_pools"
 BASE = "h36m"
 """The data set that all are tested on."""
-SETS = {"validation": "S8 (validation)", "test": "test"}
-"""Split -> in tables."""
+SPLITS = {"validation": "S8 (validation)", "test": "test"}
+"""Split -> its name in tables."""
 DEFAULT = "default"
 CHANCE = 0.01
 """A smaller gain, as a share of the error, chooses nothing."""
@@ -22,36 +23,42 @@ _SELDOM = 4096
 """Every so many frames are validated in training, for these models are tested here."""
 
 
-def trained(setup: Setup, data: str, *overrides: str, name: str, seconds: float = 16.0) -> Task:
-    """A model with other settings than the default."""
-    return setup.trained(data, *overrides, f"data.stride={_SELDOM}", name=name, seconds=seconds)
+def train_variant(
+    setup: Setup, data: str, *overrides: str, name: str, seconds: float = 16.0
+) -> Task:
+    """Return the training of a model with other settings than the default."""
+    stride = f"data.stride={_SELDOM}"
+    return setup.trained(data, *overrides, stride, name=name, seconds=seconds)
 
 
-def evaluated(
+def evaluate_model(
     setup: Setup,
     model: Task,
-    settings: Sequence[tuple[int | None, float | None]] = ((None, None),),
-    splits: Iterable[str] = SETS,
+    pools: Sequence[PoolSetting] = (PoolSetting(),),
+    splits: Iterable[str] = SPLITS,
     seconds: float = 5.0,
 ) -> Task:
-    """A model on splits of Human3.6M, with other (hypotheses, temperature) where not None."""
-    strides = setup.sizes["ablation"]["stride"]
-    sets = {}
+    """Return the test of a model on splits of Human3.6M, with each of the ``pools``."""
+    data = {}
+    files = {}
+    dependencies = {"model": model}
     for split in splits:
-        own = (f"data.evaluate={split}", f"data.stride={strides[split]}")
-        whole = setup.composed("test", BASE, *setup.overrides["test"], *own)
-        sets[split] = whole["data"]
-    config = {"sets": sets, "settings": [list(pair) for pair in settings], "seed": setup.seed}
-    config |= {"files": whole["files"]} if "files" in whole else {}
-    dependencies = {"model": model} | {split: setup.prepared(BASE, split) for split in splits}
+        stride = f"data.stride={setup.sizes.ablation.stride[split]}"
+        words = (*setup.overrides.test, f"data.evaluate={split}", stride)
+        whole = setup.composed("test", BASE, *words)
+        data[split] = whole["data"]
+        files = whole.get("files", {})
+        dependencies[split] = setup.prepared(BASE, split)
+    config = {"pools": [asdict(pool) for pool in pools], "seed": setup.seed, "splits": data}
+    if files:
+        config["files"] = files
     name = model.name.replace("train-pose", "ablation")
-    return Task(
-        name, "ghpt.paper.ablations.actions.evaluate", config, dependencies, seconds=seconds
-    )
+    return Task(name, ACTION, config, dependencies, seconds=seconds)
 
 
-def number(
-    results: Results, task: str, split: str, selection: str = "weight", setting: int = 0
+def read_error(
+    results: Results, task: str, split: str, selection: str = "weight", pool: int = 0
 ) -> Spread:
-    """Pelvis-relative MPJPE of an `evaluated` task, mm."""
-    return Spread(tuple(float(each[split][setting][selection]) for each in results.read(task)))
+    """Return the pelvis-relative MPJPE (mm) of a selection in an `evaluate_model` task."""
+    contents = results.read(task)
+    return Spread(tuple(float(content[split][pool][selection]) for content in contents))

@@ -2,80 +2,121 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
-import numpy as np
+from collections.abc import Mapping
+from dataclasses import dataclass
+from statistics import fmean
 
 from ghpt.models.relative_pose.evaluation import ALONE
-from ghpt.paper.camera.tasks import measured, of_pair, tested_pairs, three_rows
-from ghpt.paper.engine.artefact import Artefact, Claim, Comparison, Results, Section
-from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_DISSECTION
-from ghpt.report.tables import markdown
+from ghpt.paper.camera.tasks import PAIRS, pair_error, scaled, tested_pairs
+from ghpt.paper.engine.artefact import (
+    Artefact,
+    Claim,
+    Comparison,
+    Results,
+    Section,
+    comparison_rows,
+)
+from ghpt.paper.published import FUNDAMENTAL_DISSECTION
+from ghpt.report.document import Paragraph, Table
+
+HEADER = ["pair", "R: E_2D, px", "R: E_3D, mm", "t: E_2D, px", "t: E_3D, mm", "both: E_3D, mm"]
+
+
+@dataclass(frozen=True)
+class PartErrors:
+    """The errors of a pair with its rotation or its translation estimated, the other one true."""
+
+    rotation: float
+    translation: float
+
+    @property
+    def smaller(self) -> float:
+        return min(self.rotation, self.translation)
+
+
+def _part_errors(results: Results, error: str) -> dict[str, PartErrors]:
+    """Return the errors of each pair; E_2D in pixels, E_3D in mm."""
+    errors = {}
+    for pair in PAIRS:
+        parts = [pair_error(results, "weight", pair, part, error).mean for part in ALONE]
+        errors[pair] = PartErrors(*parts)
+    return errors
 
 
 def _dissection(results: Results) -> Section:
     rows = []
-    compared = []
-    for ab, printed in FUNDAMENTAL_DISSECTION.items():
-        pair = f"{ab[0]}-{ab[1]}"
-        numbers = [
+    comparisons = []
+    for (a, b), printed in FUNDAMENTAL_DISSECTION.items():
+        pair = f"{a}-{b}"
+        of_pair = [
             Comparison(
                 f"{pair} {error}, {part.replace('_', ' ')}",
                 printed[part][error],
-                measured(of_pair(results, "weight", pair, part, error)),
+                scaled(pair_error(results, "weight", pair, part, error)),
             )
             for part in ALONE
             for error in ("E_2D", "E_3D")
         ]
-        rows += three_rows(pair, numbers, [of_pair(results, "weight", pair, "E_3D").text()])
-        compared += numbers
-    head = ["pair", "R: E_2D, px", "R: E_3D, mm", "t: E_2D, px", "t: E_3D, mm", "both: E_3D, mm"]
-    text = "Errors of the weighted hypothesis when one part of the pose is estimated and the other one is true; medians."
-    alone = {
-        f"{a}-{b}": [of_pair(results, "weight", f"{a}-{b}", part, "E_3D").mean for part in ALONE]
-        for a, b in FUNDAMENTAL
-    }
-    pixels = [
-        [of_pair(results, "weight", pair, part, "E_2D").mean for part in ALONE] for pair in alone
-    ]
-    higher = [pair for pair, (R, t) in alone.items() if t > R]
-    both_higher = len(higher) + sum(t > R for R, t in pixels)
-    claim = Claim(
-        "errors of estimated translations are always higher than those of estimated rotations",
-        "appendix A",
-        both_higher == 2 * len(alone),
-        f"in {len(higher)} of {len(alone)} pairs in E_3D, in {both_higher - len(higher)} in E_2D "
-        f"(largest opposite: {_largest_opposite(alone)})",
+        paper, ours, difference = comparison_rows(f"{pair} ", of_pair)
+        both = pair_error(results, "weight", pair, "E_3D").text()
+        rows += [[*paper, ""], [*ours, both], [*difference, ""]]
+        comparisons += of_pair
+    text = (
+        "Errors of the weighted hypothesis when one part of the pose is estimated and the other "
+        "one is true; medians."
     )
     return Section(
         results.display_name("h36m"),
-        f"{text}\n\n{markdown(head, rows)}",
-        {},
-        compared,
-        [claim],
-        _compensation(results, alone),
+        [Paragraph(text), Table(HEADER, rows)],
+        comparisons=comparisons,
+        claims=[_translation_claim(results)],
+        explanation=_compensation(results),
     )
 
 
-def _largest_opposite(alone: Mapping[str, Sequence[float]]) -> str:
-    pair = max(alone, key=lambda pair: alone[pair][0] - alone[pair][1])
-    R, t = alone[pair]
-    return f"{pair}, R {R:.1f} mm, t {t:.1f} mm" if t <= R else "none"
+def _translation_claim(results: Results) -> Claim:
+    space = _part_errors(results, "E_3D")
+    image = _part_errors(results, "E_2D")
+    count_3d = sum(errors.translation > errors.rotation for errors in space.values())
+    count_2d = sum(errors.translation > errors.rotation for errors in image.values())
+    return Claim(
+        "errors of estimated translations are always higher than those of estimated rotations",
+        "appendix A",
+        count_3d + count_2d == 2 * len(PAIRS),
+        f"in {count_3d} of {len(PAIRS)} pairs in E_3D, in {count_2d} in E_2D "
+        f"(largest opposite: {_largest_opposite(space)})",
+    )
 
 
-def _compensation(results: Results, alone: Mapping[str, Sequence[float]]) -> str:
-    """The errors of R and t of one estimate are not independent."""
-    both = {pair: of_pair(results, "weight", pair, "E_3D").mean for pair in alone}
-    smaller = [pair for pair in alone if both[pair] < min(alone[pair])]
+def _largest_opposite(errors: Mapping[str, PartErrors]) -> str:
+    """Return the pair whose rotation costs most beyond its translation, with its errors."""
+    pair = max(errors, key=lambda name: errors[name].rotation - errors[name].translation)
+    rotation = errors[pair].rotation
+    translation = errors[pair].translation
+    if translation > rotation:
+        return "none"
+    return f"{pair}, R {rotation:.1f} mm, t {translation:.1f} mm"
+
+
+def _compensation(results: Results) -> str:
+    """Return what there is to say of the errors of R and t of one estimate: they depend."""
+    alone = _part_errors(results, "E_3D")
+    both = {pair: pair_error(results, "weight", pair, "E_3D").mean for pair in PAIRS}
+    smaller = [pair for pair in PAIRS if both[pair] < alone[pair].smaller]
     if not smaller:
-        return "With both parts estimated E_3D is larger than with one of them, as in the paper's tables."
-    with_both = np.mean([both[pair] for pair in smaller])
-    R, t = np.mean([alone[pair] for pair in smaller], axis=0)
+        return (
+            "With both parts estimated E_3D is larger than with one of them, as in the paper's "
+            "tables."
+        )
+    with_both = fmean(both[pair] for pair in smaller)
+    rotation = fmean(alone[pair].rotation for pair in smaller)
+    translation = fmean(alone[pair].translation for pair in smaller)
     return (
-        f"An estimate's rotation and translation err together and make up for one another: on {', '.join(smaller)} "
-        f"E_3D is smaller with both of them (mean {with_both:.1f} mm) than with R ({R:.1f} mm) or t ({t:.1f} mm) "
-        "alone, and to take one part from the truth undoes that. In the paper's tables the errors of the parts are the "
-        "smaller ones on all pairs."
+        "An estimate's rotation and translation err together and make up for one another: on "
+        f"{', '.join(smaller)} E_3D is smaller with both of them (mean {with_both:.1f} mm) than "
+        f"with R ({rotation:.1f} mm) or t ({translation:.1f} mm) alone, and to take one part from "
+        "the truth undoes that. In the paper's tables the errors of the parts are the smaller ones "
+        "on all pairs."
     )
 
 

@@ -1,6 +1,9 @@
-"""The work of the sweep over the number of frames: errors of one M, draw by draw."""
+"""The action of the sweep over the number of frames: errors of one M, draw by draw."""
+
+from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -9,19 +12,20 @@ import torch
 
 from ghpt.config import build
 from ghpt.files import write_json
-from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.checkpoint import LAST, load_model
-from ghpt.models.collect import CollectPairs
+from ghpt.models.collect import CollectPredictions
+from ghpt.models.predictions import open_predictions
 from ghpt.models.relative_pose.evaluation import errors_of_pair, pair_name
-from ghpt.models.relative_pose.predictions import open_pairs
+from ghpt.models.relative_pose.schema import PAIRS
 
 
+@torch.no_grad()
 def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
-    """Test the camera model of ``dependencies["model"]`` on ``draws`` draws of ``frames`` frames of each
-    rig.
+    """Test the camera model of the dependency ``model`` on draws of frames of each rig.
 
-    ``pairs``: of views, counted from 1; None: all. result.json: pair -> selection or baseline ->
-    E_3D (mm, null where a draw was not estimated) of each draw; beside it predictions.npz.
+    ``draws`` and ``frames`` say how many. ``pairs`` are those of the views, counted from 1; None:
+    all. result.json: pair -> selection or baseline -> E_3D (mm, null where a draw was not
+    estimated) of each draw; beside it predictions.npz.
     """
     changes = {"problem.frames": config["frames"], "problem.draws": config["draws"]}
     changes |= {"seed": config["seed"], "hypotheses": config["hypotheses"]}
@@ -29,31 +33,27 @@ def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folde
     data = build(config["data"], "data")
     data.bind(model.problem)
     data.setup("test")
-    pairs = data.frames["test"]
-    views = len(pairs.rigs[0].names)
-    pairs.pairs = [
-        (a - 1, b - 1) for a, b in config["pairs"] or combinations(range(1, views + 1), 2)
-    ]
-    meta = {
-        "data": data.name,
-        "source": data.source,
-        "split": data.evaluate,
-        "seed": config["seed"],
-    }
-    collect = CollectPairs(folder, build(config["camera_baselines"], "camera_baselines"), meta)
-    collect.data = pairs
-    collect.open([*AGGREGATIONS, *collect.estimators])
-    with torch.no_grad():
-        for first in range(0, len(pairs), data.batch_size):
-            batch = pairs[range(first, min(first + data.batch_size, len(pairs)))]
-            collect.write(model, batch, model.test_step(batch, 0))
+    dataset = data.frames["test"]
+    views = range(1, len(dataset.rigs[0].names) + 1)
+    chosen = config["pairs"] or combinations(views, 2)
+    dataset.pairs = [(a - 1, b - 1) for a, b in chosen]
+    origin = {"data": data.name, "source": data.source, "split": data.evaluate}
+    baselines = build(config["camera_baselines"], "camera_baselines")
+    meta = {**origin, "seed": config["seed"]}
+    collect = CollectPredictions(folder, model.problem, baselines, meta)
+    collect.open(dataset)
+    for first in range(0, len(dataset), data.batch_size):
+        batch = dataset[range(first, min(first + data.batch_size, len(dataset)))]
+        collect.write(batch, model.test_step(batch, 0))
     collect.finish()
-    predictions = open_pairs(collect.path)
-    result = {
-        pair_name(pair): {
-            name: [value if math.isfinite(value) else None for value in values]
-            for name, values in errors_of_pair(predictions, pair, "E_3D").items()
-        }
-        for pair in pairs.pairs
-    }
+    predictions = open_predictions(collect.path, PAIRS)
+    result = {}
+    for pair in dataset.pairs:
+        errors = errors_of_pair(predictions, pair, "E_3D")
+        result[pair_name(pair)] = {name: _finite(values) for name, values in errors.items()}
     write_json(folder / "result.json", result)
+
+
+def _finite(values: Sequence[float]) -> list[float | None]:
+    """Return the values, None for those that are not finite."""
+    return [value if math.isfinite(value) else None for value in values]

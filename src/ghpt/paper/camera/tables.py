@@ -3,27 +3,46 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from statistics import fmean
 
-import numpy as np
 import torch
 
-from ghpt.models.relative_pose.predictions import open_pairs
+from ghpt.models.predictions import open_predictions
+from ghpt.models.relative_pose import schema
 from ghpt.paper.camera.dissection import DISSECTION
 from ghpt.paper.camera.figures import SWEEP
-from ghpt.paper.camera.tasks import measured, of_pair, tested_pairs, three_rows
+from ghpt.paper.camera.tasks import PAIRS, pair_error, scaled, tested_pairs
 from ghpt.paper.camera.unknown_extrinsics import UNKNOWN
-from ghpt.paper.engine.artefact import Artefact, Claim, Comparison, Results, Section, Spread
+from ghpt.paper.engine.artefact import (
+    Artefact,
+    Claim,
+    Comparison,
+    Results,
+    Section,
+    comparison_rows,
+)
 from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_FRAMES
+from ghpt.report.document import Heading, Paragraph, Table
 from ghpt.report.pair_tables import NAMES
-from ghpt.report.tables import markdown
 
-ERRORS = {
-    "E_R": ("E_R, 10⁻³", 1000.0, 1),
-    "E_t": ("E_t, mm", 1.0, 1),
-    "E_2D": ("E_2D, px", 1.0, 2),
-    "E_3D": ("E_3D, mm", 1.0, 1),
+
+@dataclass(frozen=True)
+class Column:
+    """How the table shows an error."""
+
+    head: str
+    factor: float
+    """From the stored unit to the shown one."""
+    digits: int
+
+
+COLUMNS = {
+    "E_R": Column("E_R, 10⁻³", 1000.0, 1),
+    "E_t": Column("E_t, mm", 1.0, 1),
+    "E_2D": Column("E_2D, px", 1.0, 2),
+    "E_3D": Column("E_3D, mm", 1.0, 1),
 }
-"""Error -> head of its column, what it is shown times, decimals."""
 METHODS = (
     "weight",
     "average",
@@ -36,84 +55,97 @@ METHODS = (
 )
 NARROW = ("1-3", "2-4")
 """The pairs that the paper calls diagonal."""
+WIDE = tuple(pair for pair in PAIRS if pair not in NARROW)
 FEW_PIXELS = 5.0
-ORDER = (
-    "The paper calls (1, 3) and (2, 4) diagonal. In the data set's order of cameras, in which we read its tables, they "
-    "stand side by side, and 1-4 and 2-3 face each other: see baseline and angle."
-)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How a pair of cameras stands."""
+
+    baseline: float
+    """m."""
+    angle: float
+    """Angle between the cameras as seen from the middle of the room that people use, degrees."""
+
+    def cells(self) -> list[str]:
+        return [f"{self.baseline:.1f}", f"{self.angle:.0f}"]
 
 
 def _fundamental(results: Results) -> Section:
     rows = []
-    compared = []
+    comparisons = []
     shapes = _shapes(results)
-    for ab, printed in FUNDAMENTAL.items():
-        pair = f"{ab[0]}-{ab[1]}"
-        ours = {error: of_pair(results, "weight", pair, error) for error in ERRORS}
-        numbers = [
-            Comparison(
-                f"{pair} {error}",
-                times * printed[error],
-                measured(ours[error], times),
-                digits=digits,
-            )
-            for error, (_, times, digits) in ERRORS.items()
-        ]
-        rows += three_rows(pair, numbers, shapes[pair])
-        compared += numbers
-    head = ["pair", *(head for head, *_ in ERRORS.values()), "baseline, m", "angle, degrees"]
+    for (a, b), printed in FUNDAMENTAL.items():
+        pair = f"{a}-{b}"
+        of_pair = _compare(results, pair, printed)
+        paper, ours, difference = comparison_rows(f"{pair} ", of_pair)
+        rows += [[*paper, "", ""], [*ours, *shapes[pair].cells()], [*difference, "", ""]]
+        comparisons += of_pair
+    header = [
+        "pair",
+        *(column.head for column in COLUMNS.values()),
+        "baseline, m",
+        "angle, degrees",
+    ]
     draws = results.read("test", "metrics.json")[0]["draws"]
     text = (
-        f"Medians over {draws} draws of {FUNDAMENTAL_FRAMES} frames, weighted hypothesis. {ORDER} The angle is the one "
-        "between the two cameras as seen from the middle of the room that people use."
+        f"Medians over {draws} draws of {FUNDAMENTAL_FRAMES} frames, weighted hypothesis. The "
+        "paper calls (1, 3) and (2, 4) diagonal. In the data set's order of cameras, in which we "
+        "read its tables, they stand side by side, and 1-4 and 2-3 face each other: see baseline "
+        "and angle. The angle is the one between the two cameras as seen from the middle of the "
+        "room that people use."
     )
-    body = [
-        text,
-        markdown(head, rows),
-        "### Classical estimators on the same correspondences",
-        "Median E_3D, mm.",
-        _baselines(results),
-    ]
     return Section(
         results.display_name("h36m"),
-        "\n\n".join(body),
-        {},
-        compared,
-        _claims(results),
-        _explained(results, shapes),
+        [
+            Paragraph(text),
+            Table(header, rows),
+            Heading("Classical estimators on the same correspondences", 3),
+            Paragraph("Median E_3D, mm."),
+            _estimators_table(results),
+        ],
+        comparisons=comparisons,
+        claims=_claims(results),
+        explanation=_explanation(results, shapes),
     )
 
 
-def _baselines(results: Results) -> str:
-    pairs = [f"{a}-{b}" for a, b in FUNDAMENTAL]
+def _compare(results: Results, pair: str, printed: Mapping[str, float]) -> list[Comparison]:
+    comparisons = []
+    for error, column in COLUMNS.items():
+        ours = scaled(pair_error(results, "weight", pair, error), column.factor)
+        paper = column.factor * printed[error]
+        comparisons.append(Comparison(f"{pair} {error}", paper, ours, digits=column.digits))
+    return comparisons
+
+
+def _estimators_table(results: Results) -> Table:
     rows = []
     for method in METHODS:
-        values = [of_pair(results, method, pair, "E_3D") for pair in pairs]
-        rows.append(
-            [NAMES.get(method, method), *(v.text() for v in values), f"{_mean(values):.1f}"]
-        )
-    return markdown(["E_3D, mm", *pairs, "mean"], rows)
+        errors = [pair_error(results, method, pair, "E_3D").text() for pair in PAIRS]
+        mean = _mean_error(results, method, PAIRS)
+        rows.append([NAMES.get(method, method), *errors, f"{mean:.1f}"])
+    return Table(["E_3D, mm", *PAIRS, "mean"], rows)
 
 
 def _claims(results: Results) -> list[Claim]:
-    pixels = {
-        f"{a}-{b}": of_pair(results, "weight", f"{a}-{b}", "E_2D").mean for a, b in FUNDAMENTAL
-    }
-    space = {pair: of_pair(results, "weight", pair, "E_3D").mean for pair in pixels}
+    pixels = {pair: pair_error(results, "weight", pair, "E_2D").mean for pair in PAIRS}
+    space = {pair: pair_error(results, "weight", pair, "E_3D").mean for pair in PAIRS}
     worst = max(pixels, key=pixels.__getitem__)
-    others = max(error for pair, error in space.items() if pair not in NARROW)
-    narrow = min(space[pair] for pair in NARROW)
-    ours, theirs = (
-        _mean([of_pair(results, method, pair, "E_3D") for pair in space])
-        for method in ("weight", "eight_point")
-    )
+    largest_wide = max(space[pair] for pair in WIDE)
+    smallest_narrow = min(space[pair] for pair in NARROW)
+    ours = _mean_error(results, "weight", PAIRS)
+    theirs = _mean_error(results, "eight_point", PAIRS)
+    gain = 100 * (1 - ours / theirs)
     subpixel = ", ".join(pair for pair, error in pixels.items() if error < 1) or "none"
     return [
         Claim(
             "subpixel E_2D for the pairs (1, 2) and (2, 3)",
             "4.4",
             max(pixels["1-2"], pixels["2-3"]) < 1,
-            f"{pixels['1-2']:.2f} px (0.81) and {pixels['2-3']:.2f} px (0.72); below 1 px: {subpixel}",
+            f"{pixels['1-2']:.2f} px (0.81) and {pixels['2-3']:.2f} px (0.72); "
+            f"below 1 px: {subpixel}",
         ),
         Claim(
             "only few pixels (we ask for less than 5) in the worst case",
@@ -124,59 +156,61 @@ def _claims(results: Results) -> list[Claim]:
         Claim(
             "adjacent pairs have lower E_3D than the opposite ones, (1, 3) and (2, 4)",
             "4.4",
-            others < narrow,
-            f"at least {narrow:.1f} mm (23.0), the others at most {others:.1f} mm (13.0)",
+            largest_wide < smallest_narrow,
+            f"at least {smallest_narrow:.1f} mm (23.0), the others at most {largest_wide:.1f} mm "
+            "(13.0)",
         ),
         Claim(
             "more than 30 % better than the 8-point algorithm",
             "abstract",
             ours < 0.7 * theirs,
-            f"mean E_3D of the six pairs {ours:.1f} mm < {theirs:.1f} mm: {100 * (1 - ours / theirs):.0f} %",
+            f"mean E_3D of the six pairs {ours:.1f} mm < {theirs:.1f} mm: {gain:.0f} %",
         ),
     ]
 
 
-def _explained(results: Results, shapes: Mapping[str, Sequence[str]]) -> str:
-    """Of what was measured beside it: the shape of the pairs, PoseLib, and all views together."""
-    e3d = {
-        method: ", ".join(
-            f"{pair} {of_pair(results, method, pair, 'E_3D').text()}" for pair in NARROW
-        )
-        for method in ("weight", "poselib", "rig")
-    }
-    angle = " and ".join(shapes[pair][1] for pair in NARROW)
-    rest = [f"{a}-{b}" for a, b in FUNDAMENTAL if f"{a}-{b}" not in NARROW]
-    wide = {
-        m: _mean([of_pair(results, m, pair, "E_3D") for pair in rest])
-        for m in ("weight", "poselib", "best")
-    }
+def _explanation(results: Results, shapes: Mapping[str, Shape]) -> str:
+    """Return what was measured beside it: the pairs' shape, PoseLib, and all views together."""
+    angles = " and ".join(shapes[pair].cells()[-1] for pair in NARROW)
+    learned = _mean_error(results, "weight", WIDE)
+    poselib = _mean_error(results, "poselib", WIDE)
+    best = _mean_error(results, "best", WIDE)
     return (
-        f"The cameras of {' and '.join(NARROW)} stand side by side ({angle} degrees apart), so that two views alone "
-        f"say little of the depth: there the learned selection has {e3d['weight']} mm, PoseLib on the same "
-        f"correspondences {e3d['poselib']} mm, and all four views calibrated together {e3d['rig']} mm. On the other "
-        f"four pairs the mean is {wide['weight']:.1f} mm, PoseLib's {wide['poselib']:.1f} mm, and that of the best "
-        f"hypotheses, which only the truth can choose, {wide['best']:.1f} mm. The paper does not say from how many "
-        "draws its numbers come."
+        f"The cameras of {' and '.join(NARROW)} stand side by side ({angles} degrees apart), so "
+        "that two views alone say little of the depth: there the learned selection has "
+        f"{_narrow_errors(results, 'weight')} mm, PoseLib on the same correspondences "
+        f"{_narrow_errors(results, 'poselib')} mm, and all four views calibrated together "
+        f"{_narrow_errors(results, 'rig')} mm. On the other four pairs the mean is {learned:.1f} "
+        f"mm, PoseLib's {poselib:.1f} mm, and that of the best hypotheses, which only the truth "
+        f"can choose, {best:.1f} mm. The paper does not say from how many draws its numbers come."
     )
 
 
-def _shapes(results: Results) -> dict[str, tuple[str, str]]:
-    """Pair -> distance of its cameras (m) and the angle (degrees) between them as seen from the
-    middle of the points X*, the mean of the rigs.
-    """
-    predictions = open_pairs(results.paths("test")[0] / "predictions.npz")
-    to = predictions.cameras.centre - predictions.points.mean(dim=1, keepdim=True)
+def _narrow_errors(results: Results, method: str) -> str:
+    errors = {pair: pair_error(results, method, pair, "E_3D").text() for pair in NARROW}
+    return ", ".join(f"{pair} {error}" for pair, error in errors.items())
+
+
+def _mean_error(results: Results, method: str, pairs: Sequence[str]) -> float:
+    """Return the mean E_3D over pairs, mm."""
+    return fmean(pair_error(results, method, pair, "E_3D").mean for pair in pairs)
+
+
+def _shapes(results: Results) -> dict[str, Shape]:
+    """Return how each pair stands about the middle of the points X*, the mean over the rigs."""
+    file = results.paths("test")[0] / "predictions.npz"
+    rigs = open_predictions(file, schema.PAIRS).tables
+    middle = rigs.points.mean(dim=1, keepdim=True)
+    directions = rigs.cameras.centre - middle
     shapes = {}
     for a, b in FUNDAMENTAL:
-        one = to[:, a - 1]
-        other = to[:, b - 1]
-        angle = torch.rad2deg(torch.arccos(torch.cosine_similarity(one, other, dim=-1))).mean()
-        shapes[f"{a}-{b}"] = (f"{(one - other).norm(dim=-1).mean() / 1000:.1f}", f"{angle:.0f}")
+        one = directions[:, a - 1]
+        other = directions[:, b - 1]
+        baseline = (one - other).norm(dim=-1).mean() / 1000
+        angle = torch.arccos(torch.cosine_similarity(one, other, dim=-1))
+        degrees = torch.rad2deg(angle).mean()
+        shapes[f"{a}-{b}"] = Shape(float(baseline), float(degrees))
     return shapes
-
-
-def _mean(spreads: Sequence[Spread]) -> float:
-    return float(np.mean([spread.mean for spread in spreads]))
 
 
 ARTEFACTS = (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ghpt.paper.camera.extrinsics import KINDS, PARTS
-from ghpt.paper.camera.tasks import camera_model, of_test
+from ghpt.paper.camera.tasks import camera_model, common_settings
 from ghpt.paper.engine.artefact import (
     Artefact,
     Claim,
@@ -11,13 +11,15 @@ from ghpt.paper.engine.artefact import (
     Results,
     Section,
     Spread,
+    comparison_rows,
     over_seeds,
     signed,
 )
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
 from ghpt.paper.published import UNKNOWN_EXTRINSICS
-from ghpt.report.tables import NONE, markdown
+from ghpt.report.document import Heading, Paragraph, Table
+from ghpt.report.tables import NONE
 
 SOURCES = {"weight": "pairs, learned", "poselib": "pairs, PoseLib", "rig": "whole rig"}
 MODELS = {"h36m": "base dataset", "cmu3": "CMU3 → H36M"}
@@ -28,46 +30,31 @@ COLUMNS = {
     "both": "estimated R and t",
 }
 GOAL = 0.05
-"""Of this project: what estimated cameras may cost."""
+"""What estimated cameras may cost: the goal of this project."""
+ESTIMATION = "ghpt.paper.camera.extrinsics.estimate_extrinsics"
+POSES = "ghpt.paper.camera.extrinsics.poses_from_extrinsics"
 
 
 def _tasks(setup: Setup) -> dict[str, Task]:
-    size = setup.sizes["unknown_extrinsics"]
-    whole = setup.composed(
-        "test", "h36m", *setup.overrides["test"], f"data.stride={size['stride']}"
-    )
-    config = of_test(whole)
+    stride = f"data.stride={setup.sizes.unknown_extrinsics.stride}"
+    whole = setup.composed("test", "h36m", *setup.overrides.test, stride)
+    config = common_settings(whole)
     data = setup.prepared("h36m", whole["data"]["evaluate"])
-    camera = camera_model(setup)
-    draws = config | {"frames": size["frames"], "draws": size["draws"]}
     baselines = whole["camera_baselines"]
     estimators = {"poselib": baselines["poselib"], "rig": baselines["rig"]["calibration"]}
-    scale = camera.config["model"]["problem"]["scale"]
-    work = "ghpt.paper.camera.extrinsics."
-    extrinsics = {
-        source: Task(
-            f"extrinsics-{source}-seed{setup.seed}",
-            f"{work}estimate_extrinsics",
-            draws
-            | {"source": source}
-            | ({} if source == "weight" else {"estimator": estimators[source], "scale": scale}),
-            {"data": data} | ({"model": camera} if source == "weight" else {}),
-            seconds=12.0,
-        )
-        for source in SOURCES
-    }
+    extrinsics = {"weight": _learned_extrinsics(setup, config, data)}
+    for source, estimator in estimators.items():
+        extrinsics[source] = _classical_extrinsics(setup, config, data, source, estimator)
     tasks = {}
     for trained in MODELS:
         dependencies = {"model": setup.trained(trained), "data": data}
         name = f"{trained}-seed{setup.seed}"
-        tasks[trained] = Task(
-            f"poses-known-{name}", f"{work}poses_from_extrinsics", config, dependencies, seconds=7.0
-        )
+        tasks[trained] = Task(f"poses-known-{name}", POSES, config, dependencies, seconds=7.0)
         for source, estimated in extrinsics.items():
             parts = list(PARTS) if source == "weight" else ["both"]
             tasks[f"{trained} {source}"] = Task(
                 f"poses-{source}-{name}",
-                f"{work}poses_from_extrinsics",
+                POSES,
                 config | {"parts": parts},
                 dependencies | {"extrinsics": estimated},
                 seconds=7.0 * len(parts),
@@ -75,153 +62,194 @@ def _tasks(setup: Setup) -> dict[str, Task]:
     return tasks
 
 
+def _learned_extrinsics(setup: Setup, config: dict[str, object], data: Task) -> Task:
+    size = setup.sizes.unknown_extrinsics
+    return Task(
+        f"extrinsics-weight-seed{setup.seed}",
+        ESTIMATION,
+        {**config, "frames": size.frames, "draws": size.draws, "source": "weight"},
+        {"data": data, "model": camera_model(setup)},
+        seconds=12.0,
+    )
+
+
+def _classical_extrinsics(
+    setup: Setup, config: dict[str, object], data: Task, source: str, estimator: object
+) -> Task:
+    size = setup.sizes.unknown_extrinsics
+    scale = camera_model(setup).config["model"]["problem"]["scale"]
+    own = {
+        "frames": size.frames,
+        "draws": size.draws,
+        "source": source,
+        "estimator": estimator,
+        "scale": scale,
+    }
+    name = f"extrinsics-{source}-seed{setup.seed}"
+    return Task(name, ESTIMATION, {**config, **own}, {"data": data}, seconds=12.0)
+
+
 def _section(results: Results) -> Section:
-    size = results.setup.sizes["unknown_extrinsics"]
-    words = results.display_name("h36m")
+    size = results.setup.sizes.unknown_extrinsics
     rows = []
-    compared = []
+    comparisons = []
     for trained, name in MODELS.items():
-        numbers = [
-            Comparison(
-                f"{name}, {head}",
-                UNKNOWN_EXTRINSICS[trained][part],
-                _error(results, trained, "weight", part),
-            )
-            for part, head in COLUMNS.items()
-        ]
-        columns = zip(*(number.cells() for number in numbers), strict=True)
-        rows += [
-            [f"{name}, {kind}", *cells]
-            for kind, cells in zip(("paper", "ours", "difference"), columns, strict=True)
-        ]
-        compared += numbers
+        of_model = _compare(results, trained)
+        rows += comparison_rows(f"{name}, ", of_model)
+        comparisons += of_model
     text = (
-        "Pelvis-relative MPJPE of the weighted hypothesis in mm. Camera 1 is the true one, the others come from "
-        f"{size['frames']} frames of each rig, in {size['draws']} draws that take turns over the poses. As in the "
-        "paper, each comes from its pair with camera 1, by the learned selection, and its distance is the true one."
+        "Pelvis-relative MPJPE of the weighted hypothesis in mm. Camera 1 is the true one, the "
+        f"others come from {size.frames} frames of each rig, in {size.draws} draws that take turns "
+        "over the poses. As in the paper, each comes from its pair with camera 1, by the learned "
+        "selection, and its distance is the true one."
     )
-    other = (
-        "MPJPE in mm, in brackets the increase over known cameras. The whole rig is calibrated from all views "
-        "together; its one scale is the median ratio of true to estimated distances."
+    estimation = (
+        "MPJPE in mm, in brackets the increase over known cameras. The whole rig is calibrated "
+        "from all views together; its one scale is the median ratio of true to estimated distances."
     )
-    body = [
-        text,
-        markdown(["mm", *COLUMNS.values()], rows),
-        "### How the cameras were estimated",
-        other,
-        _increases(results),
-    ]
-    if results.display_name("cmu3").startswith("synthetic") != words.startswith("synthetic"):
-        words = f"{words}, CMU3 model trained on {results.display_name('cmu3')}"
-    return Section(words, "\n\n".join(body), {}, compared, _claims(results), _explained(results))
+    return Section(
+        _data_name(results),
+        [
+            Paragraph(text),
+            Table(["mm", *COLUMNS.values()], rows),
+            Heading("How the cameras were estimated", 3),
+            Paragraph(estimation),
+            _increases_table(results),
+        ],
+        comparisons=comparisons,
+        claims=_claims(results),
+        explanation=_explanation(results),
+    )
+
+
+def _compare(results: Results, trained: str) -> list[Comparison]:
+    comparisons = []
+    for part, head in COLUMNS.items():
+        label = f"{MODELS[trained]}, {head}"
+        ours = _error(results, trained, "weight", part)
+        comparisons.append(Comparison(label, UNKNOWN_EXTRINSICS[trained][part], ours))
+    return comparisons
+
+
+def _data_name(results: Results) -> str:
+    """Return the name of the test data, and of CMU3 where only one of the two is real."""
+    tested = results.display_name("h36m")
+    trained = results.display_name("cmu3")
+    if trained.startswith("synthetic") == tested.startswith("synthetic"):
+        return tested
+    return f"{tested}, CMU3 model trained on {trained}"
 
 
 def _error(
     results: Results, trained: str, source: str, part: str, kind: str = "relative"
 ) -> Spread:
-    contents = results.read(trained if part == "known" else f"{trained} {source}")
-    return Spread(tuple(content[part][kind] for content in contents))
+    """Return the MPJPE (mm) of a model with some part of the cameras estimated."""
+    task = trained if part == "known" else f"{trained} {source}"
+    return results.spread(task, part, kind, file="result.json")
 
 
 def _increase(
     results: Results, trained: str, source: str, part: str, kind: str = "relative"
 ) -> Spread:
-    """As a share of the error with known cameras."""
-    errors = (_error(results, trained, source, p, kind) for p in (part, "known"))
-    return over_seeds(lambda estimated, known: estimated / known - 1, *errors)
+    """Return by how many percent the error is above that with known cameras."""
+    estimated = _error(results, trained, source, part, kind)
+    known = _error(results, trained, source, "known", kind)
+    return over_seeds(lambda one, other: 100 * (one / other - 1), estimated, known)
 
 
-def _increases(results: Results) -> str:
+def _paper_increase(trained: str, part: str) -> float:
+    """Return the same of the paper's numbers."""
+    paper = UNKNOWN_EXTRINSICS[trained]
+    return 100 * (paper[part] / paper["known"] - 1)
+
+
+def _increases_table(results: Results) -> Table:
     rows = []
     for trained, name in MODELS.items():
         paper = UNKNOWN_EXTRINSICS[trained]
-        share = signed(100 * (paper["both"] / paper["known"] - 1))
-        rows.append(
-            [
-                f"{name}, the paper's pairs",
-                str(paper["known"]),
-                f"{paper['both']} ({share} %)",
-                NONE,
-                NONE,
-            ]
-        )
+        increase = signed(_paper_increase(trained, "both"))
+        both = f"{paper['both']} ({increase} %)"
+        rows.append([f"{name}, the paper's pairs", str(paper["known"]), both, NONE, NONE])
         for source, how in SOURCES.items():
-            cells = []
-            for kind in KINDS:
-                known, both = (
-                    _error(results, trained, source, part, kind).text()
-                    for part in ("known", "both")
-                )
-                share = signed(100 * _increase(results, trained, source, "both", kind).mean)
-                cells += [known, f"{both} ({share} %)"]
+            cells = _increase_cells(results, trained, source)
             rows.append([f"{name}, {how}", *cells])
-    head = [f"{kind}, {COLUMNS[part]}" for kind in KINDS for part in ("known", "both")]
-    return markdown(["cameras", *head], rows)
+    header = [f"{kind}, {COLUMNS[part]}" for kind in KINDS for part in ("known", "both")]
+    return Table(["cameras", *header], rows)
+
+
+def _increase_cells(results: Results, trained: str, source: str) -> list[str]:
+    cells = []
+    for kind in KINDS:
+        known = _error(results, trained, source, "known", kind).text()
+        both = _error(results, trained, source, "both", kind).text()
+        increase = signed(_increase(results, trained, source, "both", kind).mean)
+        cells += [known, f"{both} ({increase} %)"]
+    return cells
 
 
 def _claims(results: Results) -> list[Claim]:
-    increase = {
-        (trained, part): 100 * _increase(results, trained, "weight", part).mean
-        for trained in MODELS
-        for part in PARTS
-    }
-    error = {
-        (trained, part): _error(results, trained, "weight", part).mean
-        for trained in MODELS
-        for part in COLUMNS
-    }
-    paper = {
-        (trained, part): 100
-        * (UNKNOWN_EXTRINSICS[trained][part] / UNKNOWN_EXTRINSICS[trained]["known"] - 1)
-        for trained in MODELS
-        for part in PARTS
-    }
-    drop = "; ".join(
-        f"{name}: t {increase[trained, 't']:+.1f} % ({paper[trained, 't']:+.1f} %), "
-        f"R {increase[trained, 'R']:+.1f} % ({paper[trained, 'R']:+.1f} %)"
-        for trained, name in MODELS.items()
-    )
-    pairs = [(error["h36m", part], error["cmu3", part]) for part in COLUMNS]
-    better = ", ".join(
-        f"{base:.1f} {'<' if base < inter else '≥'} {inter:.1f}" for base, inter in pairs
-    )
-    more = all(increase[trained, "t"] > increase[trained, "R"] for trained in MODELS)
-    why = "" if more else "; R and t of a pair err together, see fundamental-dissection"
-    rig = {
-        trained: signed(100 * _increase(results, trained, "rig", "both").mean) for trained in MODELS
-    }
     return [
-        Claim(
-            "unknown translations cost more than unknown rotations",
-            "appendix A",
-            more,
-            f"{drop}{why}",
-        ),
-        Claim(
-            "the base dataset is better than inter-dataset",
-            "appendix A",
-            all(base < inter for base, inter in pairs),
-            f"{better} mm",
-        ),
-        *(
-            Claim(
-                f"estimated R and t cost at most {100 * GOAL:.0f} % on {name} (the goal of ghpt)",
-                "appendix A",
-                increase[trained, "both"] <= 100 * GOAL,
-                f"pairs {increase[trained, 'both']:+.1f} % ({paper[trained, 'both']:+.0f} %), rig {rig[trained]} %",
-            )
-            for trained, name in MODELS.items()
-        ),
+        _translation_claim(results),
+        _base_claim(results),
+        *(_goal_claim(results, trained) for trained in MODELS),
     ]
 
 
-def _explained(results: Results) -> str:
-    rig = " and ".join(
-        f"{signed(100 * _increase(results, trained, 'rig', 'both').mean)} %" for trained in MODELS
+def _translation_claim(results: Results) -> Claim:
+    holds = True
+    increases = []
+    for trained, name in MODELS.items():
+        translation = _increase(results, trained, "weight", "t").mean
+        rotation = _increase(results, trained, "weight", "R").mean
+        holds = holds and translation > rotation
+        paper_translation = _paper_increase(trained, "t")
+        paper_rotation = _paper_increase(trained, "R")
+        increases.append(
+            f"{name}: t {translation:+.1f} % ({paper_translation:+.1f} %), "
+            f"R {rotation:+.1f} % ({paper_rotation:+.1f} %)"
+        )
+    reason = "" if holds else "; R and t of a pair err together, see fundamental-dissection"
+    return Claim(
+        "unknown translations cost more than unknown rotations",
+        "appendix A",
+        holds,
+        f"{'; '.join(increases)}{reason}",
     )
+
+
+def _base_claim(results: Results) -> Claim:
+    holds = True
+    orders = []
+    for part in COLUMNS:
+        base = _error(results, "h36m", "weight", part).mean
+        inter = _error(results, "cmu3", "weight", part).mean
+        holds = holds and base < inter
+        sign = "<" if base < inter else "≥"
+        orders.append(f"{base:.1f} {sign} {inter:.1f}")
+    statement = "the base dataset is better than inter-dataset"
+    return Claim(statement, "appendix A", holds, f"{', '.join(orders)} mm")
+
+
+def _goal_claim(results: Results, trained: str) -> Claim:
+    increase = _increase(results, trained, "weight", "both").mean
+    rig = signed(_increase(results, trained, "rig", "both").mean)
+    paper = _paper_increase(trained, "both")
+    goal = 100 * GOAL
+    return Claim(
+        f"estimated R and t cost at most {goal:.0f} % on {MODELS[trained]} (the goal of ghpt)",
+        "appendix A",
+        increase <= goal,
+        f"pairs {increase:+.1f} % ({paper:+.0f} %), rig {rig} %",
+    )
+
+
+def _explanation(results: Results) -> str:
+    increases = [_increase(results, trained, "rig", "both").mean for trained in MODELS]
+    rig = " and ".join(f"{signed(increase)} %" for increase in increases)
     return (
-        "Errors of an estimated rotation and translation make up for one another; with one of them from the truth they "
-        f"cannot (tab:fundamental-dissection). All views calibrated together cost {rig} instead."
+        "Errors of an estimated rotation and translation make up for one another; with one of them "
+        "from the truth they cannot (tab:fundamental-dissection). All views calibrated together "
+        f"cost {rig} instead."
     )
 
 

@@ -1,1 +1,1 @@
-"""Tasks that are computed once and kept, artefacts made of them, and one report."""
+"""Tasks that are run once and kept, artefacts that are made of them, and one report."""

@@ -8,15 +8,15 @@ import logging
 import multiprocessing
 import os
 import signal
+import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
-import torch
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -32,65 +32,102 @@ from ghpt.files import sweep_temporaries
 from ghpt.paper.engine.tasks import Task, perform, with_dependencies
 from ghpt.signals import stopped_by_signals
 
+_LOUD = ("ghpt", "lightning.pytorch", "lightning.fabric")
+"""The loggers of the commands."""
+_COLUMNS = (
+    TextColumn("{task.fields[count]}"),
+    BarColumn(None),
+    TaskProgressColumn(),
+    TimeElapsedColumn(),
+    TimeRemainingColumn(),
+    TextColumn("{task.description}"),
+)
 _log = logging.getLogger(__name__)
 
 
 def perform_all(wanted: Iterable[Task], tasks: Path, jobs: int, show: bool) -> int:
-    """Do every task that is wanted or needed and is not yet done, ``jobs`` at a time; returns how
-    many that were.
+    """Run every task that is wanted or depended on and not yet done, ``jobs`` at a time.
 
-    A task's result is kept as soon as it is there: after an error or an interruption, which end
-    this at once, the same call goes on where it was. Raises what the task raised, a GhptError with
-    the task's name before it.
+    Returns how many that were. A task's result is kept as soon as it is there: after an error or an
+    interruption, which end this at once, the same call goes on where it was. Raises what the task
+    raised, a GhptError with the task's name before it.
     """
     tasks.mkdir(parents=True, exist_ok=True)
     sweep_temporaries(tasks)
-    missing = {key: task for key, task in with_dependencies(wanted).items() if not task.done(tasks)}
-    number = len(missing)
-    chain = _chains(missing)
+    everything = with_dependencies(wanted)
+    queue = _Queue({key: task for key, task in everything.items() if not task.done(tasks)})
+    count = len(queue.missing)
+    running: dict[Future[None], Task] = {}
     with (
         stopped_by_signals(),
-        _progress(list(missing.values()), show) as tell,
-        _executor(min(jobs, len(missing))) as submit,
+        _progress(list(queue.missing.values()), show) as report,
+        _executor(min(jobs, count)) as submit,
     ):
-        waiting = dict(missing)
-        running = {}
-        while waiting or running:
-            ready = [
-                c
-                for c in waiting.values()
-                if not any(b.key in missing for b in c.dependencies.values())
-            ]
-            for task in sorted(ready, key=lambda c: -chain[c.key])[: jobs - len(running)]:
-                running[submit(task, tasks)] = waiting.pop(task.key)
-                tell(running.values(), None)
+        while queue.missing:
+            for task in queue.take(jobs - len(running)):
+                running[submit(task, tasks)] = task
+                report(running.values(), None)
             for future in wait(running, return_when=FIRST_COMPLETED).done:
-                try:
-                    future.result()
-                except GhptError as error:
-                    error.args = (f"{running[future].name}: {error}",)
-                    raise
-                except BrokenProcessPool as error:
-                    raise _killed(running.values()) from error
+                _check(future, running)
                 task = running.pop(future)
-                del missing[task.key]
-                tell(running.values(), task)
-    return number
+                queue.finish(task)
+                report(running.values(), task)
+    return count
 
 
-def _killed(running: Iterable[Task]) -> GhptConfigError:
-    made = ", ".join(task.name for task in running)
-    problem = f"a process was killed while these were made: {made}; the system does so where memory is short"
+class _Queue:
+    """The tasks that are missing, in the order of their dependencies; the longest chain first."""
+
+    def __init__(self, missing: dict[str, Task]) -> None:
+        self.missing = missing
+        """The tasks that are not finished, by key."""
+        self._waiting = dict(missing)
+        self._chain = _chain_seconds(missing)
+
+    def take(self, count: int) -> list[Task]:
+        """Return at most ``count`` tasks whose dependencies are done, and wait for them no more."""
+        ready = [task for task in self._waiting.values() if self._is_ready(task)]
+        ready.sort(key=lambda task: -self._chain[task.key])
+        taken = ready[:count]
+        for task in taken:
+            del self._waiting[task.key]
+        return taken
+
+    def finish(self, task: Task) -> None:
+        del self.missing[task.key]
+
+    def _is_ready(self, task: Task) -> bool:
+        return not any(before.key in self.missing for before in task.dependencies.values())
+
+
+def _check(future: Future[None], running: Mapping[Future[None], Task]) -> None:
+    """Raise what the task of a finished future raised."""
+    try:
+        future.result()
+    except GhptError as error:
+        error.args = (f"{running[future].name}: {error}",)
+        raise
+    except BrokenProcessPool as error:
+        raise _killed_error(running.values()) from error
+
+
+def _killed_error(running: Iterable[Task]) -> GhptConfigError:
+    names = ", ".join(task.name for task in running)
+    problem = (
+        f"a process was killed while these were made: {names}; the system does so where memory is "
+        "short"
+    )
     return GhptConfigError("jobs", problem, "Give fewer (jobs=1, say); the same command goes on.")
 
 
-def _chains(tasks: dict[str, Task]) -> dict[str, float]:
-    """Seconds of the longest chain of tasks that begins with each: what is first in a long one is
-    done first.
+def _chain_seconds(tasks: Mapping[str, Task]) -> dict[str, float]:
+    """Return the seconds of the longest chain of tasks that begins with each task, by its key.
+
+    ``tasks`` are in an order in which dependencies come before their dependents.
     """
     chain = {key: task.seconds for key, task in tasks.items()}
-    for key, task in reversed(tasks.items()):  # dependencies come before their dependents
-        for before in task.dependencies.values():
+    for key in reversed(list(tasks)):
+        for before in tasks[key].dependencies.values():
             if before.key in chain:
                 chain[before.key] = max(chain[before.key], before.seconds + chain[key])
     return chain
@@ -98,18 +135,18 @@ def _chains(tasks: dict[str, Task]) -> dict[str, float]:
 
 @contextlib.contextmanager
 def _executor(jobs: int) -> Iterator[Callable[[Task, Path], Future[None]]]:
-    """Submit tasks to ``jobs`` processes, or with one to this process; on the way out nothing is
-    left running.
+    """Submit tasks to ``jobs`` processes, or where it is one to this process.
+
+    On the way out nothing is left running.
     """
     if jobs <= 1:
-        yield _here
+        yield _run_here
         return
     threads = max(1, (os.cpu_count() or 1) // jobs)
-    executor = ProcessPoolExecutor(
-        jobs, multiprocessing.get_context("spawn"), _start, (threads, os.getpid())
-    )
+    context = multiprocessing.get_context("spawn")
+    executor = ProcessPoolExecutor(jobs, context, _start, (threads, os.getpid()))
     try:
-        yield lambda task, tasks: executor.submit(_quietly, task, tasks)
+        yield lambda task, tasks: executor.submit(_perform_quietly, task, tasks)
     except BaseException:
         executor.shutdown(wait=False, cancel_futures=True)
         for process in multiprocessing.active_children():
@@ -119,10 +156,10 @@ def _executor(jobs: int) -> Iterator[Callable[[Task, Path], Future[None]]]:
         executor.shutdown()
 
 
-def _here(task: Task, tasks: Path) -> Future[None]:
+def _run_here(task: Task, tasks: Path) -> Future[None]:
     future: Future[None] = Future()
     try:
-        _quietly(task, tasks)
+        _perform_quietly(task, tasks)
         future.set_result(None)
     except Exception as error:
         future.set_exception(error)
@@ -130,9 +167,11 @@ def _here(task: Task, tasks: Path) -> Future[None]:
 
 
 def _start(threads: int, parent: int) -> None:
-    """In a new process: its share of the processors, and an end when the parent's comes."""
+    """Give a new process its share of the processors, and end it with its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    torch.set_num_threads(threads)
+    os.environ["OMP_NUM_THREADS"] = str(threads)  # which torch reads when a task imports it
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(threads)
     threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
@@ -142,11 +181,9 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-def _quietly(task: Task, tasks: Path) -> None:
-    """`perform` without what the commands would say on the way."""
-    loggers = [
-        logging.getLogger(name) for name in ("ghpt", "lightning.pytorch", "lightning.fabric")
-    ]
+def _perform_quietly(task: Task, tasks: Path) -> None:
+    """Run a task without what the commands would print on the way."""
+    loggers = [logging.getLogger(name) for name in _LOUD]
     levels = [logger.level for logger in loggers]
     try:
         for logger in loggers:
@@ -163,35 +200,29 @@ def _quietly(task: Task, tasks: Path) -> None:
 def _progress(
     tasks: Sequence[Task], show: bool
 ) -> Iterator[Callable[[Iterable[Task], Task | None], None]]:
-    """A bar over all tasks, as long as their expected seconds; without it, or a terminal, a line
-    for each.
+    """Show a bar over all tasks, as long as their expected seconds, or log a line for each.
 
-    What it yields is told which tasks are being made, and which one has been finished.
+    What it yields takes the tasks that are running, and the one that has been finished.
     """
-    columns = (
-        TextColumn("{task.fields[count]}"),
-        BarColumn(None),
-        TaskProgressColumn(),
-        TimeElapsedColumn(),
-        TimeRemainingColumn(),
-        TextColumn("{task.description}"),
-    )
     console = Console(stderr=True)
     show = show and console.is_terminal and len(tasks) > 0
-    bar = Progress(*columns, console=console, disable=not show)
+    bar = Progress(*_COLUMNS, console=console, disable=not show)
     done: list[Task] = []
 
     def count() -> str:
         return f"{len(done)} of {len(tasks)}"
 
     with bar:
-        task = bar.add_task("", total=sum(task.seconds for task in tasks), count=count())
+        seconds = sum(task.seconds for task in tasks)
+        whole = bar.add_task("", total=seconds, count=count())
 
-        def tell(running: Iterable[Task], finished: Task | None) -> None:
+        def report(running: Iterable[Task], finished: Task | None) -> None:
             if finished is not None:
                 done.append(finished)
-                bar.advance(task, finished.seconds)
-                (_log.debug if show else _log.info)("%s: %s", count(), finished.name)
-            bar.update(task, count=count(), description=", ".join(task.name for task in running))
+                bar.advance(whole, finished.seconds)
+                level = logging.DEBUG if show else logging.INFO
+                _log.log(level, "%s: %s", count(), finished.name)
+            names = ", ".join(task.name for task in running)
+            bar.update(whole, count=count(), description=names)
 
-        yield tell
+        yield report

@@ -1,10 +1,10 @@
-"""What the tasks of one seed share, and how the commonest of them are asked for."""
+"""What the tasks of one seed share, and how the commonest of them are made."""
 
 from __future__ import annotations
 
 import contextlib
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,24 +12,28 @@ from typing import Any
 import hydra
 from hydra.core.global_hydra import GlobalHydra
 
-from ghpt.commands.train import shell_override
+from ghpt.commands.display import shell_override
 from ghpt.config import build, plain
+from ghpt.paper.engine.settings import Overrides, Sizes
 from ghpt.paper.engine.tasks import Task
 
-SECONDS = {"h36m": 40.0}
-"""Of a test of the pose, where it is not 13."""
+PREPARATION = "ghpt.paper.engine.preparation.prepare_split"
+TRAINING = "ghpt.paper.engine.training.train_model"
+TESTING = "ghpt.paper.engine.testing.measure_model"
+TEST_SECONDS = {"h36m": 40.0}
+"""Seconds of a test of the pose, where it is not ``OTHER_SECONDS``."""
+OTHER_SECONDS = 13.0
+SPLITS = ("train", "validation", "test")
 
 
 @functools.cache
-def compose(conf: Path, name: str, overrides: tuple[str, ...]) -> dict[str, Any]:
-    """``<conf>/<name>.yaml`` under ``overrides``, as plain data. Do not change it."""
+def compose(conf: Path, name: str, overrides: tuple[str, ...]) -> Mapping[str, Any]:
+    """Return ``<conf>/<name>.yaml`` under ``overrides`` as plain data. Do not change it."""
     with contextlib.ExitStack() as stack:
-        if (
-            not GlobalHydra.instance().is_initialized()
-        ):  # as it is under a command, whose folder is ``conf`` too
-            stack.enter_context(
-                hydra.initialize_config_dir(str(conf.resolve()), version_base="1.3")
-            )
+        # Under a command Hydra is initialised, and its folder is ``conf`` too.
+        if not GlobalHydra.instance().is_initialized():
+            folder = str(conf.resolve())
+            stack.enter_context(hydra.initialize_config_dir(folder, version_base="1.3"))
         return plain(hydra.compose(name, [*overrides, "output=unused", "progress_bar=false"]))
 
 
@@ -40,71 +44,58 @@ class Setup:
     conf: Path
     roots: Mapping[str, str | None]
     """``human36m`` and ``panoptic``: folder of the real data set, None for the synthetic one."""
-    overrides: Mapping[str, Sequence[str]]
-    """``train``: of every training, in the words of train.py's command line; ``test``: of every
-    test.
-    """
-    sizes: Mapping[str, Any]
-    """``conf/reproduce.yaml``'s ``sizes``."""
+    overrides: Overrides
+    sizes: Sizes
     seed: int
 
     def root(self, data: str) -> str | None:
+        """Return the folder of a real data set, None for a synthetic one."""
         return self.roots["human36m" if data == "h36m" else "panoptic"]
 
     def source(self, data: str) -> str:
-        """As metrics.json has it: ``synthetic``, or the path of the real data."""
+        """Return the source as metrics.json has it: ``synthetic``, or the path of the real data."""
         root = self.root(data)
         return "synthetic" if root is None else str(Path(root).expanduser().resolve())
 
     def words(self, data: str, *overrides: str) -> tuple[str, ...]:
-        """What a command line says of the data and the seed."""
+        """Return what a command line says of the data and the seed, and ``overrides``."""
         root = self.root(data)
-        return (
-            f"data={data}",
-            *([] if root is None else [shell_override("data.root", root)]),
-            f"seed={self.seed}",
-            *overrides,
-        )
+        folder = [] if root is None else [shell_override("data.root", root)]
+        return (f"data={data}", *folder, f"seed={self.seed}", *overrides)
 
     def composed(self, name: str, data: str, *overrides: str) -> dict[str, Any]:
-        """A command's whole configuration; of real data also what identifies the files."""
-        config = compose(self.conf, name, (*self.words(data), "trainer.devices=1", *overrides))
-        config = {
-            key: value for key, value in config.items() if key not in ("output", "progress_bar")
-        }
-        return config | (
-            {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
-        )
+        """Return a command's whole configuration, and of real data what identifies the files."""
+        config = compose(self.conf, name, self.words(data, "trainer.devices=1", *overrides))
+        unused = ("output", "progress_bar")
+        return _without(config, unused) | self._identity(data)
+
+    def _identity(self, data: str) -> dict[str, Any]:
+        """Return what identifies the files of a real data set."""
+        if self.root(data) is None:
+            return {}
+        return {"files": _cache_keys(self.conf, self.words(data))}
 
     def prepared(self, data: str, split: str) -> Task:
-        """The recordings of a split in the cache."""
-        config = {"data": _of_source(self.composed("test", data)["data"]), "split": split}
-        files = {} if self.root(data) is None else {"files": _files(self.conf, self.words(data))}
-        return Task(
-            f"prepare-{data}-{split}",
-            "ghpt.paper.engine.preparation.prepare_split",
-            config | files,
-            seconds=8.0,
-        )
+        """Return the task that has the recordings of a split in the cache."""
+        settings = self.composed("test", data)["data"]
+        # Settings that do not change the recordings have one value, so that seeds share them.
+        shared = settings | {"seed": 0, "evaluate": "test", "stride": 64}
+        config = {"data": shared, "split": split} | self._identity(data)
+        return Task(f"prepare-{data}-{split}", PREPARATION, config, seconds=8.0)
 
     def trained(
         self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 30.0
     ) -> Task:
-        """A model trained on a data set; ``overrides`` are those of train.py, ``name`` tells them
-        apart.
+        """Return the training of a model on a data set.
+
+        ``overrides`` are those of train.py; ``name`` tells trainings with different ones apart.
         """
-        words = (f"model={model}", *self.overrides["train"], *overrides)
-        config = {
-            k: v
-            for k, v in self.composed("train", data, *words).items()
-            if k not in ("save_every", "resume")
-        }
+        words = (f"model={model}", *self.overrides.train, *overrides)
+        config = _without(self.composed("train", data, *words), ("save_every", "resume"))
         dependencies = {split: self.prepared(data, split) for split in ("train", "validation")}
-        name = "-".join(filter(None, ["train", model, data, name, f"seed{self.seed}"]))
-        command = " ".join(["python train.py", *self.words(data), *words, _output(name)])
-        return Task(
-            name, "ghpt.paper.engine.training.train_model", config, dependencies, command, seconds
-        )
+        name = _joined("train", model, data, name, f"seed{self.seed}")
+        command = _command("train.py", *self.words(data), *words, f"output={_folder(name)}")
+        return Task(name, TRAINING, config, dependencies, command, seconds)
 
     def tested(
         self,
@@ -116,47 +107,49 @@ class Setup:
         view_weights: bool = True,
         seconds: float | None = None,
     ) -> Task:
-        """The model of a `trained` task on a data set; ``baselines`` False leaves the classical
-        estimators out, ``view_weights`` False the learned view weights.
+        """Return the test of the model of a `trained` task on a data set.
+
+        ``overrides`` are those of test.py. ``baselines`` False leaves the classical estimators out,
+        ``view_weights`` False the learned view weights.
         """
-        overrides = (*self.overrides["test"], *overrides)
+        overrides = (*self.overrides.test, *overrides)
         config = self.composed("test", data, *overrides)
-        pairs = model.config["model"]["problem"].get("frames")
-        unused = ("ckpt", *(("baselines", "view_weights") if pairs else ("camera_baselines",)))
-        config = {key: value for key, value in config.items() if key not in unused}
-        left_out = {
-            "baselines": not baselines,
-            "camera_baselines": not baselines,
-            "view_weights": not view_weights,
-        }
-        config |= {key: {} for key, out in left_out.items() if out and key in config}
+        of_pairs = "frames" in model.config["model"]["problem"]
+        unused = ("baselines", "view_weights") if of_pairs else ("camera_baselines",)
+        config = _without(config, ("ckpt", *unused))
+        for key in ("baselines", "camera_baselines"):
+            if key in config and not baselines:
+                config[key] = {}
+        if "view_weights" in config and not view_weights:
+            config["view_weights"] = {}
         dependencies = {"model": model, "data": self.prepared(data, config["data"]["evaluate"])}
         trained = model.name.removeprefix("train-").removesuffix(f"-seed{self.seed}")
-        name = "-".join(filter(None, ["test", trained, "on", data, name, f"seed{self.seed}"]))
-        checkpoint = f"ckpt={_output(model.name).removeprefix('output=')}/last.ckpt"
-        command = " ".join(
-            ["python test.py", checkpoint, *self.words(data), *overrides, _output(name)]
-        )
-        seconds = seconds or SECONDS.get(data, 13.0)
-        return Task(
-            name, "ghpt.paper.engine.testing.measure_model", config, dependencies, command, seconds
-        )
+        name = _joined("test", trained, "on", data, name, f"seed{self.seed}")
+        checkpoint = f"ckpt={_folder(model.name)}/last.ckpt"
+        words = (checkpoint, *self.words(data), *overrides, f"output={_folder(name)}")
+        seconds = seconds or TEST_SECONDS.get(data, OTHER_SECONDS)
+        return Task(name, TESTING, config, dependencies, _command("test.py", *words), seconds)
 
 
-def _output(name: str) -> str:
-    """Where a command that one types puts the run."""
-    return f"output=runs/{name}"
+def _without(config: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any]:
+    return {name: value for name, value in config.items() if name not in names}
 
 
-def _of_source(data: Mapping[str, Any]) -> dict[str, Any]:
-    """The data settings that do not change the recordings set to one value, so that seeds share
-    them.
-    """
-    return dict(data) | {"seed": 0, "evaluate": "test", "stride": 64}
+def _joined(*parts: str) -> str:
+    return "-".join(part for part in parts if part)
+
+
+def _command(script: str, *words: str) -> str:
+    return " ".join(["python", script, *words])
+
+
+def _folder(name: str) -> str:
+    """Return where a command that one types puts the run."""
+    return f"runs/{name}"
 
 
 @functools.cache
-def _files(conf: Path, words: tuple[str, ...]) -> dict[str, Any]:
-    """The key of each split: it changes when a file of the real data set does."""
+def _cache_keys(conf: Path, words: tuple[str, ...]) -> dict[str, Any]:
+    """Return the key of each split: it changes when a file of the real data set does."""
     data = build(compose(conf, "test", words)["data"], "data")
-    return {split: data.cache_key(split) for split in ("train", "validation", "test")}
+    return {split: data.cache_key(split) for split in SPLITS}

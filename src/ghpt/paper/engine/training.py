@@ -3,7 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from ghpt.commands.train import train
+from ghpt.commands.train import TrainSettings, train
+from ghpt.config import settings
 from ghpt.files import write_json
 from ghpt.models.checkpoint import LAST, PREVIOUS, AtomicCheckpointIO, read_checkpoint
 
@@ -17,8 +18,14 @@ def train_model(config: dict[str, Any], dependencies: dict[str, Path], folder: P
     The checkpoint is kept without the state of the optimiser, which is two thirds of it, for no
     training is resumed from it. result.json holds the validation errors (mm).
     """
-    own = {"save_every": _NEVER, "resume": False, "progress_bar": False}
-    errors = train(config | own, folder)
+    own = {
+        "save_every": _NEVER,
+        "resume": False,
+        "progress_bar": False,
+        "output": str(folder),
+    }
+    values = {key: value for key, value in config.items() if key != "files"}
+    errors = train(settings(TrainSettings, values | own), folder)
     for name in ("best.ckpt", PREVIOUS):
         (folder / name).unlink(missing_ok=True)
     checkpoint = read_checkpoint(folder / LAST)

@@ -12,16 +12,14 @@ from ghpt.paper.engine.artefact import (
     Results,
     Section,
     Spread,
+    comparison_rows,
     over_seeds,
 )
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
-from ghpt.paper.published import (
-    ARRANGEMENTS,
-    GENERALIZATION,
-    GENERALIZATION_MAX_DIFFERENCE,
-)
-from ghpt.report.tables import markdown, max_difference
+from ghpt.paper.published import ARRANGEMENTS, GENERALIZATION, GENERALIZATION_MAX_DIFFERENCE
+from ghpt.report.document import Paragraph, Table
+from ghpt.report.tables import max_difference
 
 PANOPTIC = ARRANGEMENTS[:4]
 
@@ -29,8 +27,9 @@ PANOPTIC = ARRANGEMENTS[:4]
 def grid(
     setup: Setup, trained: Sequence[str] = ARRANGEMENTS, tested: Sequence[str] = ARRANGEMENTS
 ) -> dict[str, Task]:
-    """Every training set with every test set: ``"cmu1 on h36m"``; classical estimators where the
-    two are the same.
+    """Return tests of every training set on every test set, by names such as ``"cmu1 on h36m"``.
+
+    Classical estimators are tested where the two are the same.
     """
     models = {data: setup.trained(data) for data in trained}
     return {
@@ -41,40 +40,47 @@ def grid(
 
 def _generalization(results: Results) -> Section:
     rows = []
-    compared = []
+    comparisons = []
     for test in ARRANGEMENTS:
-        numbers = [
-            Comparison(
-                f"{a.upper()} on {test.upper()}",
-                GENERALIZATION[a, test],
-                results.relative(f"{a} on {test}"),
-            )
-            for a in ARRANGEMENTS
-        ]
-        last = [
-            f"{GENERALIZATION_MAX_DIFFERENCE[test]:.1f} %",
-            f"{_difference(results, test).text()} %",
-            "",
-        ]
-        columns = zip(*(number.cells() for number in numbers), strict=True)
-        for kind, cells, end in zip(("paper", "ours", "difference"), columns, last, strict=True):
-            rows.append([f"{test.upper()}, {kind}", *cells, end])
-        rows.append(
-            [
-                f"{test.upper()}, average of the pool",
-                *(results.relative(f"{a} on {test}", "average").text() for a in ARRANGEMENTS),
-                "",
-            ]
-        )
-        compared += numbers
+        of_test = [_compare(results, train, test) for train in ARRANGEMENTS]
+        comparisons += of_test
+        rows += _rows(results, test, of_test)
     header = ["test, mm \\ train", *(name.upper() for name in ARRANGEMENTS), "max. diff."]
     text = (
-        "A row is a test set, a column a training set, as the paper's text reads the table. The last column is "
-        "(largest - smallest) / smallest of a row. The average of the pool needs no training."
+        "A row is a test set, a column a training set, as the paper's text reads the table. The "
+        "last column is (largest - smallest) / smallest of a row. The average of the pool needs no "
+        "training."
     )
-    intra = max(_difference(results, test).mean for test in PANOPTIC)
-    inter = _difference(results, "h36m").mean
-    claims = [
+    return Section(
+        f"{panoptic_name(results)} and {results.display_name('h36m')}",
+        [Paragraph(text), Table(header, rows)],
+        comparisons=comparisons,
+        claims=_claims(results),
+        explanation=_explanation(results),
+    )
+
+
+def _compare(results: Results, train: str, test: str) -> Comparison:
+    label = f"{train.upper()} on {test.upper()}"
+    return Comparison(label, GENERALIZATION[train, test], results.relative(f"{train} on {test}"))
+
+
+def _rows(results: Results, test: str, comparisons: Sequence[Comparison]) -> list[list[str]]:
+    """Return the rows of a test set: paper, ours, difference, and the average of the pool."""
+    name = f"{test.upper()}, "
+    paper, ours, difference = comparison_rows(name, comparisons)
+    paper.append(f"{GENERALIZATION_MAX_DIFFERENCE[test]:.1f} %")
+    ours.append(f"{_max_difference(results, test).text()} %")
+    difference.append("")
+    averages = [results.relative(f"{train} on {test}", "average") for train in ARRANGEMENTS]
+    average = [f"{name}average of the pool", *(error.text() for error in averages), ""]
+    return [paper, ours, difference, average]
+
+
+def _claims(results: Results) -> list[Claim]:
+    intra = max(_max_difference(results, test).mean for test in PANOPTIC)
+    inter = _max_difference(results, "h36m").mean
+    return [
         Claim(
             "intra-dataset: performance on Panoptic within 5 %, whatever the training set",
             "4.1",
@@ -88,27 +94,28 @@ def _generalization(results: Results) -> Section:
             f"{inter:.1f} % (15.1 %)",
         ),
     ]
+
+
+def _explanation(results: Results) -> str:
     averages = [results.relative(f"{test} on {test}", "average").mean for test in PANOPTIC]
-    weights = [results.relative(f"{a} on {b}").mean for a, b in product(ARRANGEMENTS, PANOPTIC)]
-    explained = (
-        f"The pools differ: where the paper's plain average has 25.9 mm on Panoptic, the synthetic one has "
-        f"{min(averages):.1f} to {max(averages):.1f}, nearly all of it a difference in the definition of the joints "
-        f"that no selection can remove; our learned numbers are {min(weights):.1f} to {max(weights):.1f} mm."
+    pairs = product(ARRANGEMENTS, PANOPTIC)
+    weighted = [results.relative(f"{train} on {test}").mean for train, test in pairs]
+    return (
+        "The pools differ: where the paper's plain average has 25.9 mm on Panoptic, the synthetic "
+        f"one has {min(averages):.1f} to {max(averages):.1f}, nearly all of it a difference in the "
+        "definition of the joints that no selection can remove; our learned numbers are "
+        f"{min(weighted):.1f} to {max(weighted):.1f} mm."
     )
-    data = f"{four(results)} and {results.display_name('h36m')}"
-    return Section(data, f"{text}\n\n{markdown(header, rows)}", {}, compared, claims, explained)
 
 
-def four(results: Results) -> str:
-    """Panoptic's arrangements in words."""
+def panoptic_name(results: Results) -> str:
+    """Return the name of Panoptic's four arrangements, synthetic or real."""
     return results.display_name("cmu1").replace(" CMU1", " CMU1 to CMU4")
 
 
-def _difference(results: Results, test: str) -> Spread:
-    return over_seeds(
-        lambda *row: max_difference(row),
-        *(results.relative(f"{a} on {test}") for a in ARRANGEMENTS),
-    )
+def _max_difference(results: Results, test: str) -> Spread:
+    errors = [results.relative(f"{train} on {test}") for train in ARRANGEMENTS]
+    return over_seeds(lambda *row: max_difference(row), *errors)
 
 
 ARTEFACTS = (

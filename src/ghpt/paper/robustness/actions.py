@@ -1,9 +1,10 @@
-"""The work of the robustness curves: estimators on one data set under each of several
-perturbations.
-"""
+"""The action of the robustness curves: estimators on one data set under several perturbations."""
+
+from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,73 +12,115 @@ import torch
 
 from ghpt.config import build
 from ghpt.files import write_json
-from ghpt.metrics.pose_error import MPJPE
+from ghpt.metrics.pose_error import MPJPE, Kind
 from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.module import StochasticEstimator
+from ghpt.models.problem import BaselineSettings
 from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
-from ghpt.report.poses import estimators
 from ghpt.skeleton import JOINTS
 
-KINDS = ("relative", "absolute")
+KINDS: tuple[Kind, ...] = ("relative", "absolute")
 OF_POOL = ("weight", "average", "most", "best")
 """Selections of the model's pool; the best one looks at the truth."""
 LEARNED = (*OF_POOL, "view_weights")
 """Every estimator that is not classical."""
 
-Estimator = Callable[[Observations], PoseEstimate]
+Estimator = Callable[[Any], Any]
+"""From observations to an estimate, as the problem of the model has them."""
+
+
+@dataclass(frozen=True)
+class LevelErrors:
+    """The errors of an estimator under one perturbation, MPJPE in mm; None: nothing measured."""
+
+    relative: float | None
+    absolute: float | None
+    coverage: Mapping[str, float]
+    """Kind -> share of the joints with a truth that were measured."""
+
+    def error(self, kind: str) -> float:
+        """Return the error of a kind, NaN where nothing was measured."""
+        value = self.relative if kind == "relative" else self.absolute
+        return math.nan if value is None else value
+
+
+@dataclass(frozen=True)
+class CurveContent:
+    """The content of result.json."""
+
+    frames: int
+    levels: Sequence[Mapping[str, LevelErrors]]
+    """For each perturbation, the errors of each estimator by its name."""
+
+
+class LevelMetrics:
+    """The metrics of all estimators under one perturbation."""
+
+    def __init__(self) -> None:
+        self._metrics: dict[str, dict[Kind, MPJPE]] = {}
+
+    def update(self, estimates: Mapping[str, PoseEstimate], truth: Truth) -> None:
+        """Add the estimates of a batch, by the estimators' names."""
+        for name, estimate in estimates.items():
+            if name not in self._metrics:
+                self._metrics[name] = {kind: MPJPE(kind, 1, len(JOINTS)) for kind in KINDS}
+            group = torch.zeros(len(estimate.points), dtype=torch.int64)
+            for metric in self._metrics[name].values():
+                metric.update(estimate, truth, group)
+
+    def compute(self) -> dict[str, LevelErrors]:
+        """Return the errors over all batches."""
+        return {name: _level_errors(metrics) for name, metrics in self._metrics.items()}
 
 
 @torch.no_grad()
-def curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
-    """Estimate ``config["data"]`` under each of ``config["perturbations"]`` (None: as it is) with
-    the model of ``dependencies["model"]``, ``config["view_weights"]`` and ``config["baselines"]``.
+def measure_curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
+    """Measure all estimators on ``data`` under each of the ``perturbations`` (None: as it is).
 
-    result.json: for each perturbation, estimator -> MPJPE (mm) ``relative`` and ``absolute``, and
-    the ``coverage`` of each: the share of the joints with a truth that were counted.
+    They are the model of the dependency ``model``, the settings' ``view_weights`` and
+    ``baselines``. result.json: `CurveContent`.
     """
     data = build(config["data"], "data")
     data.setup("test")
     frames = data.frames["test"]
-    model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
-    everybody = together(model.eval(), estimators(config, model))
+    seed = config["seed"]
+    model, _ = load_model(dependencies["model"] / LAST, seed=seed)
+    groups = BaselineSettings(config["baselines"], {}, config.get("view_weights"))
+    estimate = all_estimators(model.eval(), model.problem.baselines(groups, model))
     perturbations = build(config["perturbations"], "perturbations")
-    levels: list[dict[str, dict[str, MPJPE]]] = [{} for _ in perturbations]
+    levels = [LevelMetrics() for _ in perturbations]
     for first in range(0, len(frames), data.batch_size):
         batch = frames[range(first, min(first + data.batch_size, len(frames)))]
-        for errors, perturbation in zip(levels, perturbations, strict=True):
+        for metrics, perturbation in zip(levels, perturbations, strict=True):
             observations = batch.observations
             if perturbation is not None:
-                observations = perturbation(observations, config["seed"])
-            found = everybody(Labelled(observations, batch.truth))
-            for name, estimate in found.items():
-                metrics = errors.setdefault(
-                    name, {kind: MPJPE(kind, 1, len(JOINTS)) for kind in KINDS}
-                )
-                for metric in metrics.values():
-                    metric.update(estimate, batch.truth, torch.zeros_like(observations.index))
-    content = [{name: _numbers(metrics) for name, metrics in errors.items()} for errors in levels]
-    write_json(folder / "result.json", {"frames": len(frames), "levels": content})
+                observations = perturbation(observations, seed)
+            metrics.update(estimate(Labelled(observations, batch.truth)), batch.truth)
+    content = CurveContent(len(frames), [metrics.compute() for metrics in levels])
+    write_json(folder / "result.json", asdict(content))
 
 
-def together(
+def all_estimators(
     model: StochasticEstimator, others: Mapping[str, Estimator]
 ) -> Callable[[Labelled[Observations, Truth]], dict[str, PoseEstimate]]:
-    """The model's selections and the other estimators on a batch, by name."""
+    """Return what estimates a batch by the model's selections and by the others, by name."""
 
     def estimate(batch: Labelled[Observations, Truth]) -> dict[str, PoseEstimate]:
         pool = model.sample(batch.observations, "test", batch.truth)
-        of_pool = {name: pool.estimate(name) for name in OF_POOL}
-        return of_pool | {name: estimator(batch.observations) for name, estimator in others.items()}
+        estimates = {name: pool.estimate(name) for name in OF_POOL}
+        for name, estimator in others.items():
+            estimates[name] = estimator(batch.observations)
+        return estimates
 
     return estimate
 
 
-def _numbers(metrics: dict[str, MPJPE]) -> dict[str, Any]:
-    computed = {kind: metric.compute() for kind, metric in metrics.items()}
-    means = {kind: _finite(errors.mean.item()) for kind, errors in computed.items()}
-    return means | {"coverage": {kind: errors.coverage.item() for kind, errors in computed.items()}}
-
-
-def _finite(value: float) -> float | None:
-    """None where nothing was counted."""
-    return value if math.isfinite(value) else None
+def _level_errors(metrics: Mapping[Kind, MPJPE]) -> LevelErrors:
+    means = {}
+    coverage = {}
+    for kind, metric in metrics.items():
+        errors = metric.compute()
+        mean = errors.mean.item()
+        means[kind] = mean if math.isfinite(mean) else None
+        coverage[str(kind)] = errors.coverage.item()
+    return LevelErrors(means["relative"], means["absolute"], coverage)

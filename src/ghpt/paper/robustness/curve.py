@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from ghpt.paper.engine.artefact import Results, Spread
+from ghpt.config import settings
+from ghpt.paper.engine.artefact import Number, Results, Spread
+from ghpt.paper.engine.settings import Robustness
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
-from ghpt.paper.robustness.actions import LEARNED
+from ghpt.paper.robustness.actions import KINDS, LEARNED, CurveContent, LevelErrors
 
+ACTION = "ghpt.paper.robustness.actions.measure_curve"
 PERTURBATIONS = "ghpt.paper.robustness.perturbation"
 CLEAN = "clean"
 """The task of a data set as it is, shared by the curves."""
@@ -22,121 +25,136 @@ class Curve:
     """One quantity that gets worse."""
 
     name: str
-    """Of its task, and of its levels in ``sizes.robustness``; 0 means the data as they are."""
+    """The name of its task."""
     perturbation: str
-    setting: str
-    """The perturbation's argument that the levels are of."""
+    argument: str
+    """The perturbation's argument that is varied."""
+    levels_of: Callable[[Robustness], Sequence[Number]]
+    """Returns the levels of the argument; 0 means the data as they are."""
     x: str
     """The axis and the head of the table, with the unit."""
     unit: str = ""
-    """In a sentence."""
-    times: float = 1.0
-    """From the setting to what is shown."""
+    """The unit in a sentence."""
+    factor: float = 1.0
+    """From the argument to what is shown."""
     data: str = "h36m"
     logarithmic: bool = False
-    more: tuple[str, ...] = field(default=())
-    """Further arguments, also in ``sizes.robustness``."""
+    constants_of: Callable[[Robustness], Mapping[str, Number]] = lambda sizes: {}
+    """Returns the perturbation's other arguments."""
 
-    def levels(self, setup: Setup) -> list[float | int]:
-        return setup.sizes["robustness"][self.name]
+    def levels(self, setup: Setup) -> Sequence[Number]:
+        return self.levels_of(setup.sizes.robustness)
 
     def task(self, setup: Setup) -> Task:
-        sizes = setup.sizes["robustness"]
-        more = {name: sizes[f"{self.name}_{name}"] for name in self.more}
+        """Return the task that measures the levels other than 0."""
+        constants = self.constants_of(setup.sizes.robustness)
         target = f"{PERTURBATIONS}.{self.perturbation}"
         perturbations = [
-            {"_target_": target, self.setting: level, **more}
+            {"_target_": target, self.argument: level, **constants}
             for level in self.levels(setup)
             if level
         ]
-        return measured(setup, self.name, self.data, perturbations)
+        return _measured(setup, self.name, self.data, perturbations)
 
 
-def measured(
-    setup: Setup, name: str, data: str, perturbations: Sequence[dict[str, Any] | None]
-) -> Task:
-    """Everybody under each of the perturbations."""
-    sizes = setup.sizes["robustness"]
-    whole = setup.composed(
-        "test", data, *setup.overrides["test"], f"data.stride={sizes['stride'][data]}"
-    )
-    config = {
-        key: whole[key]
-        for key in ("data", "view_weights", "baselines", "seed", "files")
-        if key in whole
-    }
-    config |= {"perturbations": list(perturbations)}
-    dependencies = {
-        "model": setup.trained(sizes["trained_on"]),
-        "data": setup.prepared(data, "test"),
-    }
-    seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
-    name = f"robustness-{name}-seed{setup.seed}"
-    return Task(name, "ghpt.paper.robustness.actions.curve", config, dependencies, seconds=seconds)
-
-
-def tasks_of(setup: Setup, of: Sequence[Curve]) -> dict[str, Task]:
-    tasks = {curve.name: curve.task(setup) for curve in of}
-    if any(0 in curve.levels(setup) for curve in of):
-        tasks[CLEAN] = measured(setup, CLEAN, "h36m", [None])
+def curve_tasks(setup: Setup, curves: Sequence[Curve]) -> dict[str, Task]:
+    """Return the tasks of some curves by name, with that of the unperturbed data."""
+    tasks = {curve.name: curve.task(setup) for curve in curves}
+    if any(0 in curve.levels(setup) for curve in curves):
+        tasks[CLEAN] = _measured(setup, CLEAN, "h36m", [None])
     return tasks
 
 
+def _measured(
+    setup: Setup, name: str, data: str, perturbations: Sequence[Mapping[str, Any] | None]
+) -> Task:
+    """Return the task that measures every estimator under each of the perturbations."""
+    sizes = setup.sizes.robustness
+    stride = f"data.stride={sizes.stride[data]}"
+    whole = setup.composed("test", data, *setup.overrides.test, stride)
+    keys = ("data", "view_weights", "baselines", "seed", "files")
+    config = {key: whole[key] for key in keys if key in whole}
+    config["perturbations"] = list(perturbations)
+    dependencies = {"model": setup.trained(sizes.trained_on), "data": setup.prepared(data, "test")}
+    seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
+    name = f"robustness-{name}-seed{setup.seed}"
+    return Task(name, ACTION, config, dependencies, seconds=seconds)
+
+
 @dataclass(frozen=True)
-class Found:
+class CurveResult:
     """The results of a curve."""
 
     levels: list[str]
-    places: list[float]
-    errors: dict[str, dict[str, list[Spread]]]
-    """Kind -> estimator -> MPJPE at each level, mm; NaN where nothing was counted."""
-    coverage: list[tuple[float, float]]
-    """Least and largest share of the joints that an estimator has, at each level."""
+    places: Sequence[Number]
+    """The levels as numbers."""
+    errors: Mapping[str, Mapping[str, Sequence[Spread]]]
+    """Kind -> estimator -> MPJPE at each level, mm; NaN where nothing was measured."""
+    coverage: Sequence[tuple[float, float]]
+    """Smallest and largest share of the joints that an estimator has, at each level."""
+    frames: int
+
+    @property
+    def last(self) -> int:
+        """The index of the last level."""
+        return len(self.levels) - 1
 
     @property
     def classical(self) -> list[str]:
         return [name for name in self.errors["relative"] if name not in LEARNED]
 
     def mean(self, name: str, level: int, kind: str = "relative") -> float:
+        """Return the mean error of an estimator at a level, mm."""
         return self.errors[kind][name][level].mean
 
     def lead(self, name: str, level: int) -> float:
-        """By what share an estimator's error is below that of the best classical one."""
+        """Return by what share an estimator's error is below that of the best classical one."""
         return 1 - self.mean(name, level) / self.mean(self.best_classical(level), level)
 
     def best_classical(self, level: int) -> str:
-        return min(self.classical, key=lambda name: nan_to_last(self.mean(name, level)))
+        """Return the classical estimator with the smallest error at a level."""
+        return min(self.classical, key=lambda name: nan_to_inf(self.mean(name, level)))
 
 
-def nan_to_last(error: float) -> float:
-    """For an order in which what has no number comes last."""
+def nan_to_inf(error: float) -> float:
+    """Return the error for an order in which what has no number comes last."""
     return math.inf if math.isnan(error) else error
 
 
-def found(results: Results, curve: Curve) -> Found:
+def read_curve(results: Results, curve: Curve) -> CurveResult:
+    """Return the results of a curve's task, with those of the unperturbed data at level 0."""
     levels = curve.levels(results.setup)
-    seeds = [list(each["levels"]) for each in results.read(curve.name)]
-    for i, level in enumerate(levels):
-        if level == 0:
-            for own, clean in zip(seeds, results.read(CLEAN), strict=True):
-                own.insert(i, clean["levels"][0])
-    names = list(seeds[0][0])
+    contents = _contents(results, curve.name)
+    seeds = [list(content.levels) for content in contents]
+    if 0 in levels:
+        for of_seed, clean in zip(seeds, _contents(results, CLEAN), strict=True):
+            of_seed.insert(list(levels).index(0), clean.levels[0])
+    errors = {str(kind): _spreads(seeds, kind) for kind in KINDS}
+    coverage = []
+    for level in range(len(levels)):
+        shares = [
+            estimator.coverage["relative"]
+            for of_seed in seeds
+            for estimator in of_seed[level].values()
+        ]
+        coverage.append((min(shares), max(shares)))
+    places = [curve.factor * level for level in levels]
+    labels = [f"{place:g}" for place in places]
+    return CurveResult(labels, places, errors, coverage, contents[0].frames)
 
-    def spread(kind: str, name: str, i: int) -> Spread:
-        values = (own[i][name][kind] for own in seeds)
-        return Spread(tuple(float("nan") if value is None else value for value in values))
 
-    errors = {
-        kind: {name: [spread(kind, name, i) for i in range(len(levels))] for name in names}
-        for kind in ("relative", "absolute")
-    }
-    shares = [
-        [own[i][name]["coverage"]["relative"] for own in seeds for name in names]
-        for i in range(len(levels))
-    ]
-    return Found(
-        [f"{curve.times * level:g}" for level in levels],
-        [curve.times * level for level in levels],
-        errors,
-        [(min(s), max(s)) for s in shares],
-    )
+def _contents(results: Results, task: str) -> list[CurveContent]:
+    return [settings(CurveContent, content) for content in results.read(task)]
+
+
+def _spreads(
+    seeds: Sequence[Sequence[Mapping[str, LevelErrors]]], kind: str
+) -> dict[str, list[Spread]]:
+    """Return the error of each estimator at each level over the seeds; NaN where there is none."""
+    spreads = {}
+    for name in seeds[0][0]:
+        spreads[name] = [
+            Spread(tuple(levels[name].error(kind) for levels in of_level))
+            for of_level in zip(*seeds, strict=True)
+        ]
+    return spreads

@@ -1,6 +1,4 @@
-"""Errors against a quantity, one line for each estimator: the figures of the robustness curves and
-the ablations.
-"""
+"""Errors against a quantity, a line for each estimator: figures of robustness and ablations."""
 
 from __future__ import annotations
 
@@ -8,11 +6,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
-from ghpt.paper.engine.artefact import Spread
+from ghpt.paper.engine.artefact import Number, Spread
 from ghpt.report.figures import wrapped
 from ghpt.report.tables import NAMES
 
@@ -39,9 +38,21 @@ LABELS = NAMES | {
     "best": "best of its pool (looks at the truth)",
 }
 WIDTHS = {"weight": 2.2, "view_weights": 2.6, "linear": 2.6, "ransac": 3.2, "adaptive_ransac": 4.0}
-"""Of those that others often lie upon, or that matter most; 1.4 of the rest."""
+"""Widths of the lines that others often lie upon, or that matter most."""
+OTHER_WIDTH = 1.4
 ACROSS = 6.0
 """Largest ratio of the errors in a panel on a linear axis."""
+TICKS = (10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1000, 2000, 5000)
+"""Ticks of a logarithmic axis, mm."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """The errors of an estimator at some places."""
+
+    places: Sequence[Number]
+    errors: Sequence[Spread]
+    """mm."""
 
 
 @dataclass(frozen=True)
@@ -50,77 +61,72 @@ class Panel:
 
     x: str
     """What is varied, with its unit."""
-    lines: Mapping[str, tuple[Sequence[float | int], Sequence[Spread]]]
-    """Estimator -> places, errors (mm)."""
+    lines: Mapping[str, Line]
+    """By the estimator's name."""
     logarithmic: bool = False
-    """The horizontal axis."""
-    mark: float | int | None = None
+    """Whether the horizontal axis is logarithmic."""
+    mark: Number | None = None
     """The default, a vertical line."""
 
 
-def curves(
+def draw_curves(
     panels: Sequence[Panel],
     heading: str,
     y: str,
     labels: Mapping[str, str] = LABELS,
     share: bool = True,
 ) -> Figure:
-    """The panels side by side, on one vertical axis where they ``share`` it; bars are a standard
-    deviation over the seeds.
+    """Draw the panels side by side, on one vertical axis where they ``share`` it.
+
+    Bars are a standard deviation over the seeds.
     """
-    figure = Figure(figsize=(6.4 if len(panels) == 1 else 7.2, 4.6), layout="constrained")
-    axes = figure.subplots(1, len(panels), sharey=share, squeeze=False)[0]
-    for each, panel in zip(axes, panels, strict=True):
-        _draw(each, panel, labels)
-    errors = [s.mean for panel in panels for _, spreads in panel.lines.values() for s in spreads]
-    errors = [error for error in errors if np.isfinite(error)]
+    single = len(panels) == 1
+    figure = Figure(figsize=(6.4 if single else 7.2, 4.6), layout="constrained")
+    axes = list(figure.subplots(1, len(panels), sharey=share, squeeze=False)[0])
+    for own_axes, panel in zip(axes, panels, strict=True):
+        _draw_panel(own_axes, panel, labels)
     axes[0].set_ylabel(y)
-    if errors and max(errors) > ACROSS * min(errors):
-        axes[0].set_yscale("log")
-        ticks = [
-            t
-            for t in (10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1000, 2000, 5000)
-            if min(errors) / 1.5 < t < max(errors) * 1.5
-        ]
-        axes[0].yaxis.set_major_locator(FixedLocator(ticks))
-        axes[0].yaxis.set_minor_locator(NullLocator())
-        axes[0].yaxis.set_major_formatter(ScalarFormatter())
-    handles = {h.get_label(): h for each in axes for h in each.get_legend_handles_labels()[0]}
-    columns = 4 if max(map(len, handles)) <= 25 else 2
+    _scale_errors(axes[0], panels)
+    _draw_legend(figure, axes)
+    figure.suptitle(wrapped(heading, 70 if single else 80), fontsize=10)
+    return figure
+
+
+def _scale_errors(axes: Axes, panels: Sequence[Panel]) -> None:
+    """Make the vertical axis logarithmic where the errors differ by more than ``ACROSS``."""
+    lines = [line for panel in panels for line in panel.lines.values()]
+    means = [error.mean for line in lines for error in line.errors]
+    errors = [mean for mean in means if np.isfinite(mean)]
+    if not errors or max(errors) <= ACROSS * min(errors):
+        return
+    axes.set_yscale("log")
+    ticks = [tick for tick in TICKS if min(errors) / 1.5 < tick < max(errors) * 1.5]
+    axes.yaxis.set_major_locator(FixedLocator(ticks))
+    axes.yaxis.set_minor_locator(NullLocator())
+    axes.yaxis.set_major_formatter(ScalarFormatter())
+
+
+def _draw_legend(figure: Figure, axes: Sequence[Axes]) -> None:
+    handles: dict[str, Artist] = {}
+    for own_axes in axes:
+        for handle, label in zip(*own_axes.get_legend_handles_labels(), strict=True):
+            handles[label] = handle
     figure.legend(
         handles.values(),
         handles,
         loc="outside lower center",
-        ncols=columns,
+        ncols=4 if max(map(len, handles)) <= 25 else 2,
         frameon=False,
         fontsize=9,
     )
-    figure.suptitle(wrapped(heading, 70 if len(panels) == 1 else 80), fontsize=10)
-    return figure
 
 
-def _draw(axes: Axes, panel: Panel, labels: Mapping[str, str]) -> None:
-    for name, (places, spreads) in panel.lines.items():
-        colour, style, marker = STYLES[name]
-        deviation = [s.deviation for s in spreads]
-        axes.errorbar(
-            places,
-            [s.mean for s in spreads],
-            yerr=None if None in deviation else deviation,
-            color=colour,
-            linestyle=style,
-            marker=marker,
-            markersize=4 + 1.5 * WIDTHS.get(name, 1.4),
-            markeredgecolor="white",
-            markeredgewidth=0.5,
-            linewidth=WIDTHS.get(name, 1.4),
-            capsize=2,
-            label=labels.get(name, name),
-            zorder=5 - WIDTHS.get(name, 1.4) / 4 + (name in ("weight", "view_weights")),
-        )
+def _draw_panel(axes: Axes, panel: Panel, labels: Mapping[str, str]) -> None:
+    for name, line in panel.lines.items():
+        _draw_line(axes, name, line, labels.get(name, name))
     if panel.logarithmic:
         axes.set_xscale("log")
-    ticks = sorted({place for places, _ in panel.lines.values() for place in places})
+    ticks = sorted({place for line in panel.lines.values() for place in line.places})
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()
     if panel.mark is not None:
@@ -130,3 +136,25 @@ def _draw(axes: Axes, panel: Panel, labels: Mapping[str, str]) -> None:
     axes.set_axisbelow(True)
     axes.tick_params(labelsize=9)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def _draw_line(axes: Axes, name: str, line: Line, label: str) -> None:
+    colour, style, marker = STYLES[name]
+    width = WIDTHS.get(name, OTHER_WIDTH)
+    deviations = [error.deviation for error in line.errors]
+    known = [deviation for deviation in deviations if deviation is not None]
+    axes.errorbar(
+        line.places,
+        [error.mean for error in line.errors],
+        yerr=known if len(known) == len(deviations) else None,
+        color=colour,
+        linestyle=style,
+        marker=marker,
+        markersize=4 + 1.5 * width,
+        markeredgecolor="white",
+        markeredgewidth=0.5,
+        linewidth=width,
+        capsize=2,
+        label=label,
+        zorder=5 - width / 4 + (name in ("weight", "view_weights")),
+    )

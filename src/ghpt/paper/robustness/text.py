@@ -5,119 +5,140 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ghpt.paper.engine.artefact import signed
-from ghpt.paper.robustness.curve import Curve, Found, nan_to_last
+from ghpt.paper.engine.artefact import Spread, signed
+from ghpt.paper.robustness.curve import Curve, CurveResult, nan_to_inf
 from ghpt.paper.robustness.figure import LABELS
-from ghpt.report.escape import Markdown
-from ghpt.report.tables import NONE, markdown
+from ghpt.report.document import Strong, Table, Text
+from ghpt.report.tables import NONE
 
 TIE = 5e-4
 """Errors that differ by a smaller share are equal in print."""
+_WHOLE = 0.99995
+"""A coverage above it is printed as 100.0 %."""
 
 
-def table(curve: Curve, of: Found, kind: str) -> str:
-    """Levels x estimators; the coverage where it is not whole. The least error of a level is bold."""
-    head = [curve.x, *(LABELS.get(name, name) for name in of.errors[kind])]
-    partial_coverage = min(low for low, _ in of.coverage) < 0.99995
-    rows = []
-    for i, level in enumerate(of.levels):
-        least = min(
-            nan_to_last(spreads[i].mean)
-            for name, spreads in of.errors[kind].items()
-            if name != "best"
-        )
-        texts = [NONE if math.isnan(s[i].mean) else s[i].text() for s in of.errors[kind].values()]
-        means = [spreads[i].mean for spreads in of.errors[kind].values()]
-        bold = [
-            Markdown(f"**{text}**") if mean == least else text
-            for text, mean in zip(texts, means, strict=True)
-        ]
-        rows.append([level, *bold, *([_share(*of.coverage[i])] if partial_coverage else [])])
-    return markdown([*head, *(["joints counted"] if partial_coverage else [])], rows)
+def error_table(curve: Curve, result: CurveResult, kind: str) -> Table:
+    """Return a table levels x estimators; the least error of a level is bold.
 
-
-def _share(low: float, high: float) -> str:
-    same = f"{100 * low:.1f}" == f"{100 * high:.1f}"
-    return f"{100 * low:.1f} %" if same else f"{100 * low:.1f} to {100 * high:.1f} %"
-
-
-def verdict(curve: Curve, of: Found) -> str:
-    """Where the view weights stand against the best classical estimator of each level, and where
-    the paper's selection stands against that, LO-RANSAC and its own pool.
+    The coverage has a column where it is not whole.
     """
-    last = len(of.levels) - 1
-    parts = [_view_weights(curve, of), _against(curve, of, 0), _against(curve, of, last)]
-    ahead = [f"of all classical estimators at {_where(curve, of, of.classical)}"]
-    if "lo_ransac" in of.classical:
-        ahead.append(f"of LO-RANSAC at {_where(curve, of, ['lo_ransac'])}")
-    parts.append(f"It is ahead {', '.join(ahead)}.")
-    most, best = (
-        " and ".join(f"{of.mean(name, i):.1f}" for i in (0, last)) for name in ("most", "best")
-    )
-    parts.append(
-        f"At these two ends the best-scored hypothesis of its pool has {most} mm, the best of its pool {best}."
-    )
-    return " ".join(part for part in parts if part)
+    estimators = result.errors[kind]
+    header = [curve.x, *(LABELS.get(name, name) for name in estimators)]
+    whole = all(low >= _WHOLE for low, _ in result.coverage)
+    rows: list[list[Text]] = []
+    for level, label in enumerate(result.levels):
+        rivals = [errors[level].mean for name, errors in estimators.items() if name != "best"]
+        least = min(map(nan_to_inf, rivals))
+        cells = [_error_cell(errors[level], least) for errors in estimators.values()]
+        coverage = [] if whole else [_coverage_text(*result.coverage[level])]
+        rows.append([label, *cells, *coverage])
+    return Table(header if whole else [*header, "joints counted"], rows)
 
 
-def _view_weights(curve: Curve, of: Found) -> str:
-    """Wins, ties and losses over the levels at which something was counted, and the two ends."""
-    leads = {i: of.lead("view_weights", i) for i in range(len(of.levels))}
-    leads = {i: lead for i, lead in leads.items() if math.isfinite(lead)}
+def _error_cell(error: Spread, least: float) -> Text:
+    if math.isnan(error.mean):
+        return NONE
+    return Strong(error.text()) if error.mean == least else error.text()
+
+
+def _coverage_text(low: float, high: float) -> str:
+    smallest = f"{100 * low:.1f}"
+    largest = f"{100 * high:.1f}"
+    return f"{smallest} %" if smallest == largest else f"{smallest} to {largest} %"
+
+
+def verdict(curve: Curve, result: CurveResult) -> str:
+    """Return where the view weights and the paper's selection stand at the levels of a curve.
+
+    The view weights are set against the best classical estimator of each level; the paper's
+    selection against that, LO-RANSAC and its own pool.
+    """
+    ahead = [f"of all classical estimators at {_winning_levels(curve, result, result.classical)}"]
+    if "lo_ransac" in result.classical:
+        ahead.append(f"of LO-RANSAC at {_winning_levels(curve, result, ['lo_ransac'])}")
+    most = _means_at_ends(result, "most")
+    best = _means_at_ends(result, "best")
+    sentences = [
+        _view_weights_text(curve, result),
+        _selection_text(curve, result, 0),
+        _selection_text(curve, result, result.last),
+        f"It is ahead {', '.join(ahead)}.",
+        f"At these two ends the best-scored hypothesis of its pool has {most} mm, the best of its "
+        f"pool {best}.",
+    ]
+    return " ".join(sentence for sentence in sentences if sentence)
+
+
+def _means_at_ends(result: CurveResult, name: str) -> str:
+    return f"{result.mean(name, 0):.1f} and {result.mean(name, result.last):.1f}"
+
+
+def _view_weights_text(curve: Curve, result: CurveResult) -> str:
+    """Return wins, ties and losses over the measured levels, and the two ends."""
+    leads = {}
+    for level in range(len(result.levels)):
+        lead = result.lead("view_weights", level)
+        if math.isfinite(lead):
+            leads[level] = lead
     if not leads:
         return ""
     won = sum(lead > TIE for lead in leads.values())
     lost = sum(lead < -TIE for lead in leads.values())
-    worst, best = (
-        f"{standing(of, i)} at {of.levels[i]}{curve.unit}"
-        for i in (min(leads, key=leads.__getitem__), max(leads, key=leads.__getitem__))
-    )
+    tied = len(leads) - won - lost
+    worst = min(leads, key=leads.__getitem__)
+    best = max(leads, key=leads.__getitem__)
     return (
-        f"Against the best classical estimator of each of {len(leads)} levels the view weights win {won}, tie "
-        f"{len(leads) - won - lost} and lose {lost}: from {worst} to {best}."
+        f"Against the best classical estimator of each of {len(leads)} levels the view weights win "
+        f"{won}, tie {tied} and lose {lost}: "
+        f"from {margin(result, worst)} at {result.levels[worst]}{curve.unit} "
+        f"to {margin(result, best)} at {result.levels[best]}{curve.unit}."
     )
 
 
-def standing(of: Found, level: int, name: str = "view_weights") -> str:
-    """``+2.8 % (24.0 mm, adaptive RANSAC 24.7)``: by what share an estimator leads the best
-    classical one.
+def margin(result: CurveResult, level: int, name: str = "view_weights") -> str:
+    """Return by what share an estimator leads the best classical one.
+
+    For example ``+2.8 % (24.0 mm, adaptive RANSAC 24.7)``.
     """
-    other = of.best_classical(level)
-    ours = of.mean(name, level)
-    theirs = of.mean(other, level)
-    return f"{signed(100 * of.lead(name, level))} % ({ours:.1f} mm, {LABELS.get(other, other)} {theirs:.1f})"
+    other = result.best_classical(level)
+    ours = result.mean(name, level)
+    theirs = result.mean(other, level)
+    lead = signed(100 * result.lead(name, level))
+    return f"{lead} % ({ours:.1f} mm, {LABELS.get(other, other)} {theirs:.1f})"
 
 
-def _where(curve: Curve, of: Found, others: Sequence[str]) -> str:
-    """The levels at which the paper's selection is ahead of all these."""
-    wins = [
-        level
-        for i, level in enumerate(of.levels)
-        if of.mean("weight", i) < (1 - TIE) * min(nan_to_last(of.mean(name, i)) for name in others)
-    ]
+def _winning_levels(curve: Curve, result: CurveResult, others: Sequence[str]) -> str:
+    """Return the levels at which the paper's selection is ahead of all these."""
+    wins = []
+    for level, label in enumerate(result.levels):
+        rival = min(nan_to_inf(result.mean(name, level)) for name in others)
+        if result.mean("weight", level) < (1 - TIE) * rival:
+            wins.append(label)
+    if not wins:
+        return "no level"
+    return "every level" if len(wins) == len(result.levels) else ", ".join(wins) + curve.unit
+
+
+def _selection_text(curve: Curve, result: CurveResult, level: int) -> str:
+    """Return where the paper's selection stands at a level."""
+    name = result.best_classical(level)
+    ours = result.mean("weight", level)
+    lead = result.lead("weight", level)
+    if abs(lead) <= TIE:
+        order = "is level with"
+        distance = ""
+    else:
+        order = "beats" if lead > 0 else "loses to"
+        distance = f" by {100 * abs(lead):.1f} %"
     return (
-        "no level"
-        if not wins
-        else "every level"
-        if len(wins) == len(of.levels)
-        else ", ".join(wins) + curve.unit
+        f"At {result.levels[level]}{curve.unit} the paper's selection ({ours:.1f} mm) {order} the "
+        f"best classical estimator, {LABELS.get(name, name)} ({result.mean(name, level):.1f} mm)"
+        f"{distance}, and {_pool_text(result, level)} the average of its pool."
     )
 
 
-def _against(curve: Curve, of: Found, level: int) -> str:
-    ours = of.mean("weight", level)
-    average = of.mean("average", level)
-    name = of.best_classical(level)
-    lead = of.lead("weight", level)
-    gain = 1 - ours / average
-    does = "is level with" if abs(lead) <= TIE else "beats" if lead > 0 else "loses to"
-    by = "" if abs(lead) <= TIE else f" by {100 * abs(lead):.1f} %"
-    pool = (
-        "equals"
-        if abs(gain) <= TIE
-        else f"is {100 * abs(gain):.1f} % {'below' if gain > 0 else 'above'}"
-    )
-    return (
-        f"At {of.levels[level]}{curve.unit} the paper's selection ({ours:.1f} mm) {does} the best classical estimator, "
-        f"{LABELS.get(name, name)} ({of.mean(name, level):.1f} mm){by}, and {pool} the average of its pool."
-    )
+def _pool_text(result: CurveResult, level: int) -> str:
+    gain = 1 - result.mean("weight", level) / result.mean("average", level)
+    if abs(gain) <= TIE:
+        return "equals"
+    return f"is {100 * abs(gain):.1f} % {'below' if gain > 0 else 'above'}"
