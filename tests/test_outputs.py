@@ -274,7 +274,7 @@ COMMANDS = {
     "cameras": (
         ghpt.commands.cameras.COMMAND,
         [],
-        ["cameras.toml", "keypoints.npz", "checkup.json", "report.md"],
+        ["cameras.toml", "keypoints.npz", "cameras.json", "report.md"],
     ),
     "train": (
         train.COMMAND,
