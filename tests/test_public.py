@@ -147,3 +147,26 @@ def test_the_metrics_of_arrays():
     errors = ghpt.relative_pose_errors(RIG.R[1:], RIG.t[1:], RIG.R[1:], RIG.t[1:] + 1)
     assert errors.translation_mm == pytest.approx([3**0.5] * 3)
     assert errors.rotation_deg == pytest.approx([0] * 3, abs=1e-6)
+
+
+def test_a_rig_is_calibrated_from_intrinsics_alone():
+    truth = walk()[:80].double()
+    noise = np.random.default_rng(1).normal(0, 0.5, (80, 4, 17, 2))
+    key_points = project(RIG.cameras, truth)[0].numpy() + noise
+    rig, findings = ghpt.calibrate_rig(key_points, RIG.K, height=1750)
+    assert rig.names == ("cam_00", "cam_01", "cam_02", "cam_03")
+    assert [found.text for found in findings if found.severity == "error"] == []
+    R, _ = rig.cameras.relative_pose(0, slice(1, 4))
+    true_R, _ = RIG.cameras.relative_pose(0, slice(1, 4))
+    zero = np.zeros((3, 3))
+    assert ghpt.relative_pose_errors(R, zero, true_R, zero).rotation_deg.max() < 1
+    assert [found.code for found in ghpt.check_cameras(key_points, rig)] == []
+
+
+def test_a_turned_camera_is_found():
+    truth = walk()[:80].double()
+    key_points = project(RIG.cameras, truth)[0].numpy()
+    R = RIG.R.clone()
+    R[2] = R[2].T
+    findings = ghpt.check_cameras(key_points, (RIG.K, R, RIG.t))
+    assert [found.cameras for found in findings] == [("cam_02",)]

@@ -168,7 +168,9 @@ class Predictor:
         wanted = self.settings
         sequence = person_sequence(people, rig, wanted.match, wanted.views, wanted.person)
         sequence.cameras.check_calibrated(sequence.source)
-        sequence = resolve_unit(sequence, build(wanted.doctor, "doctor").consensus, ask=True)
+        sequence = resolve_unit(
+            sequence, build(wanted.camera_check, "camera_check").consensus, ask=True
+        )
         chunks = Chunks(wanted.fitted_frames, wanted.batch)
         part = _estimate(self.estimator.predictor, sequence.read, len(sequence), chunks)
         names = sequence.cameras.names
@@ -191,6 +193,7 @@ def calibrate_rig(
     taken, and a finding says so. ``changes`` are settings of conf/calibrate.yaml. Raises
     GhptDataError where no rig can be found.
     """
+    from ghpt.calibration.millimetres import read_scale
     from ghpt.commands.calibrate import CalibrateSettings, Case, solve_rig
 
     defaults = _defaults("calibrate")
@@ -199,7 +202,12 @@ def calibrate_rig(
     rig = as_camera_set(cameras)
     people = as_detections(key_points, rig, confidence)
     sequence = person_sequence(people, rig, wanted.match, wanted.views, person=None)
-    solution = solve_rig(wanted, Case(sequence, "the given calibration", is_own=True))
+    case = Case(sequence, "the given calibration", is_own=True)
+    calibration = build(wanted.calibration, "calibration")
+    name = wanted.triangulation
+    estimator = build(wanted.baselines[name], f"baselines.{name}")
+    source = read_scale(wanted.scale, sequence.cameras.names)
+    solution = solve_rig(case, calibration, estimator, source, wanted.seed)
     findings = solution.findings
     if not solution.usable:
         problem = findings[0].text if findings else "no two cameras can be calibrated"

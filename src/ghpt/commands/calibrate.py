@@ -18,6 +18,7 @@ from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.millimetres import (
     RigScale,
     ScaleSettings,
+    ScaleSource,
     in_millimetres,
     read_scale,
     scale_findings,
@@ -131,6 +132,33 @@ class Case:
         )
 
 
+@dataclass(frozen=True)
+class RigSolution:
+    """A calibrated rig, in millimetres."""
+
+    estimate: RigEstimate
+    """In a world of its own."""
+    scale: RigScale
+    placed: list[int]
+    """The calibrated views; none if they are fewer than two."""
+    usable: list[int]
+    """Those of them that no error concerns."""
+    world: str
+    """The world that the rig is written in, in words."""
+    change: Similarity
+    """The way there from the estimate's own."""
+
+    @property
+    def rig(self) -> Cameras:
+        """All cameras, in the world that the rig is written in."""
+        return self.change.cameras(self.estimate.cameras)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the rig and its scale."""
+        return (*self.estimate.findings, *scale_findings(self.scale))
+
+
 def files(settings: CalibrateSettings) -> Files:
     """Return what a calibration reads and writes."""
     check_apart(settings.keypoints, settings.output)
@@ -157,18 +185,13 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     for file in RIG_FILES:  # of an earlier run: they must not pass for this one's
         remove(output / file)
 
-    estimate = _estimate(calibration, case.sequence, settings.seed)
-    placed = _placed_views(estimate)
-
-    def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
-        used = _indices(usable_cameras(estimate)) or placed
-        recording = _spread(case.recording(used, rig), MEASURED_FRAMES)
-        return triangulate_recording(recording, estimator)
-
-    estimate, scale = in_millimetres(estimate, source, measure)
-    usable = _indices(usable_cameras(estimate))
-    world, change = _choose_world(estimate, placed, case)
-    rig = change.cameras(estimate.cameras)
+    solution = solve_rig(case, calibration, estimator, source, settings.seed)
+    estimate = solution.estimate
+    scale = solution.scale
+    placed = solution.placed
+    usable = solution.usable
+    change = solution.change
+    rig = solution.rig
     reference = case.reference_cameras
     rigs = {_ESTIMATED: rig} if reference is None else {_ESTIMATED: rig, case.reference: reference}
     recordings = {
@@ -183,7 +206,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         frames=len(case.sequence),
         seed=settings.seed,
         scale=scale,
-        world=world,
+        world=solution.world,
         reference=None if reference is None else case.reference,
         triangulation=settings.triangulation,
         converged=estimate.converged,
@@ -191,7 +214,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         cameras=calibrated_cameras(estimate, change, cameras),
         difference=_difference(estimate, rig, reference, placed),
         explains=explain(recordings, estimator),
-        findings=_findings(case, estimate, scale, camera_check),
+        findings=_findings(case, solution, camera_check),
         provenance=provenance(settings.seed),
     )
     points = change.points(estimate.points)
@@ -211,6 +234,28 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     _log.info("Report: %s, beside it %s.", report, beside)
     _raise_errors(result, report)
     return result
+
+
+def solve_rig(
+    case: Case,
+    calibration: RigCalibration,
+    estimator: Estimator,
+    source: ScaleSource,
+    seed: int,
+) -> RigSolution:
+    """Return the rig that a recording shows, with the length that ``source`` gives it."""
+    estimate = _estimate(calibration, case.sequence, seed)
+    placed = _placed_views(estimate)
+
+    def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
+        used = _indices(usable_cameras(estimate)) or placed
+        recording = _spread(case.recording(used, rig), MEASURED_FRAMES)
+        return triangulate_recording(recording, estimator)
+
+    estimate, scale = in_millimetres(estimate, source, measure)
+    usable = _indices(usable_cameras(estimate))
+    world, change = _choose_world(estimate, placed, case)
+    return RigSolution(estimate, scale, placed, usable, world, change)
 
 
 def _raise_errors(result: CalibrationResult, report: str) -> None:
@@ -326,11 +371,9 @@ def _difference(
     return Differences(rotation, centre, found.scale)
 
 
-def _findings(
-    case: Case, estimate: RigEstimate, scale: RigScale, camera_check: CameraCheck
-) -> tuple[Finding, ...]:
+def _findings(case: Case, solution: RigSolution, camera_check: CameraCheck) -> tuple[Finding, ...]:
     """Return what is wrong with the recording, the rig, and the extrinsics in the user's file."""
-    own = (*case.notes, *estimate.findings, *scale_findings(scale))
+    own = (*case.notes, *solution.findings)
     said = {(found.code, frozenset(found.cameras)) for found in own}
     of_file = [
         found
