@@ -240,24 +240,18 @@ def test_the_stamp_of_a_folder_changes_with_any_file_below_it(tmp_path):
 
 
 def test_the_inputs_of_a_command_are_those_that_its_settings_name(tmp_path):
-    settings = {
-        "ckpt": "m.ckpt",
-        "keypoints": "pose",
-        "cameras": str(tmp_path),
-        "data": {"root": "/data"},
-    }
-    found = input_paths(settings)
+    found = input_paths("m.ckpt", "pose", str(tmp_path), "/data")
     named = [Path("m.ckpt"), Path("pose"), tmp_path, Path("/data")]
     assert set(found) == {*named, tmp_path / "intri.yml", tmp_path / "extri.yml"}
-    assert input_paths({"ckpt": None, "data": {"root": None}}) == ()
+    assert input_paths(None, None) == ()
 
 
 def test_the_folder_of_key_points_is_no_output(tmp_path):
     with pytest.raises(
         GhptConfigError, match=r"output: is .*, the folder that the key points are read from"
     ):
-        check_apart({"keypoints": str(tmp_path), "output": f"{tmp_path}/."})
-    check_apart({"keypoints": str(tmp_path), "output": f"{tmp_path}/out"})
+        check_apart(str(tmp_path), f"{tmp_path}/.")
+    check_apart(str(tmp_path), f"{tmp_path}/out")
 
 
 COMMANDS = {
