@@ -112,7 +112,7 @@ def test_cameras_without_extrinsics_are_named():
     rig = named_cameras()
     bare = CameraSet(rig.names, rig.K, rig.distortion, path="intrinsics.toml")
     assert not bare.calibrated
-    with pytest.raises(GhptDataError, match="intrinsics.toml: rotation, translation"):
+    with pytest.raises(GhptDataError, match=r"intrinsics\.toml: rotation, translation"):
         _ = bare.cameras
     with pytest.raises(GhptDataError, match="there is only a"):
         rig.select([0]).check_calibrated("points")

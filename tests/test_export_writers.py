@@ -8,7 +8,7 @@ import torch
 
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import WRITERS, read_reconstruction
-from ghpt.export.stream import PIECE, Extent, extent, part, pieces, equidistant_pieces
+from ghpt.export.stream import PIECE, Extent, equidistant_pieces, extent, part, pieces
 from ghpt.reconstruction import State
 from reconstructions import about, in_parts, random_reconstruction
 

@@ -64,6 +64,8 @@ SHARDS = ".shards"
 _OWN_FORMATS = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if name in WRITERS)
 """The formats that need no further package."""
 _TIMED_FORMATS = ("trc", "c3d")
+_NOT_OF_SHARDS = ("command", "seed")
+"""What shards do not depend on; where an estimator draws by the seed, its identity holds it."""
 _log = logging.getLogger(__name__)
 
 
@@ -362,7 +364,7 @@ def _shard_key(sequence: Sequence, estimator: PoseEstimator, origin: dict[str, A
         "frames": sequence.digest(),
         "estimator": estimator.name,
         "settings": estimator.identity,
-        "made": {name: value for name, value in origin.items() if name != "command"},
+        "made": {name: value for name, value in origin.items() if name not in _NOT_OF_SHARDS},
     }
     text = json.dumps(parts, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()

@@ -244,6 +244,7 @@ def _human36m_subject(
     path: Path, subject: Name, extrinsics: Mapping[str, dict[str, Any]]
 ) -> str | None:
     """Return the subject whose extrinsics are wanted; None where the file has none."""
+    chosen: str | None
     if subject is not None:
         chosen = chosen_name(subject, extrinsics)
         problem = f"there is no {chosen!r}"

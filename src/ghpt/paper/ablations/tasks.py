@@ -28,7 +28,7 @@ def train_variant(
 ) -> Task:
     """Return the training of a model with other settings than the default."""
     stride = f"data.stride={_SELDOM}"
-    return setup.trained(data, *overrides, stride, name=name, seconds=seconds)
+    return setup.training(data, *overrides, stride, name=name, seconds=seconds)
 
 
 def evaluate_model(
@@ -45,10 +45,10 @@ def evaluate_model(
     for split in splits:
         stride = f"data.stride={setup.sizes.ablation.stride[split]}"
         words = (*setup.overrides.test, f"data.evaluate={split}", stride)
-        whole = setup.composed("test", BASE, *words)
+        whole = setup.configuration("test", BASE, *words)
         data[split] = whole["data"]
         files = whole.get("files", {})
-        dependencies[split] = setup.prepared(BASE, split)
+        dependencies[split] = setup.preparation(BASE, split)
     config = PoolsSettings(data, list(pools), setup.seed, files)
     name = model.name.replace("train-pose", "ablation")
     return Task(name, ACTION, asdict(config), dependencies, seconds=seconds)

@@ -49,7 +49,7 @@ class StoredExtrinsics:
     """mm."""
 
     @classmethod
-    def of(cls, extrinsics: Extrinsics) -> StoredExtrinsics:
+    def from_extrinsics(cls, extrinsics: Extrinsics) -> StoredExtrinsics:
         R, t = extrinsics
         return cls(R.tolist(), t.tolist())
 
@@ -196,7 +196,7 @@ def estimate_extrinsics(
         rig = draw // own.draws
         rows = range(draw * len(pairs.pairs), (draw + 1) * len(pairs.pairs))
         extrinsics = estimator(pairs[rows].observations, pairs.rigs[rig].cameras)
-        stored[rig].append(StoredExtrinsics.of(extrinsics))
+        stored[rig].append(StoredExtrinsics.from_extrinsics(extrinsics))
     rigs = [
         RigDraws(list(rig.recordings), of_rig)
         for rig, of_rig in zip(pairs.rigs, stored, strict=True)

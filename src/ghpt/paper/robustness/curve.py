@@ -60,24 +60,24 @@ class Curve:
             for level in self.levels(setup)
             if level
         ]
-        return _measured(setup, self.name, self.data, perturbations)
+        return _curve_task(setup, self.name, self.data, perturbations)
 
 
 def curve_tasks(setup: Setup, curves: Sequence[Curve]) -> dict[str, Task]:
     """Return the tasks of some curves by name, with that of the unperturbed data."""
     tasks = {curve.name: curve.task(setup) for curve in curves}
     if any(0 in curve.levels(setup) for curve in curves):
-        tasks[CLEAN] = _measured(setup, CLEAN, "h36m", [None])
+        tasks[CLEAN] = _curve_task(setup, CLEAN, "h36m", [None])
     return tasks
 
 
-def _measured(
+def _curve_task(
     setup: Setup, name: str, data: str, perturbations: Sequence[Mapping[str, Any] | None]
 ) -> Task:
     """Return the task that measures every estimator under each of the perturbations."""
     sizes = setup.sizes.robustness
     stride = f"data.stride={sizes.stride[data]}"
-    whole = setup.composed("test", data, *setup.overrides.test, stride)
+    whole = setup.configuration("test", data, *setup.overrides.test, stride)
     config = CurveSettings(
         data=whole["data"],
         baselines=whole["baselines"],
@@ -86,7 +86,10 @@ def _measured(
         perturbations=list(perturbations),
         files=whole.get("files", {}),
     )
-    dependencies = {"model": setup.trained(sizes.trained_on), "data": setup.prepared(data, "test")}
+    dependencies = {
+        "model": setup.training(sizes.trained_on),
+        "data": setup.preparation(data, "test"),
+    }
     seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
     name = f"robustness-{name}-seed{setup.seed}"
     return Task(name, ACTION, asdict(config), dependencies, seconds=seconds)
