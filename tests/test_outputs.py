@@ -189,7 +189,8 @@ def test_with_a_damaged_manifest_nothing_is_ours(tmp_path, damage):
 
 def test_b10_a_second_writer_is_refused_at_once_and_a_dead_ones_lock_is_taken_over(tmp_path):
     script = (
-        "import sys, time; from pathlib import Path; from ghpt.commands.outputs import Files, OutputFolder\n"
+        "import sys, time; from pathlib import Path\n"
+        "from ghpt.commands.outputs import Files, OutputFolder\n"
         "with OutputFolder(Path(sys.argv[1]), Files()):\n"
         "    print('in', flush=True); time.sleep(600)\n"
     )
@@ -302,7 +303,7 @@ def test_no_command_touches_a_foreign_folder(typed, tmp_path, name):
 
 
 def test_a_calibration_beside_its_own_inputs_is_refused_and_leaves_them(typed, tmp_path):
-    """EasyMocap's layout: cameras in intri.yml and extri.yml of the folder that is also the output."""
+    """EasyMocap's layout: intri.yml and extri.yml lie in the folder that is also the output."""
     for name in ("intri.yml", "extri.yml"):
         (tmp_path / name).write_text("%YAML:1.0\n---\n")
     before = contents(tmp_path)
