@@ -19,13 +19,22 @@ import torch
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
+from ghpt.arrays import (
+    ARRAYS,
+    Array,
+    CamerasLike,
+    as_camera_set,
+    as_detections,
+    as_key_points,
+    as_tensor,
+)
 from ghpt.commands.overrides import Source, compose
 from ghpt.config import CONF, build, plain, settings
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.persons import person_sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError, check
-from ghpt.geometry.cameras import Cameras, CameraSet
+from ghpt.geometry.cameras import CameraSet
 from ghpt.geometry.lens import undistort
 from ghpt.metrics.pose_error import Kind, joint_errors
 from ghpt.metrics.relative_pose import (
@@ -43,12 +52,7 @@ if TYPE_CHECKING:
     from ghpt.commands.predict import PredictSettings
     from ghpt.models.estimators.predictors import Classical, Learned
 
-Array = np.ndarray | Tensor
-CamerasLike = CameraSet | tuple[Array, Array, Array]
-"""Cameras of a file, or K, R and t of ideal pinholes."""
 Rows = Int[np.ndarray, " N"]
-_ARRAYS = "arrays"
-"""What errors call the input, and files its source."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ def triangulate(key_points: Array, cameras: CamerasLike, confidence: Array | Non
     GhptDataError for shapes that do not fit, and for cameras without extrinsics.
     """
     rig = as_camera_set(cameras)
-    points = _key_points(key_points, confidence, len(rig))
+    points = as_key_points(key_points, confidence, len(rig))
     names = tuple(f"joint_{joint}" for joint in range(points.valid.shape[-1]))
     defaults = _defaults("predict")
     name = defaults["triangulation"]
@@ -261,8 +265,8 @@ def mpjpe(estimate: Array, truth: Array, kind: Kind = "absolute") -> float:
     ``kind``: ``absolute`` in the world, ``relative`` to the pelvis, or ``aligned`` by the best
     similarity of each frame.
     """
-    points = _tensor(estimate)
-    true_points = _tensor(truth)
+    points = as_tensor(estimate)
+    true_points = as_tensor(truth)
     found = PoseEstimate(points.nan_to_num(0.0), torch.isfinite(points).all(-1))
     known = Truth(true_points.nan_to_num(0.0), torch.isfinite(true_points).all(-1))
     errors, counted = joint_errors(found, known, kind)
@@ -271,52 +275,16 @@ def mpjpe(estimate: Array, truth: Array, kind: Kind = "absolute") -> float:
 
 def relative_pose_errors(R: Array, t: Array, true_R: Array, true_t: Array) -> RelativePoseErrors:
     """Return the errors of relative poses ``x_b = R x_a + t``: rotations [*N 3 3], mm [*N 3]."""
-    rotation = _tensor(R)
-    true_rotation = _tensor(true_R)
-    translation = _tensor(t)
-    true_translation = _tensor(true_t)
+    rotation = as_tensor(R)
+    true_rotation = as_tensor(true_R)
+    translation = as_tensor(t)
+    true_translation = as_tensor(true_t)
     return RelativePoseErrors(
         rotation_deg=rotation_deg(rotation, true_rotation).numpy(),
         quaternion=quaternion_error(rotation, true_rotation).numpy(),
         translation_mm=translation_error(translation, true_translation).numpy(),
         translation_deg=translation_deg(translation, true_translation).numpy(),
     )
-
-
-def as_camera_set(cameras: CamerasLike | Array) -> CameraSet:
-    """Return named cameras; those of K alone have no extrinsics."""
-    if isinstance(cameras, CameraSet):
-        return cameras
-    if not isinstance(cameras, tuple):
-        K = _tensor(cameras)
-        unknown = (torch.eye(3).expand(K.shape), K.new_zeros(len(K), 3))
-        return replace(as_camera_set((K, *unknown)), R=None, t=None)
-    K, R, t = (_tensor(part) for part in cameras)
-    shapes = (K.shape[1:], R.shape[1:], t.shape[1:])
-    if shapes != ((3, 3), (3, 3), (3,)) or not len(K) == len(R) == len(t):
-        shown = ", ".join(str(list(part.shape)) for part in (K, R, t))
-        problem = f"K, R and t have the shapes {shown}"
-        raise GhptDataError("cameras", "", problem, "Give [V 3 3], [V 3 3] and [V 3].")
-    names = [f"cam_{view:02d}" for view in range(len(K))]
-    return CameraSet.from_cameras(names, Cameras(K, R, t), path="cameras")
-
-
-def as_detections(
-    key_points: Array | Detections,
-    cameras: CameraSet,
-    confidence: Array | None = None,
-    rate_hz: float | None = None,
-) -> Detections:
-    """Return key points of the 17 joints as one person's detections in the views of cameras."""
-    if isinstance(key_points, Detections):
-        return key_points if rate_hz is None else replace(key_points, rate_hz=rate_hz)
-    points = _key_points(key_points, confidence, len(cameras))
-    if points.valid.shape[-1] != len(JOINTS):
-        problem = f"there are {points.valid.shape[-1]} joints, not {len(JOINTS)}"
-        hint = "Give them in the order of ghpt.skeleton.JOINTS, NaN where there is none."
-        raise GhptDataError("key_points", "", problem, hint)
-    frame = np.arange(len(points))
-    return Detections.of_person(_ARRAYS, cameras.names, JOINTS, frame, points, rate_hz)
 
 
 @functools.cache
@@ -376,27 +344,9 @@ def _observe(points: KeyPoints, rig: CameraSet) -> Observations:
     )
 
 
-def _key_points(key_points: Array, confidence: Array | None, views: int) -> KeyPoints:
-    """Return key points and what is valid of them. Raises GhptDataError for a wrong shape."""
-    pixels = _tensor(key_points).numpy()
-    if pixels.ndim != 4 or pixels.shape[1] != views or pixels.shape[-1] != 2:
-        problem = f"has the shape {list(pixels.shape)}, for {views} cameras"
-        raise GhptDataError("key_points", "", problem, f"Give [T {views} J 2].")
-    valid = np.isfinite(pixels).all(-1)
-    if confidence is None:
-        sure = np.ones(valid.shape)
-    else:
-        sure = _tensor(confidence).numpy()
-        if sure.shape != valid.shape:
-            problem = f"has the shape {list(sure.shape)}"
-            raise GhptDataError("confidence", "", problem, f"Give {list(valid.shape)}.")
-    valid &= sure > 0
-    return KeyPoints(np.where(valid[..., None], pixels, 0.0), np.nan_to_num(sure), valid)
-
-
 def _poses_of(points: Array) -> Poses:
     """Return points [T J 3] as poses of which no more is known."""
-    values = _tensor(points)
+    values = as_tensor(points)
     if values.ndim != 3 or values.shape[-1] != 3:
         problem = f"has the shape {list(values.shape)}"
         raise GhptDataError("poses", "", problem, "Give [T J 3].")
@@ -421,8 +371,8 @@ def _about(
     estimator: str, joints: tuple[str, ...], views: tuple[str, ...], rate_hz: float | None
 ) -> About:
     return About(
-        name=_ARRAYS,
-        source=_ARRAYS,
+        name=ARRAYS,
+        source=ARRAYS,
         estimator=estimator,
         joints=joints,
         camera_names=views,
@@ -430,11 +380,6 @@ def _about(
         smoothed=False,
         provenance={},
     )
-
-
-def _tensor(values: Array) -> Tensor:
-    """Return an array as a float64 tensor on the CPU."""
-    return torch.as_tensor(values).detach().to("cpu", torch.float64)
 
 
 def _with_nan(values: Tensor, there: Bool[Tensor, "T J"]) -> np.ndarray:
