@@ -96,7 +96,7 @@ def test_the_lens_of_a_camera_set_is_undone(key_points):
     distorted = torch.stack(seen).unflatten(1, (40, 17)).transpose(0, 1)
     through_lens = ghpt.triangulate(distorted, RIG)
     np.testing.assert_allclose(
-        through_lens.points, ghpt.triangulate(key_points, ARRAYS).points, atol=1e-6
+        through_lens.points, ghpt.triangulate(key_points, ARRAYS).points, atol=1e-4
     )
 
 
@@ -167,6 +167,6 @@ def test_a_turned_camera_is_found():
     truth = walk()[:80].double()
     key_points = project(RIG.cameras, truth)[0].numpy()
     R = RIG.R.clone()
-    R[2] = R[2].T
+    R[2] = R[2].T.clone()
     findings = ghpt.check_cameras(key_points, (RIG.K, R, RIG.t))
     assert [found.cameras for found in findings] == [("cam_02",)]
