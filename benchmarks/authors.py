@@ -32,11 +32,10 @@ HYPOTHESES = 200
 
 
 def theirs(authors: str, frames: int) -> tuple[float, float]:
-    """Seconds a frame of their forward pass, and of their backward pass with the optimiser's step."""
+    """Return the seconds a frame of their forward pass, and of their backward pass with a step."""
     sys.path.insert(0, authors)
-    torch.Tensor.cuda = lambda self, *_, **__: (
-        self
-    )  # they move the scorer's input there whatever the device is
+    # they move the scorer's input to the GPU whatever the device is
+    torch.Tensor.cuda = lambda self, *_, **__: self
     warnings.filterwarnings("ignore")
     from src.dsac import PoseDSAC
     from src.loss import MPJPELoss
@@ -61,19 +60,19 @@ def theirs(authors: str, frames: int) -> tuple[float, float]:
     )
     optimizer = torch.optim.Adam(scorer.parameters(), lr=5e-4)
     recording = scene.take("theirs", frames, scene.ring(4), np.random.default_rng(0))
-    key_points, truth = torch.from_numpy(recording.key_points), torch.from_numpy(recording.truth)
-    Ks, Rs, ts = (getattr(recording.cameras, name).float() for name in ("K", "R", "t"))
-    mean, deviation = (
-        truth.mean(dim=0),
-        torch.full((17, 3), 1000.0),
-    )  # as of people who walk about a room
+    key_points = torch.from_numpy(recording.key_points)
+    truth = torch.from_numpy(recording.truth)
+    cameras = recording.cameras.to(torch.float32)
+    t = cameras.t[..., None]
+    mean = truth.mean(dim=0)
+    deviation = torch.full((17, 3), 1000.0)  # as of people who walk about a room
     metrics = GlobalMetrics("human36m")
 
     start = time.perf_counter()
-    losses = [
-        model(key_points[frame], Ks, Rs, ts[..., None], mean, deviation, truth[frame], metrics)[0]
-        for frame in range(frames)
-    ]
+    losses = []
+    for points, true_points in zip(key_points, truth, strict=True):
+        loss, *_ = model(points, cameras.K, cameras.R, t, mean, deviation, true_points, metrics)
+        losses.append(loss)
     forward = time.perf_counter()
     total = torch.stack(losses).sum()
     total.backward()

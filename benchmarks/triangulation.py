@@ -14,7 +14,7 @@ figure).
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pycolmap
@@ -30,43 +30,60 @@ from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
 from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.lo_ransac import pycolmap_cameras
-from ghpt.observations import Observations
+from ghpt.observations import Labelled, Observations, Truth
 
 HYPOTHESES = 200
 
 
-def batch(views: int, frames: int) -> Observations:
+Batch = Labelled[Observations, Truth]
+Method = Callable[[Observations], Tensor]
+
+
+class Options(NamedTuple):
+    """What the command line sets."""
+
+    frames: int
+    loop_frames: int
+    least: float
+    """Seconds for each figure."""
+
+
+def draw_batch(views: int, frames: int) -> Batch:
     recording = scene.take("bench", frames, scene.ring(views), np.random.default_rng(views))
-    return Frames([recording], np.arange(frames))[range(frames)].observations
+    return Frames([recording], np.arange(frames))[range(frames)]
 
 
-def with_outliers(data: Observations) -> Observations:
-    """One detection in ten moved by 100 pixels in a random direction."""
+def add_outliers(data: Observations) -> Observations:
+    """Return the batch with one detection in ten moved by 100 pixels in a random direction."""
     generator = torch.Generator().manual_seed(0)
     shape = data.valid.shape
     angle = 2 * torch.pi * torch.rand(shape, generator=generator)
     hit = torch.rand(shape, generator=generator) < 0.1
-    offset = 100 * torch.stack((angle.cos(), angle.sin()), dim=-1) * hit[..., None]
-    return replace(data, key_points=data.key_points + offset)
+    direction = torch.stack((angle.cos(), angle.sin()), dim=-1)
+    return replace(data, key_points=data.key_points + 100 * direction * hit[..., None])
 
 
 def svd_loop(data: Observations) -> Tensor:
-    """The textbook: for each point the two rows of each view in homogeneous coordinates, and a 4x4
-    SVD in NumPy.
-    """
-    P = (data.cameras.K @ torch.cat((data.cameras.R, data.cameras.t[..., None]), dim=-1)).numpy()
-    key_points, valid = data.key_points.double().numpy(), data.valid.numpy()
-    points = np.zeros(data.truth.shape)
-    for frame, joint in np.ndindex(points.shape[:2]):
+    """The textbook: for each point the two rows of each view, and a 4x4 SVD in NumPy."""
+    cameras = data.cameras
+    pose = torch.cat((cameras.R, cameras.t[..., None]), dim=-1)
+    P = (cameras.K @ pose).numpy()
+    key_points = data.key_points.double().numpy()
+    valid = data.valid.numpy()
+    frames, _, joints = valid.shape
+    points = np.zeros((frames, joints, 3))
+    for frame, joint in np.ndindex(frames, joints):
         views = valid[frame, :, joint]
-        rows = key_points[frame, views, joint, :, None] * P[frame, views, 2:] - P[frame, views, :2]
-        solution = np.linalg.svd(rows.reshape(-1, 4))[2][-1]
+        pixels = key_points[frame, views, joint, :, None]
+        rows = pixels * P[frame, views, 2:] - P[frame, views, :2]
+        _, _, Vt = np.linalg.svd(rows.reshape(-1, 4))
+        solution = Vt[-1]
         points[frame, joint] = solution[:3] / solution[3]
     return torch.from_numpy(points)
 
 
-def pycolmap_alone(data: Observations, threshold: float) -> Callable[[], None]:
-    """Its LO-RANSAC over all points, everything prepared; ``threshold`` in pixels."""
+def prepare_pycolmap(data: Observations, threshold: float) -> Callable[[], None]:
+    """Return its LO-RANSAC over all points, everything prepared; ``threshold`` in pixels."""
     options = pycolmap.EstimateTriangulationOptions()
     options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
     options.ransac.max_error = threshold
@@ -74,13 +91,13 @@ def pycolmap_alone(data: Observations, threshold: float) -> Callable[[], None]:
     tasks = []
     for frame in range(len(data)):
         rig = data.cameras.index(frame)
-        found = pycolmap_cameras(rig, np.ones(len(rig.K), dtype=bool))
+        cameras, poses = pycolmap_cameras(rig, np.ones(len(rig.K), dtype=bool))
         for joint in range(data.valid.shape[-1]):
             views = np.flatnonzero(data.valid[frame, :, joint])
             pixels = data.key_points[frame, views, joint].double().numpy()
-            tasks.append(
-                (pixels, [found[1][v] for v in views], [found[0][v] for v in views], options)
-            )
+            own_poses = [poses[v] for v in views]
+            own_cameras = [cameras[v] for v in views]
+            tasks.append((pixels, own_poses, own_cameras, options))
 
     def run() -> None:
         for task in tasks:
@@ -89,73 +106,104 @@ def pycolmap_alone(data: Observations, threshold: float) -> Callable[[], None]:
     return run
 
 
-def linearity(
-    views: int, frames: int, least: float, methods: dict[str, Callable[[Observations], Any]]
-) -> list[Any]:
-    rows = []
-    for name, estimate in methods.items():
-        one, long, wide = (
-            seconds(lambda d=d, e=estimate: e(d), least)
-            for d in (batch(views, frames), batch(views, 2 * frames), batch(2 * views, frames))
-        )
-        rows.append([str(views), name, f"{long / one / 2:.2f}", f"{wide / one / 2:.2f}"])
-    return rows
-
-
-def error(estimate: Callable[[Observations], Tensor], data: Observations) -> float:
+def measure_error(method: Method, data: Observations, truth: Truth) -> float:
+    """Return the mean error of joints that two views see, mm."""
     enough = data.valid.sum(1) >= 2
-    return (estimate(data) - data.truth).norm(dim=-1)[enough].mean().item()
+    error = (method(data) - truth.points).norm(dim=-1)
+    return error[enough].mean().item()
+
+
+def points_per_second(count: int, duration: float) -> str:
+    return f"{count / duration:,.0f}"
+
+
+def measure_subsets(views: int, options: Options) -> list[str]:
+    one = draw_batch(views, 16).observations
+    keys = randomness.key(0, "benchmark", one.index)
+    subsets = random_subsets(one.valid, HYPOTHESES, keys)
+
+    def run() -> None:
+        triangulate_subsets(one.cameras, one.key_points, one.valid, subsets)
+
+    speed = points_per_second(subsets[..., 0].numel(), seconds(run, options.least))
+    return [str(views), "subsets, 200 hypotheses", speed, "", ""]
+
+
+def measure_pycolmap(views: int, few: Batch, threshold: float, options: Options) -> list[str]:
+    data = few.observations
+    size = person_scale(data.key_points, data.valid).mean().item()
+    duration = seconds(prepare_pycolmap(data, threshold * size), options.least)
+    return [
+        str(views),
+        "pycolmap alone",
+        points_per_second(few.truth.valid.numel(), duration),
+        "",
+        "",
+    ]
+
+
+def measure_method(
+    views: int,
+    name: str,
+    method: Method,
+    batches: tuple[Batch, Batch],
+    options: Options,
+) -> list[str]:
+    """Return the row of a method; ``batches``: many frames, and few for errors and slow methods."""
+    many, few = batches
+    timed = few if name in ("lo_ransac", "SVD loop") else many
+    duration = seconds(lambda: method(timed.observations), options.least)
+    speed = points_per_second(timed.truth.valid.numel(), duration)
+    clean = measure_error(method, few.observations, few.truth)
+    spoilt = measure_error(method, add_outliers(few.observations), few.truth)
+    label = "lo_ransac (pycolmap)" if name == "lo_ransac" else name
+    return [str(views), label, speed, f"{clean:.2f}", f"{spoilt:.2f}"]
+
+
+def measure_linearity(views: int, name: str, method: Method, options: Options) -> list[str]:
+    """Return the time of twice the frames, or views, over twice the time of one."""
+
+    def measure(views: int, frames: int) -> float:
+        data = draw_batch(views, frames).observations
+        return seconds(lambda: method(data), options.least)
+
+    one = measure(views, options.frames)
+    long = measure(views, 2 * options.frames)
+    wide = measure(2 * views, options.frames)
+    return [str(views), name, f"{long / one / 2:.2f}", f"{wide / one / 2:.2f}"]
+
+
+def make_methods(baselines: dict[str, Any]) -> dict[str, Method]:
+    """Return all classical estimators, the loop, and what predict does by default."""
+    config = configuration("estimator/default")["estimator"]["classical"]
+    classical = build(config, "estimator.classical")
+    predictor = classical(estimator=baselines[configuration("predict")["triangulation"]])
+    methods: dict[str, Method] = {}
+    for name, baseline in baselines.items():
+        methods[name] = lambda data, baseline=baseline: baseline(data).points
+    methods["SVD loop"] = svd_loop
+    methods["predict"] = lambda data: predictor(data).points
+    return methods
 
 
 def main() -> None:
     wanted = settings(views="4,7,10,31", frames=512, loop_frames=64, least=1.0)
-    title, baselines = machine(), build(configuration("test")["baselines"], "baselines")
-    classical = build(
-        configuration("estimator/default")["estimator"]["classical"], "estimator.classical"
-    )
-    predictor = classical(estimator=baselines[configuration("predict")["triangulation"]])
-    methods = {name: (lambda d, b=b: b(d).points) for name, b in baselines.items()} | {
-        "SVD loop": svd_loop
-    }
-    methods["predict"] = lambda d: predictor(d).points
-    rows, lines = [], []
+    options = Options(wanted["frames"], wanted["loop_frames"], wanted["least"])
+    title = machine()
+    baselines = build(configuration("test")["baselines"], "baselines")
+    methods = make_methods(baselines)
+    rows = []
+    lines = []
     for views in map(int, wanted["views"].split(",")):
-        many, few = batch(views, wanted["frames"]), batch(views, wanted["loop_frames"])
-        one = batch(views, 16)
-        subsets = random_subsets(one.valid, HYPOTHESES, randomness.key(0, "benchmark", one.index))
-        taken = seconds(
-            lambda one=one, s=subsets: triangulate_subsets(
-                one.cameras, one.key_points, one.valid, s
-            ),
-            wanted["least"],
-        )
-        rows.append(
-            [
-                str(views),
-                "subsets, 200 hypotheses",
-                f"{subsets[..., 0].numel() / taken:,.0f}",
-                "",
-                "",
-            ]
-        )
-        size = person_scale(few.key_points, few.valid).mean().item()
-        taken = seconds(
-            pycolmap_alone(few, baselines["lo_ransac"].threshold * size), wanted["least"]
-        )
-        rows.append(
-            [str(views), "pycolmap alone", f"{few.truth[..., 0].numel() / taken:,.0f}", "", ""]
-        )
-        for name, estimate in methods.items():
-            data = few if name in ("lo_ransac", "SVD loop") else many
-            taken = seconds(lambda d=data, e=estimate: e(d), wanted["least"])
-            errors = [f"{error(estimate, d):.2f}" for d in (few, with_outliers(few))]
-            label = "lo_ransac (pycolmap)" if name == "lo_ransac" else name
-            rows.append([str(views), label, f"{data.truth[..., 0].numel() / taken:,.0f}", *errors])
-        fast = {
-            name: methods[name] for name in ("linear", "m_estimator", "adaptive_ransac", "predict")
-        }
+        many = draw_batch(views, options.frames)
+        few = draw_batch(views, options.loop_frames)
+        rows.append(measure_subsets(views, options))
+        rows.append(measure_pycolmap(views, few, baselines["lo_ransac"].threshold, options))
+        for name, method in methods.items():
+            rows.append(measure_method(views, name, method, (many, few), options))
         if views <= 10:
-            lines += linearity(views, wanted["frames"], wanted["least"], fast)
+            for name in ("linear", "m_estimator", "adaptive_ransac", "predict"):
+                lines.append(measure_linearity(views, name, methods[name], options))
     show(title, ["views", "method", "points/s", "error, mm", "with outliers, mm"], rows)
     show("linear is 1", ["views", "method", "2 x frames", "2 x views"], lines)
 

@@ -31,7 +31,6 @@ from ghpt.data.synthetic.random_processes import generator
 from ghpt.data.synthetic.recordings import Take, takes
 from ghpt.data.synthetic.rigs import ARRANGEMENTS
 from ghpt.files import atomic_write
-from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate_subsets
 from ghpt.models.estimators.ransac import Ransac
@@ -40,7 +39,9 @@ from ghpt.randomness import key
 from ghpt.skeleton import PELVIS
 
 CONF = Path(__file__).resolve().parents[1] / "conf" / "detector"
-STRIDE, HYPOTHESES, SEEDS = 64, 200, (0, 1, 2)
+STRIDE = 64
+HYPOTHESES = 200
+SEEDS = (0, 1, 2)
 TARGETS = {
     "human36m": {"random": 45.0, "average": 31.2, "best": 22.3, "worst": 98.9, "ransac": 27.4},
     "panoptic": {"random": 26.1, "average": 25.9, "best": 24.4, "worst": 31.0},
@@ -68,69 +69,74 @@ class Draw:
     processes: list[Processes]
 
     def batch(self, detector: Detector) -> Labelled[Observations, Truth]:
-        """The detections in all views by these numbers."""
-        take, count, views = self.take, len(self.points), range(len(self.processes))
-        apparent = detector.displace_joints(self.points, self.body_error, take.familiar)
-        found = [
-            detector.detect_view(
-                self.points, apparent, take.rig, view, self.processes[view], take.familiar
-            )
-            for view in views
-        ]
-        key_points, confidence, valid = (
-            torch.from_numpy(np.stack(x, axis=1))
-            for x in zip(*([d.key_points, d.confidence, d.valid] for d in found), strict=True)
-        )
-        rig = take.rig.cameras
+        """Return the detections in all views by these numbers."""
+        points = self.points
+        rig = self.take.rig
+        familiar = self.take.familiar
+        apparent = detector.displace_joints(points, self.body_error, familiar)
+        found = []
+        for view, processes in enumerate(self.processes):
+            found.append(detector.detect_view(points, apparent, rig, view, processes, familiar))
+        count = len(points)
         observations = Observations(
             index=torch.arange(count),
             recording=torch.zeros(count, dtype=torch.int64),
-            cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
-            key_points=key_points,
-            confidence=confidence,
-            valid=valid,
+            cameras=rig.cameras.expand(count),
+            key_points=_stack([view.key_points for view in found]),
+            confidence=_stack([view.confidence for view in found]),
+            valid=_stack([view.valid for view in found]),
         )
         truth_valid = torch.ones(self.points.shape[:2], dtype=torch.bool)
         return Labelled(observations, Truth(torch.from_numpy(self.points).float(), truth_valid))
 
 
+def _stack(views: list[np.ndarray]) -> torch.Tensor:
+    return torch.from_numpy(np.stack(views, axis=1))
+
+
 def draws(detector: Detector, data: str, split: str, seed: int) -> list[Draw]:
-    """One for each person. The random numbers do not depend on the free numbers, so they serve the
-    whole fit.
+    """Return one for each person.
+
+    The random numbers do not depend on the free numbers, so they serve the whole fit.
     """
     cameras = sorted({number for name in SETS["panoptic"] for number in ARRANGEMENTS[name]})
+    source = "h36m" if data == "human36m" else "panoptic"
     drawn = []
-    for _, group in groupby(
-        takes("h36m" if data == "human36m" else "panoptic", split, seed, cameras),
-        lambda t: t.subject,
-    ):
-        parts = []
-        for take in group:
-            frames = len(take.truth)
-            error = detector.draw_body_error(frames, take.rate_hz, seed, take.subject, take.name)
-            generators = [generator(seed, "camera", take.name, name) for name in take.rig.names]
-            processes = [
-                detector.draw_processes(frames, take.rate_hz, rng).subsample(STRIDE)
-                for rng in generators
-            ]
-            parts.append((take.truth[::STRIDE], error.drift[::STRIDE], processes))
-        points, drift, processes = zip(*parts, strict=True)
-        drift = np.concatenate(drift)
-        drawn.append(
-            Draw(
-                take,
-                np.concatenate(points),
-                BodyError(error.bias, drift),
-                [_join(view) for view in zip(*processes, strict=True)],
-            )
+    for _, group in groupby(takes(source, split, seed, cameras), lambda take: take.subject):
+        parts = [_draw(detector, take, seed) for take in group]
+        drift = np.concatenate([part.body_error.drift for part in parts])
+        views = zip(*(part.processes for part in parts), strict=True)
+        whole = Draw(
+            take=parts[-1].take,
+            points=np.concatenate([part.points for part in parts]),
+            body_error=BodyError(parts[-1].body_error.bias, drift),
+            processes=[_join(view) for view in views],
         )
+        drawn.append(whole)
     return drawn
 
 
-def _join(parts: tuple[Processes, ...]) -> Processes:
-    return Processes(
-        **{name: np.concatenate([getattr(part, name) for part in parts]) for name in vars(parts[0])}
+def _draw(detector: Detector, take: Take, seed: int) -> Draw:
+    frames = len(take.truth)
+    error = detector.draw_body_error(frames, take.rate_hz, seed, take.subject, take.name)
+    processes = []
+    for name in take.rig.names:
+        rng = generator(seed, "camera", take.name, name)
+        whole = detector.draw_processes(frames, take.rate_hz, rng)
+        processes.append(whole.subsample(STRIDE))
+    return Draw(
+        take=take,
+        points=take.truth[::STRIDE],
+        body_error=BodyError(error.bias, error.drift[::STRIDE]),
+        processes=processes,
     )
+
+
+def _join(parts: tuple[Processes, ...]) -> Processes:
+    joined = {}
+    for name in vars(parts[0]):
+        joined[name] = np.concatenate([getattr(part, name) for part in parts])
+    return Processes(**joined)
 
 
 def views_of(data: str, rig_names: tuple[str, ...]) -> dict[str, list[int]]:
@@ -153,7 +159,9 @@ def some_views(
 
 def relative_error(points: torch.Tensor, ok: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
     """Pelvis-relative MPJPE (mm) over the estimated joints: [..., J, 3] -> [...]."""
-    error = ((points - points[..., [PELVIS], :]) - (truth - truth[..., [PELVIS], :])).norm(dim=-1)
+    relative = points - points[..., [PELVIS], :]
+    true_relative = truth - truth[..., [PELVIS], :]
+    error = (relative - true_relative).norm(dim=-1)
     ok = ok & ok[..., [PELVIS]]
     return (error * ok).sum(dim=-1) / ok.sum(dim=-1).clamp(min=1)
 
@@ -183,7 +191,8 @@ def table(
     detector: Detector, data: str, drawn: list[Draw], threshold: float, seed: int
 ) -> dict[str, dict[str, float]]:
     """The rows' means for each arrangement of a data set."""
-    result, batches = {}, [draw.batch(detector) for draw in drawn]
+    result = {}
+    batches = [draw.batch(detector) for draw in drawn]
     for arrangement, views in views_of(data, drawn[0].take.rig.names).items():
         parts = [rows(some_views(batch, views), threshold, seed) for batch in batches]
         result[arrangement] = {
@@ -198,23 +207,23 @@ def mean(tables: list[dict[str, dict[str, float]]]) -> dict[str, float]:
     return {name: float(np.mean([entry[name] for entry in entries])) for name in entries[0]}
 
 
-def with_numbers(detector: Detector, numbers: Mapping[str, float]) -> Detector:
+def replace_numbers(detector: Detector, numbers: Mapping[str, float]) -> Detector:
     """Replace free numbers, and those that are tied to them."""
-    tied = {
-        name: float(f"{numbers[of] * ratio:.3g}")
-        for name, (of, ratio) in TIED.items()
-        if of in numbers
-    }
+    tied = {}
+    for name, (leader, ratio) in TIED.items():
+        if leader in numbers:
+            tied[name] = float(f"{numbers[leader] * ratio:.3g}")
     return replace(detector, **numbers, **tied)
 
 
 def fit(detector: Detector, data: str, drawn: dict[int, list[Draw]], threshold: float) -> Detector:
     """Least squares on the logarithms of the rows over the logarithms of the free numbers."""
-    targets, free = TARGETS[data], FREE[data]
+    targets = TARGETS[data]
+    free = FREE[data]
     start = np.log([getattr(detector, name) for name in free])
 
     def residuals(logs: np.ndarray) -> np.ndarray:
-        tried = with_numbers(detector, dict(zip(free, np.exp(logs).tolist(), strict=True)))
+        tried = replace_numbers(detector, dict(zip(free, np.exp(logs).tolist(), strict=True)))
         found = mean([table(tried, data, drawn[seed], threshold, seed) for seed in drawn])
         return np.array([np.log(found[name] / target) for name, target in targets.items()])
 
@@ -222,7 +231,7 @@ def fit(detector: Detector, data: str, drawn: dict[int, list[Draw]], threshold: 
         residuals, start, diff_step=0.02, x_scale=0.3, xtol=1e-3, ftol=1e-3, max_nfev=5
     )
     rounded = [float(f"{value:.3g}") for value in np.exp(solution.x)]
-    return with_numbers(detector, dict(zip(free, rounded, strict=True)))
+    return replace_numbers(detector, dict(zip(free, rounded, strict=True)))
 
 
 def best_threshold(detector: Detector, data: str, seed: int) -> float:
@@ -232,14 +241,12 @@ def best_threshold(detector: Detector, data: str, seed: int) -> float:
     batches = [some_views(draw.batch(detector), views) for draw in drawn]
 
     def error(threshold: float) -> float:
-        estimates = [
-            (Ransac(threshold=threshold, pairs=64, seed=seed)(batch.observations), batch)
-            for batch in batches
-        ]
-        parts = [
-            relative_error(e.points.double(), e.estimated, batch.truth.points.double())
-            for e, batch in estimates
-        ]
+        ransac = Ransac(threshold=threshold, pairs=64, seed=seed)
+        parts = []
+        for batch in batches:
+            estimate = ransac(batch.observations)
+            truth = batch.truth.points.double()
+            parts.append(relative_error(estimate.points.double(), estimate.estimated, truth))
         return float(torch.cat(parts).mean())
 
     return min((0.003, 0.005, 0.007, 0.01, 0.014, 0.02, 0.03), key=error)
@@ -250,15 +257,15 @@ def report(
 ) -> None:
     """Target beside fitted, for the mean, and for each seed and arrangement."""
     tables = {seed: table(detector, data, drawn[seed], threshold, seed) for seed in drawn}
-    sheet = Table(
-        title=f"{data}: pelvis-relative MPJPE, mm (RANSAC threshold {threshold} of the person's size)"
-    )
+    note = f"RANSAC threshold {threshold} of the person's size"
+    sheet = Table(title=f"{data}: pelvis-relative MPJPE, mm ({note})")
     columns = ["target", "fitted", "difference", *(f"seed {seed}" for seed in tables)]
     arrangements = SETS[data] if len(SETS[data]) > 1 else ()
     for column in ("row", *columns, *arrangements):
         sheet.add_column(column, justify="right")
     for name in ("random", "average", "best", "worst", "ransac"):
-        target, fitted = TARGETS[data].get(name), mean(list(tables.values()))[name]
+        target = TARGETS[data].get(name)
+        fitted = mean(list(tables.values()))[name]
         cells = [
             f"{target or '-'}",
             f"{fitted:.1f}",
@@ -274,14 +281,14 @@ def write(path: Path, detector: Detector, data: str) -> None:
     """The numbers, with what wrote them."""
     numbers: dict[str, Any] = dict(vars(detector))
     free = ", ".join((*FREE[data], *(name for name, (of, _) in TIED.items() if of in FREE[data])))
+    header = [
+        f"# The synthetic detector on {data}. Written by scripts/fit_detector.py, which fitted",
+        f"# {free}",
+        "# to the learning-free rows of the paper's tab:quantitative-hypotheses.",
+        "# Lengths in statures, rates as shares of the time, durations in seconds.",
+    ]
     with atomic_write(path, "w") as handle:
-        handle.write(
-            f"# The synthetic detector on {data}. Written by scripts/fit_detector.py, which fitted\n"
-        )
-        handle.write(
-            f"# {free}\n# to the learning-free rows of the paper's tab:quantitative-hypotheses.\n"
-        )
-        handle.write("# Lengths in statures, rates as shares of the time, durations in seconds.\n")
+        handle.write("\n".join(header) + "\n")
         yaml.safe_dump(numbers, handle, sort_keys=False, default_flow_style=None, width=100)
 
 
@@ -301,8 +308,9 @@ def main() -> None:
         threshold = best_threshold(detector, data, arguments.seeds[0])
         if not arguments.check:
             detector = fit(detector, data, drawn, threshold)
-            before, threshold = threshold, best_threshold(detector, data, arguments.seeds[0])
-            if threshold != before:
+            previous = threshold
+            threshold = best_threshold(detector, data, arguments.seeds[0])
+            if threshold != previous:
                 detector = fit(detector, data, drawn, threshold)
             write(path, detector, data)
         report(console, detector, data, drawn, threshold)

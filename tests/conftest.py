@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -18,6 +19,7 @@ import children
 import toys
 from ghpt.commands.app import Command, run
 from ghpt.data.synthetic import recordings as synthetic
+from ghpt.report import pair_tensorboard, tensorboard
 
 ROOT = Path(__file__).resolve().parents[1]
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
@@ -121,6 +123,14 @@ def little_data(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(synthetic, "PANOPTIC_FRAMES", 400)
     monkeypatch.setattr(synthetic, "PANOPTIC_SUBJECTS", ("P1",))
     monkeypatch.setenv("GHPT_CACHE", os.path.join(os.environ["GHPT_CACHE"], "little"))
+
+
+@pytest.fixture
+def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """TensorBoard's figures stay blank: to draw them is most of what a small test costs."""
+    blank = np.zeros((8, 8, 3), np.uint8)
+    monkeypatch.setattr(tensorboard, "image", lambda figure: blank)
+    monkeypatch.setattr(pair_tensorboard, "image", lambda figure: blank)
 
 
 @pytest.fixture(scope="session")

@@ -123,12 +123,12 @@ def test_each_setting_is_trained_twice_and_the_default_is_the_reports_own_model(
         for data in ("h36m", "cmu3")
     }
     for data, task in defaults.items():
-        assert task.dependencies["model"].key == setup().trained(data).key
+        assert task.dependencies["model"].key == setup().training(data).key
     assert set(defaults["cmu3"].config["splits"]) == {"test"}
     others = [
         task.dependencies["model"].config for name, task in tasks.items() if "default" not in name
     ]
-    assert all(config["model"] != setup().trained("h36m").config["model"] for config in others)
+    assert all(config["model"] != setup().training("h36m").config["model"] for config in others)
 
 
 @pytest.mark.parametrize(

@@ -140,7 +140,7 @@ def test_estimated_extrinsics_of_perfect_detections_cost_nothing(real):
         assert estimated["both"] == pytest.approx(known, abs=1)
     rigs = read_json(tasks["h36m rig"].dependencies["extrinsics"].folder(folder) / "result.json")
     assert sorted(index for rig in rigs for index in rig["recordings"]) == [0, 1]
-    assert np.shape(rigs[0]["draws"][0][0]) == (4, 3, 3)
+    assert np.shape(rigs[0]["draws"][0]["R"]) == (4, 3, 3)
 
 
 def sweep_cells(seed: int, name: str) -> dict[str, Any]:

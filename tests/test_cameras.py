@@ -1,7 +1,9 @@
 import numpy as np
+import pytest
 import torch
 
-from ghpt.geometry.cameras import Cameras, project, reprojection_error
+from ghpt.errors import GhptDataError
+from ghpt.geometry.cameras import Cameras, CameraSet, project, reprojection_error
 from scenes import random_scene
 
 
@@ -76,3 +78,41 @@ def test_reprojection_errors_are_double_whatever_is_given():
     error = reprojection_error(cameras, scene.key_points.float(), scene.points.float())
     assert error.dtype == torch.float64
     assert error.max() < 1e-2
+
+
+@pytest.mark.parametrize("target", [2, slice(None)])
+def test_a_relative_pose_takes_one_camera_s_frame_to_the_others(target):
+    scene = random_scene(4, frames=1, views=3)
+    rig, points = scene.cameras.index(0), scene.points[0]
+    in_camera = points @ rig.R.mT + rig.t[:, None]
+    R, t = rig.relative_pose(1, target)
+    found = in_camera[1] @ R.mT + t[..., None, :]
+    torch.testing.assert_close(found, in_camera[target])
+
+
+def named_cameras() -> CameraSet:
+    rig = random_scene(5, frames=1, views=3).cameras.index(0)
+    return CameraSet.from_cameras(("a", "b", "c"), rig, path="rig.toml")
+
+
+def test_cameras_are_selected_with_all_that_belongs_to_them():
+    rig = named_cameras()
+    found = rig.select([2, 0])
+    assert found.names == ("c", "a")
+    assert torch.equal(found.cameras.centre, rig.cameras.centre[[2, 0]])
+
+
+def test_an_image_size_that_is_not_known_is_twice_the_principal_point():
+    rig = named_cameras()
+    assert rig.size is None
+    assert torch.equal(rig.image_size, (2 * rig.K[:, :2, 2] + 1).round().long())
+
+
+def test_cameras_without_extrinsics_are_named():
+    rig = named_cameras()
+    bare = CameraSet(rig.names, rig.K, rig.distortion, path="intrinsics.toml")
+    assert not bare.calibrated
+    with pytest.raises(GhptDataError, match=r"intrinsics\.toml: rotation, translation"):
+        _ = bare.cameras
+    with pytest.raises(GhptDataError, match="there is only a"):
+        rig.select([0]).check_calibrated("points")

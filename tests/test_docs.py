@@ -112,7 +112,8 @@ class Page:
             self.laid_out.discard(output)
         if "resume=true" in words:  # what was stopped was begun by the same command
             self.typed(self.conf, main, [word for word in words if word != "resume=true"])
-        words = [re.sub(r"^(data=\w+,\w+),.*", r"\1", word) for word in words]  # two of a sweep
+        if "-m" in words:  # the first two values of each that is swept
+            words = [re.sub(r"^([\w.]+=[\w./]+,[\w./]+),.*", r"\1", word) for word in words]
         status, said, errors = self.typed(self.conf, main, words)
         spoilt = next((word.split("=")[1] for word in words if word.startswith("spoil=")), None)
         if spoilt:
@@ -262,7 +263,7 @@ def lay_out(runner: Page, models: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_commands_and_the_code_of_a_page_run(
-    page, tmp_path, models, little_data, typed, monkeypatch
+    page, tmp_path, models, little_data, blank_figures, typed, monkeypatch
 ):
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.chdir(tmp_path)

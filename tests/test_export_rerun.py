@@ -25,7 +25,7 @@ def test_the_recording_has_cameras_rays_key_points_joints_and_hypotheses(tmp_pat
         pytest.skip("rerun-sdk, 170 MB, comes with ghpt[viz]")
     made = random_reconstruction(20)
     evidence = Evidence(torch.randn(20, 3, 17, 2), made.views, torch.randn(20, 4, 17, 3))
-    parts = [Evidence(*(value[a:b] for value in evidence)) for a, b in ((0, 7), (7, 20))]
+    parts = [evidence.part(0, 7), evidence.part(7, 20)]
     scene = Scene(rig(3), lambda: iter(parts))
     WRITERS["rerun"].write(
         tmp_path / "poses.rrd",

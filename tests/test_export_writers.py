@@ -8,7 +8,7 @@ import torch
 
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import WRITERS, read_reconstruction
-from ghpt.export.stream import PIECE, Extent, extent, part, pieces, without_gaps
+from ghpt.export.stream import PIECE, Extent, equidistant_pieces, extent, part, pieces
 from ghpt.reconstruction import State
 from reconstructions import about, in_parts, random_reconstruction
 
@@ -41,7 +41,7 @@ def test_absent_frames_are_rows_without_joints_where_rows_are_equally_spaced(tmp
     keep = torch.tensor([0, 1, 5, 6, 20, 29])
     gappy = take(made, keep)
     chunks = in_parts(part(gappy, 0, 3), part(gappy, 3, 6))
-    full = list(without_gaps(tmp_path, who, chunks, extent(tmp_path, who, chunks)))
+    full = list(equidistant_pieces(tmp_path, who, chunks, extent(tmp_path, who, chunks)))
     frames = torch.cat([piece.frame for piece in full])
     assert frames.tolist() == list(range(5, 35))
     points, state = (

@@ -280,5 +280,5 @@ def test_tasks_are_shared_between_items():
     assert len({task.dependencies["model"].key for task in grid.values()}) == 5
     other = setup(1)
     assert generalization.grid(other)["cmu1 on h36m"].key != grid["cmu1 on h36m"].key
-    data = [s.prepared("h36m", "test").key for s in (SETUP, other)]
+    data = [s.preparation("h36m", "test").key for s in (SETUP, other)]
     assert data[0] == data[1]  # seeds share the recordings

@@ -424,7 +424,7 @@ def test_a_full_disk_is_named_and_the_next_run_goes_on(tmp_path, limit, file):
 
 
 def test_a_recording_of_a_data_set_is_a_demonstration(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "data_sequence", lambda _: sequence_of(30))
+    monkeypatch.setattr(module, "recording_sequence", lambda _: sequence_of(30))
     numbers = numbers_of(config("compare=[linear,ransac]", "evaluated_frames=10"), tmp_path / "out")
     assert numbers["source"] == "synthetic"
     assert set(numbers["evaluation"]["estimators"]) >= {"linear", "ransac"}

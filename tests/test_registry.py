@@ -14,13 +14,14 @@ from typing import Any
 import pytest
 import torch
 
+import sections
 import toys
 from ghpt.errors import GhptCheckpointError, GhptConfigError
 from ghpt.models.checkpoint import FIELD, load_model, read_checkpoint
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.registry import PARTS, build_registered, packages_to_trust
 from ghpt.paper.ablations.tables import ARTEFACTS
-from ghpt.paper.engine.setup import Setup, compose
+from ghpt.paper.engine.setup import compose
 from ghpt.paper.engine.tasks import with_dependencies
 from signing import save_signed
 from toys import train
@@ -115,15 +116,9 @@ def of_conf() -> dict[str, dict[str, Any]]:
 
 def of_the_ablations() -> dict[str, dict[str, Any]]:
     """The model of every training that reproduce.py changes something in."""
-    setup = Setup(
-        CONF,
-        {"human36m": None, "panoptic": None},
-        {"train": (), "test": ()},
-        {"ablation": ABLATED},
-        0,
-    )
+    small = sections.setup(ablation=ABLATED)
     tasks = with_dependencies(
-        itertools.chain.from_iterable(item.tasks(setup).values() for item in ARTEFACTS)
+        itertools.chain.from_iterable(item.tasks(small).values() for item in ARTEFACTS)
     )
     return {
         task.name: task.config["model"]

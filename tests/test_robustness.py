@@ -244,7 +244,7 @@ def test_what_is_unperturbed_is_measured_once(tmp_path: Path):
     assert "clean" not in tasks["robustness-views"]
     for by_name in tasks.values():
         models = {task.dependencies["model"].key for task in by_name.values()}
-        assert models == {setup().trained("cmu2").key}
+        assert models == {setup().training("cmu2").key}
 
 
 def test_an_estimator_without_a_number_has_a_dash(tmp_path: Path):

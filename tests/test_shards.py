@@ -141,7 +141,7 @@ def test_looking_changes_nothing(tmp_path, whole):
     before = sorted((p.name, p.stat().st_mtime_ns) for p in tmp_path.iterdir())
     assert shards(tmp_path, clean=False).missing() == [1, 2]
     beside.write(2, part(whole, 20, 25))
-    opened.look()
+    opened.refresh()
     assert opened.missing() == [1]
     assert len(before) == len(list(tmp_path.iterdir())) - 1
 
@@ -217,7 +217,7 @@ def test_looking_takes_in_only_what_is_whole_and_keeps_what_it_knows(tmp_path, w
     cut = opened.path(2).read_bytes()[:-1]
     opened.path(2).write_bytes(cut)
     opened.path(0).unlink()
-    opened.look()
+    opened.refresh()
     assert sorted(opened.kept) == [0, 1]
 
 

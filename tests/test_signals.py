@@ -135,7 +135,7 @@ def test_pycolmap_is_imported_in_one_place():
 def predict_to(folder, patch):
     """Predict 250 frames in 5 shards into the folder."""
     patch.setattr(sys, "argv", ["predict.py"])
-    patch.setattr(prediction, "data_sequence", lambda _: sequence_of(250))
+    patch.setattr(prediction, "recording_sequence", lambda _: sequence_of(250))
     origin_of = {"ghpt": "0", "commit": "", "command": ""}
     patch.setattr(prediction, "provenance", lambda seed: origin_of | {"seed": seed})
     settings = config("triangulation=linear", "shard_frames=50", "batch=25", "formats=[npz,csv]")

@@ -96,7 +96,7 @@ def test_draws_take_turns_over_the_frames_of_their_rigs():
     R, t = relative_poses(recordings[0].cameras)
     shifts = [[0, 10, 20], [30, 40, 50]]  # of a rig's cameras in its draws, mm
     rigs = [
-        RigDraws([i], [StoredExtrinsics.of((R, t + shift)) for shift in shifts[i]])
+        RigDraws([i], [StoredExtrinsics.from_extrinsics((R, t + shift)) for shift in shifts[i]])
         for i in range(2)
     ]
     batch = through_draws(frames, rigs, "t")[range(6)].observations

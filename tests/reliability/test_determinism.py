@@ -73,7 +73,9 @@ def predictions_of(checkpoint, folder, threads, **data):
     return arrays(folder)
 
 
-def test_c4_batch_size_threads_and_workers_do_not_matter(tmp_path, checkpoint, record_row):
+def test_c4_batch_size_threads_and_workers_do_not_matter(
+    tmp_path, checkpoint, blank_figures, record_row
+):
     reference = predictions_of(checkpoint, tmp_path / "reference", 1, batch_size=16)
     runs = [(1, 1, 0), (4096, 2, 0), (7, 2, 2)]
     worst, differing = 0.0, 0

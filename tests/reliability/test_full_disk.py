@@ -62,7 +62,7 @@ def train_command(typed, conf, tmp_path):
 
 
 @pytest.fixture
-def test_command(typed, conf, tmp_path, train_command):
+def test_command(typed, conf, tmp_path, train_command, blank_figures):
     assert train_command(f"output={tmp_path / 'model'}")[0] == 0
     words = ("data=toy", f"ckpt={tmp_path / 'model' / 'last.ckpt'}", f"output={tmp_path / 'out'}")
     quiet = ("progress_bar=false", "trainer.accelerator=cpu")
@@ -71,7 +71,7 @@ def test_command(typed, conf, tmp_path, train_command):
 
 @pytest.fixture
 def predict_command(typed, tmp_path, monkeypatch):
-    monkeypatch.setattr(prediction, "data_sequence", lambda _: sequence_of(400))
+    monkeypatch.setattr(prediction, "recording_sequence", lambda _: sequence_of(400))
     words = (
         "triangulation=linear",
         "shard_frames=100",

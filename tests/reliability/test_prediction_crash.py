@@ -21,7 +21,7 @@ OUTPUTS = ("poses.npz", "poses.csv", "poses.trc", "prediction.json", "report.md"
 
 
 def predict(output: Path, frames: int, settings: dict) -> None:
-    command.data_sequence = lambda _: sequence_of(frames)
+    command.recording_sequence = lambda _: sequence_of(frames)
     command.predict(settings, output)
 
 

@@ -25,7 +25,7 @@ def child(output: str, frames: int) -> None:
         held.append(memory.private_memory())
 
     run.Shards.write = measured
-    command.data_sequence = lambda _: sequence_of(frames)
+    command.recording_sequence = lambda _: sequence_of(frames)
     words = ("triangulation=linear", "shard_frames=2000", "batch=1000", "formats=[npz,csv]")
     command.predict(config(*words), Path(output))
     third = len(held) // 3

@@ -64,6 +64,8 @@ SHARDS = ".shards"
 _OWN_FORMATS = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if name in WRITERS)
 """The formats that need no further package."""
 _TIMED_FORMATS = ("trc", "c3d")
+_NOT_OF_SHARDS = ("command", "seed")
+"""What shards do not depend on; where an estimator draws by the seed, its identity holds it."""
 _log = logging.getLogger(__name__)
 
 
@@ -305,15 +307,10 @@ def _with_flips(settings: PredictSettings, group: Target) -> dict[str, Any]:
 def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Sequence:
     """Return what is predicted: the user's own key points, or a recording of the data set."""
     if not settings.keypoints:
-        return data_sequence(settings)
+        return recording_sequence(settings)
     sequence = _files_sequence(settings)
     sequence.cameras.check_calibrated(sequence.source)
     return resolve_unit(sequence, camera_check.consensus, ask=True)
-
-
-def data_sequence(settings: PredictSettings) -> Sequence:
-    """Return a recording of the data set."""
-    return recording_sequence(settings)
 
 
 def _files_sequence(settings: PredictSettings) -> Sequence:
@@ -367,7 +364,7 @@ def _shard_key(sequence: Sequence, estimator: PoseEstimator, origin: dict[str, A
         "frames": sequence.digest(),
         "estimator": estimator.name,
         "settings": estimator.identity,
-        "made": {name: value for name, value in origin.items() if name != "command"},
+        "made": {name: value for name, value in origin.items() if name not in _NOT_OF_SHARDS},
     }
     text = json.dumps(parts, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()

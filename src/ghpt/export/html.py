@@ -5,12 +5,15 @@ from __future__ import annotations
 import base64
 import json
 import math
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from ghpt.export.scene import (
     Scene,
@@ -20,10 +23,11 @@ from ghpt.export.scene import (
     side_of,
     title,
     to_z_up,
-    upright,
+    upward,
 )
-from ghpt.export.stream import Chunks, extent, pieces, points_of_origin
+from ghpt.export.stream import Chunks, extent, local_points, pieces
 from ghpt.files import atomic_write
+from ghpt.geometry.masking import where
 from ghpt.reconstruction import About, Reconstruction, State
 
 MOST_FRAMES = 6000
@@ -32,89 +36,123 @@ _FRUSTUM = 300.0
 """Depth at which cameras are drawn, mm."""
 
 
-def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = None) -> None:
-    """A page that plays the skeleton: left blue, right orange; filled joints hollow, missing ones
-    absent; below it the reprojection error. ``scene``: cameras to draw. Up is the world axis
-    nearest to the body's.
+@dataclass(frozen=True)
+class _Frames:
+    """What the page plays."""
 
-    Positions are relative to ``about.origin``, which the page tells."""
+    frame: np.ndarray
+    """[T]"""
+    points: np.ndarray
+    """[T, J, 3], mm from ``About.origin``; 0 where missing."""
+    state: np.ndarray
+    """[T, J]"""
+    error: np.ndarray
+    """[T], the mean over the observed joints, pixels; NaN where there is none."""
+
+
+def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = None) -> None:
+    """Write a page that plays the skeleton, left blue and right orange.
+
+    Filled joints are hollow, missing ones absent; below it is the reprojection error. ``scene``:
+    cameras to draw. Up is the world axis nearest to the body's. Positions are relative to
+    ``about.origin``, which the page tells.
+    """
     whole = extent(path, about, chunks)
     stride = math.ceil(whole.count / MOST_FRAMES)
-    arrays = []
+    parts = []
     up = torch.zeros(3, dtype=torch.float64)
-    at = 0
+    count = 0
     for piece in pieces(path, about, chunks):
-        arrays.append(_arrays(about, piece, slice(-at % stride, None, stride)))
-        up = up + upright(about.joints, piece)
-        at = at + len(piece)
-    turn = to_z_up(up)
-    frame, points, state, error = (np.concatenate(parts) for parts in zip(*arrays, strict=True))
-    # The distance of the frames that are kept, in frame numbers.
-    step = int(np.median(np.diff(frame))) if len(frame) > 1 else 1
+        first = -count % stride
+        parts.append(_select_frames(about, piece, slice(first, None, stride)))
+        up = up + upward(about.joints, piece)
+        count = count + len(piece)
+    frames = _join(parts)
+    to_page = to_z_up(up)
+    intervals = np.diff(frames.frame)
     data = {
         "title": title(about),
-        "about": _about(about, len(frame), whole.count, stride),
+        "about": _describe(about, len(frames.frame), whole.count, stride),
         "rate_hz": about.rate_hz,
         "joints": about.joints,
         "bones": bones_of(about.joints),
         "sides": [side_of(joint) for joint in about.joints],
-        "stride": step,
-        "frame": _base64(frame, "<f8"),
-        "state": _base64(state, "|u1"),
-        "error": _base64(error, "<f4"),
-        "points": _base64(points @ turn.numpy().T, "<f4"),
-        "axes": turn.T.tolist(),
-        "cameras": _cameras(about, scene, turn),
+        "stride": int(np.median(intervals)) if len(intervals) else 1,
+        "frame": _base64(frames.frame, "<f8"),
+        "state": _base64(frames.state, "|u1"),
+        "error": _base64(frames.error, "<f4"),
+        "points": _base64(frames.points @ to_page.numpy().T, "<f4"),
+        "axes": to_page.T.tolist(),
+        "cameras": _cameras(about, scene, to_page),
     }
-    text = json.dumps(data, allow_nan=False).replace(
-        "<", "\\u003c"
-    )  # "</script>" in a name would end the data
-    folder = resources.files("ghpt.export")
-    page, player = (
-        (folder / file).read_text(encoding="utf-8") for file in ("player.html", "player.js")
-    )
-    before, between, after = _split(page, "%DATA%", "%PLAYER%")
+    # "</script>" in a name would end the data
+    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
+    head, rest = _resource("player.html").split("%DATA%")
+    middle, tail = rest.split("%PLAYER%")
     with atomic_write(path, "w") as handle:
-        handle.writelines([before, text, between, player, after])
+        handle.writelines([head, text, middle, _resource("player.js"), tail])
 
 
-def _split(page: str, first: str, second: str) -> tuple[str, str, str]:
-    before, rest = page.split(first)
-    between, after = rest.split(second)
-    return before, between, after
+def _resource(name: str) -> str:
+    file = resources.files("ghpt.export") / name
+    return file.read_text(encoding="utf-8")
 
 
-def _arrays(about: About, piece: Reconstruction, kept: slice) -> tuple[np.ndarray, ...]:
-    """frame, points, state and the mean error of the observed joints (NaN: none), of the frames
-    kept.
-    """
-    observed = (piece.state == State.OBSERVED)[kept]
-    total = torch.where(observed, piece.error[kept], 0.0).sum(1)
-    mean = torch.where(observed.any(1), total / observed.sum(1).clamp(min=1), torch.nan)
-    points = torch.where(piece.has_position[..., None], points_of_origin(about, piece), 0.0)[kept]
-    return tuple(value.numpy() for value in (piece.frame[kept], points, piece.state[kept], mean))
+def _select_frames(about: About, piece: Reconstruction, rows: slice) -> _Frames:
+    observed = (piece.state == State.OBSERVED)[rows]
+    total = torch.where(observed, piece.error[rows], 0.0).sum(1)
+    count = observed.sum(1)
+    mean = torch.where(count > 0, total / count.clamp(min=1), torch.nan)
+    points = where(piece.has_position, local_points(about, piece), 0.0)
+    return _Frames(
+        frame=piece.frame[rows].numpy(),
+        points=points[rows].numpy(),
+        state=piece.state[rows].numpy(),
+        error=mean.numpy(),
+    )
 
 
-def _about(about: About, shown: int, count: int, stride: int) -> str:
-    words = [f"{about.estimator}", f"{len(about.camera_names)} cameras", f"{count} frames"]
-    words += [
-        f"{about.rate_hz:g} frames/s" if about.rate_hz else "rate unknown (played at 30 frames/s)"
+def _join(parts: list[_Frames]) -> _Frames:
+    return _Frames(
+        frame=np.concatenate([part.frame for part in parts]),
+        points=np.concatenate([part.points for part in parts]),
+        state=np.concatenate([part.state for part in parts]),
+        error=np.concatenate([part.error for part in parts]),
+    )
+
+
+def _describe(about: About, kept: int, count: int, stride: int) -> str:
+    rate = f"{about.rate_hz:g} frames/s" if about.rate_hz else None
+    notes = [
+        about.estimator,
+        f"{len(about.camera_names)} cameras",
+        f"{count} frames",
+        rate or "rate unknown (played at 30 frames/s)",
     ]
-    words += ["smoothed"] if about.smoothed else []
-    words += [f"shown: 1 frame of {stride}, {shown} in all"] if stride > 1 else []
-    words += [origin_note(about)] if origin_note(about) else []
-    return " · ".join(words)
+    if about.smoothed:
+        notes.append("smoothed")
+    if stride > 1:
+        notes.append(f"shown: 1 frame of {stride}, {kept} in all")
+    if any(about.origin):
+        notes.append(origin_note(about))
+    return " · ".join(notes)
 
 
-def _cameras(about: About, scene: Scene | None, turn: torch.Tensor) -> list[dict[str, Any]]:
+def _cameras(
+    about: About,
+    scene: Scene | None,
+    to_page: Float[Tensor, "3 3"],
+) -> list[dict[str, Any]]:
     if scene is None:
         return []
-    cameras = scene.cameras.relative_to(torch.tensor(about.origin, dtype=torch.float64))
-    centres = cameras.centre @ turn.T
-    corners = frustum(cameras, _FRUSTUM) @ turn.T
-    each = zip(about.camera_names, centres.tolist(), corners.tolist(), strict=True)
-    return [{"name": name, "centre": centre, "corners": points} for name, centre, points in each]
+    origin = torch.tensor(about.origin, dtype=torch.float64)
+    cameras = scene.cameras.relative_to(origin)
+    centres = (cameras.centre @ to_page.T).tolist()
+    corners = (frustum(cameras, _FRUSTUM) @ to_page.T).tolist()
+    views = zip(about.camera_names, centres, corners, strict=True)
+    return [{"name": name, "centre": centre, "corners": image} for name, centre, image in views]
 
 
 def _base64(values: np.ndarray, dtype: str) -> str:
-    return base64.b64encode(np.ascontiguousarray(values, dtype).tobytes()).decode()
+    data = np.ascontiguousarray(values, dtype).tobytes()
+    return base64.b64encode(data).decode()

@@ -7,143 +7,214 @@ import tempfile
 import zipfile
 from collections.abc import Iterator
 from contextlib import ExitStack
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ghpt.data.formats.stored_npz import Member, add_member, members_of, read_rows, text_table
 from ghpt.errors import GhptDataError
 from ghpt.export.stream import PIECE, Chunks, pieces
 from ghpt.files import atomic_write
+from ghpt.geometry.masking import where
 from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
 
 FORMAT_VERSION = 2
 _POINTS = {1: "<f4", 2: "<f8"}
 """How each version that is read stores positions; the first had few digits far from the zero."""
 _HINT = "Predict this recording again, or copy the file again"
-_TEXTS = ("meta", "joints", "camera_names")
+_FORMAT = "ghpt reconstruction"
 
 
-_FIELDS = {"swapped": "flipped"}
-"""The fields of ``Reconstruction`` whose arrays have another name in the file."""
-_Layout = dict[str, tuple[str, tuple[int, ...]]]
+@dataclass(frozen=True)
+class _Array:
+    """One array of the file, and the field of ``Reconstruction`` that it holds."""
+
+    name: str
+    field: str
+    dtype: str
+    row: tuple[int, ...]
+    """Shape of one frame."""
 
 
-def _layout(views: int, joints: int, version: int = FORMAT_VERSION) -> _Layout:
-    """The type of each array and the shape of its rows."""
-    return {
-        "frame": ("<i8", ()),
-        "points": (_POINTS[version], (joints, 3)),
-        "state": ("|i1", (joints,)),
-        "error": ("<f4", (joints,)),
-        "views": ("|b1", (views, joints)),
-        "covariance": ("<f4", (joints, 6)),
-        "score": ("<f4", ()),
-        "swapped": ("|b1", (views,)),
-    }
+def _layout(views: int, joints: int, version: int = FORMAT_VERSION) -> tuple[_Array, ...]:
+    """Return the arrays with a row for each frame."""
+    return (
+        _Array("frame", "frame", "<i8", ()),
+        _Array("points", "points", _POINTS[version], (joints, 3)),
+        _Array("state", "state", "|i1", (joints,)),
+        _Array("error", "error", "<f4", (joints,)),
+        _Array("views", "views", "|b1", (views, joints)),
+        _Array("covariance", "covariance", "<f4", (joints, 6)),
+        _Array("score", "score", "<f4", ()),
+        _Array("swapped", "flipped", "|b1", (views,)),
+    )
+
+
+@dataclass(frozen=True)
+class _Meta:
+    """The text ``meta`` of a file, as JSON: what is no array of a row for each frame."""
+
+    format: str
+    format_version: int
+    unit: str
+    name: str
+    source: str
+    estimator: str
+    rate_hz: float | None
+    smoothed: bool
+    provenance: dict[str, Any]
+    origin: tuple[float, float, float]
+    states: dict[str, int]
+
+    @classmethod
+    def describe(cls, about: About) -> _Meta:
+        return cls(
+            format=_FORMAT,
+            format_version=FORMAT_VERSION,
+            unit="mm",
+            name=about.name,
+            source=about.source,
+            estimator=about.estimator,
+            rate_hz=about.rate_hz,
+            smoothed=about.smoothed,
+            provenance=about.provenance,
+            origin=about.origin,
+            states={state.name.lower(): int(state) for state in FILE_STATES},
+        )
 
 
 def write_npz(path: Path, about: About, chunks: Chunks) -> None:
-    """All fields of ``Reconstruction`` and ``About`` (docs/outputs.md).
+    """Write all fields of ``Reconstruction`` and ``About`` (docs/outputs.md).
 
     Positions are NaN where missing; errors and covariances where not observed. Stored without
     compression: numpy reads it, in parts too. The same content gives the same bytes.
     """
     layout = _layout(len(about.camera_names), len(about.joints))
+    meta = json.dumps(asdict(_Meta.describe(about)), allow_nan=False)
+    rate_hz = np.nan if about.rate_hz is None else about.rate_hz
     tables = {
         "joints": np.array(about.joints, np.str_),
         "camera_names": np.array(about.camera_names, np.str_),
+        "rate_hz": np.array(rate_hz, "<f8"),
+        "unit": np.array("mm"),
+        "meta": np.array(meta),
     }
-    tables["rate_hz"] = np.array(np.nan if about.rate_hz is None else about.rate_hz, "<f8")
-    tables["unit"] = np.array("mm")
-    tables["meta"] = np.array(json.dumps(_meta(about), allow_nan=False))
-    count = 0
     with atomic_write(path, verify=read_reconstruction) as handle, ExitStack() as stack:
         # Files without a name: nothing of them is left behind, however the process ends.
-        spools = {
-            name: stack.enter_context(tempfile.TemporaryFile(dir=path.parent)) for name in layout
-        }
+        spools: list[IO[bytes]] = []
+        for _ in layout:
+            spools.append(stack.enter_context(tempfile.TemporaryFile(dir=path.parent)))
+        count = 0
         for piece in pieces(path, about, chunks):
             count += len(piece)
-            for name, value in _masked(piece).items():
-                spools[name].write(value.numpy().astype(layout[name][0]).tobytes())
+            masked = _mask_missing(piece)
+            for array, spool in zip(layout, spools, strict=True):
+                value = getattr(masked, array.field).numpy()
+                spool.write(value.astype(array.dtype).tobytes())
         with zipfile.ZipFile(handle, "w") as archive:
-            for name, (dtype, shape) in layout.items():
-                spools[name].seek(0)
-                add_member(archive, name, np.dtype(dtype), (count, *shape), spools[name])
+            for array, spool in zip(layout, spools, strict=True):
+                spool.seek(0)
+                shape = (count, *array.row)
+                add_member(archive, array.name, np.dtype(array.dtype), shape, spool)
             for name, table in tables.items():
                 add_member(archive, name, table.dtype, table.shape, table.tobytes())
 
 
-def _meta(about: About) -> dict[str, Any]:
-    plain = ("name", "source", "estimator", "rate_hz", "smoothed", "provenance", "origin")
-    meta = {"format": "ghpt reconstruction", "format_version": FORMAT_VERSION, "unit": "mm"}
-    return (
-        meta
-        | {field: getattr(about, field) for field in plain}
-        | {"states": {s.name.lower(): int(s) for s in FILE_STATES}}
+def _mask_missing(piece: Reconstruction) -> Reconstruction:
+    """Return the frames on the CPU, with NaN for what is not known."""
+    piece = Reconstruction(**{name: value.cpu() for name, value in vars(piece).items()})
+    observed = piece.state == State.OBSERVED
+    return replace(
+        piece,
+        points=where(piece.has_position, piece.points, torch.nan),
+        error=where(observed, piece.error, torch.nan),
+        covariance=where(observed, piece.covariance, torch.nan),
     )
-
-
-def _masked(piece: Reconstruction) -> dict[str, torch.Tensor]:
-    values = {name: getattr(piece, _FIELDS.get(name, name)).cpu() for name in _layout(1, 1)}
-    observed = values["state"] == State.OBSERVED
-    values["points"] = torch.where(
-        (values["state"] <= State.FILLED)[..., None], values["points"], torch.nan
-    )
-    values["error"] = torch.where(observed, values["error"], torch.nan)
-    values["covariance"] = torch.where(observed[..., None], values["covariance"], torch.nan)
-    return values
 
 
 def read_reconstruction(
-    path: str | Path, size: int = PIECE
+    path: str | Path,
+    size: int = PIECE,
 ) -> tuple[About, Iterator[Reconstruction]]:
-    """What ``write_npz`` wrote: at most ``size`` frames at a time. Nothing in the file is executed
-    or unpacked.
+    """Read what ``write_npz`` wrote, at most ``size`` frames at a time.
 
-    Raises GhptDataError if it is missing, damaged (every byte is compared with its checksum), of
-    another version, or if its arrays do not belong together.
+    Nothing in the file is executed or unpacked. Raises GhptDataError if it is missing, damaged
+    (every byte is compared with its checksum), of another version, or if its arrays do not belong
+    together.
     """
     path = Path(path)
-    members, texts, meta = _open(path)
-    joints = texts["joints"]
-    cameras = texts["camera_names"]
-    frames = members["frame"].shape[0] if "frame" in members and members["frame"].shape else 0
-    layout = _layout(len(cameras), len(joints), meta["format_version"])
-    for name, (dtype, shape) in layout.items():
-        if name not in members or members[name][1:] != (np.dtype(dtype), (frames, *shape)):
-            raise GhptDataError(path, name, f"is not {dtype} of shape {(frames, *shape)}", _HINT)
+    file = _open(path)
+    starts = range(0, file.frames, size)
     about = About(
-        name=meta["name"],
-        source=meta["source"],
-        estimator=meta["estimator"],
-        joints=joints,
-        camera_names=cameras,
-        rate_hz=meta["rate_hz"],
-        smoothed=meta["smoothed"],
-        provenance=meta["provenance"],
-        origin=_origin(path, meta),
+        name=file.meta.name,
+        source=file.meta.source,
+        estimator=file.meta.estimator,
+        joints=file.joints,
+        camera_names=file.camera_names,
+        rate_hz=file.meta.rate_hz,
+        smoothed=file.meta.smoothed,
+        provenance=file.meta.provenance,
+        origin=file.meta.origin,
     )
-    starts = range(0, frames, size)
-    return about, (_read(path, members, start, min(start + size, frames)) for start in starts)
+    return about, (file.read(start, min(start + size, file.frames)) for start in starts)
 
 
-def _origin(path: Path, meta: dict[str, Any]) -> tuple[float, float, float]:
-    origin = meta.get("origin", [0.0, 0.0, 0.0])
-    numbers = isinstance(origin, list) and [type(x) for x in origin] == [float] * 3
-    if not numbers or not np.isfinite(origin).all():
-        raise GhptDataError(path, "meta.origin", f"is {origin!r}", _HINT)
-    return tuple(origin)
+@dataclass(frozen=True)
+class _File:
+    """An opened file whose arrays fit one another."""
+
+    path: Path
+    members: dict[str, Member]
+    joints: tuple[str, ...]
+    camera_names: tuple[str, ...]
+    meta: _Meta
+    frames: int
+
+    @property
+    def layout(self) -> tuple[_Array, ...]:
+        return _layout(len(self.camera_names), len(self.joints), self.meta.format_version)
+
+    def check_layout(self) -> None:
+        """Raise GhptDataError unless all arrays are there, of their types and shapes."""
+        for array in self.layout:
+            shape = (self.frames, *array.row)
+            member = self.members.get(array.name)
+            if member is None or member[1:] != (np.dtype(array.dtype), shape):
+                problem = f"is not {array.dtype} of shape {shape}"
+                raise GhptDataError(self.path, array.name, problem, _HINT)
+
+    def read(self, start: int, stop: int) -> Reconstruction:
+        """Read the frames from position ``start`` up to ``stop``."""
+        rows: dict[str, Tensor] = {}
+        for array in self.layout:
+            values = read_rows(self.path, self.members[array.name], start, stop)
+            rows[array.field] = torch.from_numpy(values)
+        piece = Reconstruction(**rows)
+        unknown = (piece.state < 0) | (piece.state > max(FILE_STATES))
+        if unknown.any():
+            raise GhptDataError(self.path, "state", "holds a number that is no state", _HINT)
+        if not piece.points[piece.has_position].isfinite().all():
+            problem = "a joint that is not missing has no position"
+            raise GhptDataError(self.path, "points", problem, _HINT)
+        return replace(
+            piece,
+            points=piece.points.nan_to_num(0.0, 0.0, 0.0).double(),
+            error=piece.error.nan_to_num(0.0, 0.0, 0.0),
+            covariance=piece.covariance.nan_to_num(0.0, 0.0, 0.0),
+        )
 
 
-def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], dict[str, Any]]:
+def _open(path: Path) -> _File:
     try:
         members = members_of(path)
-        texts = {name: text_table(path, members, name) for name in _TEXTS}
-        meta = json.loads(texts["meta"][0])
+        (text, *_) = text_table(path, members, "meta")
+        joints = text_table(path, members, "joints")
+        camera_names = text_table(path, members, "camera_names")
+        meta = json.loads(text)
     except FileNotFoundError as error:
         raise GhptDataError(path, "", "there is no such file", "Check the path") from error
     except (
@@ -155,41 +226,50 @@ def _open(path: Path) -> tuple[dict[str, Member], dict[str, tuple[str, ...]], di
         RuntimeError,
         zipfile.BadZipFile,
     ) as error:
-        raise GhptDataError(
-            path, "", f"is not a readable reconstruction ({error})", _HINT
-        ) from error
-    version = meta.get("format_version") if isinstance(meta, dict) else None
-    readable = type(version) is int and version in _POINTS
-    if not readable or meta.get("format") != "ghpt reconstruction":
+        problem = f"is not a readable reconstruction ({error})"
+        raise GhptDataError(path, "", problem, _HINT) from error
+    frame = members.get("frame")
+    frames = frame.shape[0] if frame is not None and frame.shape else 0
+    file = _File(path, members, joints, camera_names, _parse_meta(path, meta), frames)
+    file.check_layout()
+    return file
+
+
+_META_TYPES: dict[str, tuple[type, ...]] = {
+    "name": (str,),
+    "source": (str,),
+    "estimator": (str,),
+    "rate_hz": (float, int, type(None)),
+    "smoothed": (bool,),
+    "provenance": (dict,),
+}
+
+
+def _parse_meta(path: Path, meta: Any) -> _Meta:
+    """Return the checked text ``meta``. Raises GhptDataError."""
+    content = meta if isinstance(meta, dict) else {}
+    version = content.get("format_version")
+    own = content.get("format") == _FORMAT
+    if type(version) is not int or version not in _POINTS or not own:
         known = " and ".join(map(str, _POINTS))
         problem = f"is {version!r}; this ghpt reads {known}"
         raise GhptDataError(path, "meta.format_version", problem, _HINT)
-    forms = {
-        "name": str,
-        "source": str,
-        "estimator": str,
-        "rate_hz": (float, int, type(None)),
-        "smoothed": bool,
-        "provenance": dict,
-    }
-    for field, form in forms.items():
-        if not isinstance(meta.get(field, ...), form):
-            raise GhptDataError(path, f"meta.{field}", f"is {meta.get(field)!r}", _HINT)
-    return members, texts, meta
+    for field, types in _META_TYPES.items():
+        if not isinstance(content.get(field, ...), types):
+            raise GhptDataError(path, f"meta.{field}", f"is {content.get(field)!r}", _HINT)
+    return _Meta(
+        format=_FORMAT,
+        format_version=version,
+        unit="mm",
+        origin=_parse_origin(path, content.get("origin", [0.0, 0.0, 0.0])),
+        states={},
+        **{field: content[field] for field in _META_TYPES},
+    )
 
 
-def _read(path: Path, members: dict[str, Member], start: int, stop: int) -> Reconstruction:
-    rows = {
-        _FIELDS.get(name, name): torch.from_numpy(read_rows(path, members[name], start, stop))
-        for name in _layout(1, 1)
-    }
-    state = rows["state"]
-    if ((state < 0) | (state > max(FILE_STATES))).any():
-        raise GhptDataError(path, "state", "holds a number that is no state", _HINT)
-    placed = (state <= State.FILLED)[..., None].expand_as(rows["points"])
-    if not rows["points"][placed].isfinite().all():
-        raise GhptDataError(path, "points", "a joint that is not missing has no position", _HINT)
-    for name in ("points", "error", "covariance"):
-        rows[name] = rows[name].nan_to_num(0.0, 0.0, 0.0)
-    rows["points"] = rows["points"].double()
-    return Reconstruction(**rows)
+def _parse_origin(path: Path, origin: Any) -> tuple[float, float, float]:
+    numbers = isinstance(origin, list) and [type(x) for x in origin] == [float] * 3
+    if not numbers or not np.isfinite(origin).all():
+        raise GhptDataError(path, "meta.origin", f"is {origin!r}", _HINT)
+    x, y, z = origin
+    return x, y, z

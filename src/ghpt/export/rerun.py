@@ -1,9 +1,8 @@
-"""poses.rrd: a recording for the Rerun viewer: cameras, rays, key points and reprojections, joints,
-hypotheses.
-"""
+"""poses.rrd: a recording for the Rerun viewer: cameras, rays, key points, joints, hypotheses."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import repeat
 from pathlib import Path
@@ -11,12 +10,14 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ghpt.errors import GhptConfigError
 from ghpt.export.scene import Evidence, Scene, bones_of, origin_note, side_of, title
-from ghpt.export.stream import Chunks, extent, part, points_of_origin
+from ghpt.export.stream import Chunks, extent, local_points, part
 from ghpt.files import atomic_write
 from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.masking import finite_vectors
 from ghpt.reconstruction import About, Reconstruction, State
 
 _PIECE = 500
@@ -28,66 +29,71 @@ _GREY = 0x99999966
 
 
 def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = None) -> None:
-    """Timelines ``frame`` and, with a known rate, ``time``; mm. Missing joints are absent, filled
-    ones pale.
+    """Write timelines ``frame`` and, with a known rate, ``time``; mm.
 
-    ``scene`` adds cameras and rays, and with evidence key points, reprojections and hypotheses. The
-    viewer has float32, so all is relative to ``about.origin``, which the recording's name tells.
+    Missing joints are absent, filled ones pale. ``scene`` adds cameras and rays, and with evidence
+    key points, reprojections and hypotheses. The viewer has float32, so all is relative to
+    ``about.origin``, which the recording's name tells.
 
     Raises GhptConfigError without the package.
     """
     try:
         import rerun as rr
     except ImportError as error:
-        raise GhptConfigError(
-            "rerun", "needs rerun-sdk", "pip install 'ghpt[viz]', or leave rerun out"
-        ) from error
+        hint = "pip install 'ghpt[viz]', or leave rerun out"
+        raise GhptConfigError("rerun", "needs rerun-sdk", hint) from error
     extent(path, about, chunks)
     if scene is not None:
         origin = torch.tensor(about.origin, dtype=torch.float64)
         scene = replace(scene, cameras=scene.cameras.relative_to(origin))
-    evidence = (
-        scene.evidence() if scene is not None and scene.evidence is not None else repeat(None)
-    )
+    names = [title(about), origin_note(about)]
     with atomic_write(path) as handle:
         recording = rr.RecordingStream("ghpt")
         recording.save(handle.name)
-        recording.send_recording_name(" · ".join(filter(None, (title(about), origin_note(about)))))
+        recording.send_recording_name(" · ".join(filter(None, names)))
         if scene is not None:
             _log_cameras(rr, recording, about, scene.cameras)
-        for chunk, made_of in zip(chunks(), evidence, strict=False):
+        for chunk, evidence in zip(chunks(), _evidence(scene), strict=False):
             for start in range(0, len(chunk), _PIECE):
                 stop = start + _PIECE
-                there = (
-                    None
-                    if made_of is None
-                    else Evidence(*(None if x is None else x[start:stop] for x in made_of))
-                )
                 piece = part(chunk, start, stop)
-                near = replace(piece, points=points_of_origin(about, piece))
-                _Piece(rr, recording, about, near).log(scene, there)
+                piece = replace(piece, points=local_points(about, piece))
+                own = None if evidence is None else evidence.part(start, stop)
+                _PieceLog(rr, recording, about, piece).log(scene, own)
         recording.flush()
         recording.disconnect()
+
+
+def _evidence(scene: Scene | None) -> Iterator[Evidence | None]:
+    """Return the evidence of each chunk, None where there is none."""
+    if scene is None or scene.evidence is None:
+        return repeat(None)
+    return scene.evidence()
 
 
 def _log_cameras(rr: Any, recording: Any, about: About, cameras: Cameras) -> None:
     views = zip(about.camera_names, cameras.K, cameras.R, cameras.centre, strict=True)
     for name, K, R, centre in views:
         pose = rr.Transform3D(translation=centre.tolist(), mat3x3=R.T.numpy())
+        image_size = 2 * K[:2, 2]
         lens = rr.Pinhole(
             image_from_camera=K.numpy(),
-            resolution=(2 * K[:2, 2]).tolist(),
+            resolution=image_size.tolist(),
             image_plane_distance=300.0,
         )
-        recording.log(_camera(rr, name), pose, static=True)
-        recording.log(f"{_camera(rr, name)}/image", lens, static=True)
+        recording.log(_camera_path(rr, name), pose, static=True)
+        recording.log(_image_path(rr, name), lens, static=True)
 
 
-def _camera(rr: Any, name: str) -> str:
+def _camera_path(rr: Any, name: str) -> str:
     return f"world/cameras/{rr.escape_entity_path_part(name)}"
 
 
-class _Piece:
+def _image_path(rr: Any, name: str) -> str:
+    return f"{_camera_path(rr, name)}/image"
+
+
+class _PieceLog:
     """Logs some frames."""
 
     def __init__(self, rr: Any, recording: Any, about: About, piece: Reconstruction) -> None:
@@ -103,90 +109,92 @@ class _Piece:
         self.colours = torch.where(piece.state == State.FILLED, colours - _PALE, colours)
 
     def log(self, scene: Scene | None, evidence: Evidence | None) -> None:
-        rr = self.rr
         piece = self.piece
-        self._points(
-            rr.Points3D, "world/joints", piece.points, piece.has_position, self.colours, 15.0
-        )
-        bones = torch.tensor(bones_of(self.about.joints), dtype=torch.long).reshape(-1, 2)
-        strips = piece.points[:, bones]
-        there = piece.has_position[:, bones].all(-1)
-        colours = torch.minimum(self.colours[:, bones[:, 0]], self.colours[:, bones[:, 1]])
-        self._strips("world/bones", strips, there, colours, 6.0)
-        observed = piece.state == State.OBSERVED
-        error = torch.where(observed, piece.error, 0.0).sum(1) / observed.sum(1)
-        self._send("error_px", rr.Scalars.columns(scalars=error.double().numpy()))
+        joints = self.rr.Points3D
+        self._points(joints, "world/joints", piece.points, piece.has_position, self.colours, 15.0)
+        self._bones()
+        self._errors()
         if scene is not None:
             self._views(scene.cameras, evidence)
         if evidence is not None and evidence.hypotheses is not None:
-            pool = evidence.hypotheses.flatten(1, 2)
-            pool = pool.double() - torch.tensor(self.about.origin, dtype=torch.float64)
-            self._points(
-                rr.Points3D,
-                "world/hypotheses",
-                pool,
-                pool.isfinite().all(-1),
-                pool[..., 0] * 0 + _GREY,
-                4.0,
-            )
+            self._hypotheses(evidence.hypotheses)
+
+    def _bones(self) -> None:
+        piece = self.piece
+        bones = torch.tensor(bones_of(self.about.joints), dtype=torch.long).reshape(-1, 2)
+        start, end = bones.unbind(-1)
+        strips = piece.points[:, bones]
+        present = piece.has_position[:, bones].all(-1)
+        colours = torch.minimum(self.colours[:, start], self.colours[:, end])
+        self._strips("world/bones", strips, present, colours, 6.0)
+
+    def _errors(self) -> None:
+        observed = self.piece.state == State.OBSERVED
+        total = torch.where(observed, self.piece.error, 0.0).sum(1)
+        mean = total / observed.sum(1)
+        self._send("error_px", self.rr.Scalars.columns(scalars=mean.double().numpy()))
+
+    def _hypotheses(self, hypotheses: Tensor) -> None:
+        origin = torch.tensor(self.about.origin, dtype=torch.float64)
+        pool = hypotheses.flatten(1, 2).double() - origin
+        finite = finite_vectors(pool)
+        colours = torch.full_like(pool[..., 0], _GREY)
+        self._points(self.rr.Points3D, "world/hypotheses", pool, finite, colours, 4.0)
 
     def _views(self, cameras: Cameras, evidence: Evidence | None) -> None:
         rr = self.rr
         piece = self.piece
+        points = piece.points.double()
         double = cameras.to(torch.float64)
-        pixels, depth = project(double, piece.points.double())
+        pixels, depth = project(double, points)
+        observed = piece.state == State.OBSERVED
+        grey = torch.full_like(piece.state, _GREY, dtype=torch.long)
         for v, name in enumerate(self.about.camera_names):
-            used = piece.views[:, v] & (piece.state == State.OBSERVED)
-            start = double.centre[v].expand_as(piece.points)
-            rays = torch.stack([start, piece.points.double()], dim=-2)
-            colour = torch.full_like(piece.state, 0, dtype=torch.long) + _GREY
-            self._strips(f"world/rays/{rr.escape_entity_path_part(name)}", rays, used, colour, 1.0)
-            image = f"{_camera(rr, name)}/image"
-            shown = piece.has_position & (depth[:, v] > 0)
-            self._points(
-                rr.Points2D, f"{image}/reprojected", pixels[:, v], shown, self.colours, 3.0
-            )
+            centre = double.centre[v].expand_as(points)
+            rays = torch.stack([centre, points], dim=-2)
+            path = f"world/rays/{rr.escape_entity_path_part(name)}"
+            self._strips(path, rays, piece.views[:, v] & observed, grey, 1.0)
+            image = _image_path(rr, name)
+            visible = piece.has_position & (depth[:, v] > 0)
+            path = f"{image}/reprojected"
+            self._points(rr.Points2D, path, pixels[:, v], visible, self.colours, 3.0)
             if evidence is not None:
-                valid = evidence.valid[:, v]
-                self._points(
-                    rr.Points2D,
-                    f"{image}/key_points",
-                    evidence.key_points[:, v],
-                    valid,
-                    colour,
-                    5.0,
-                )
+                key_points = evidence.key_points[:, v]
+                path = f"{image}/key_points"
+                self._points(rr.Points2D, path, key_points, evidence.valid[:, v], grey, 5.0)
 
     def _points(
         self,
         kind: Any,
         path: str,
-        points: torch.Tensor,
-        there: torch.Tensor,
-        colours: torch.Tensor,
+        points: Tensor,
+        present: Tensor,
+        colours: Tensor,
         radius: float,
     ) -> None:
-        values = {
-            "positions": points[there].float().numpy(),
-            "colors": colours[there].numpy().astype(np.uint32),
-        }
-        values["radii"] = np.full(len(values["positions"]), radius, np.float32)
-        self._send(path, kind.columns(**values).partition(there.sum(1).numpy()))
+        positions = points[present].float().numpy()
+        columns = kind.columns(
+            positions=positions,
+            colors=colours[present].numpy().astype(np.uint32),
+            radii=np.full(len(positions), radius, np.float32),
+        )
+        self._send(path, columns.partition(present.sum(1).numpy()))
 
     def _strips(
         self,
         path: str,
-        strips: torch.Tensor,
-        there: torch.Tensor,
-        colours: torch.Tensor,
+        strips: Tensor,
+        present: Tensor,
+        colours: Tensor,
         radius: float,
     ) -> None:
-        values = {
-            "strips": strips[there].float().numpy(),
-            "colors": colours[there].numpy().astype(np.uint32),
-        }
-        values["radii"] = np.full(len(values["strips"]), radius, np.float32)
-        self._send(path, self.rr.LineStrips3D.columns(**values).partition(there.sum(1).numpy()))
+        lines = strips[present].float().numpy()
+        columns = self.rr.LineStrips3D.columns(
+            strips=lines,
+            colors=colours[present].numpy().astype(np.uint32),
+            radii=np.full(len(lines), radius, np.float32),
+        )
+        self._send(path, columns.partition(present.sum(1).numpy()))
 
     def _send(self, path: str, columns: Any) -> None:
         self.rr.send_columns(path, indexes=self.times, columns=columns, recording=self.recording)

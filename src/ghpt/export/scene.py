@@ -1,23 +1,22 @@
-"""What pictures of a reconstruction show besides it: the cameras, what they saw, and which way is
-up.
-"""
+"""What pictures of a reconstruction show besides it: cameras, key points, and which way is up."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.epipolar import homogeneous
 from ghpt.reconstruction import About, Reconstruction
 from ghpt.skeleton import BONES, JOINTS
 
 
-class Evidence(NamedTuple):
+@dataclass(frozen=True)
+class Evidence:
     """What a part of a reconstruction was made of, frame by frame."""
 
     key_points: Float[Tensor, "T V J 2"]
@@ -26,10 +25,16 @@ class Evidence(NamedTuple):
     hypotheses: Float[Tensor, "T H J 3"] | None
     """World, mm; those of the pool that are worth a look."""
 
+    def part(self, start: int, stop: int) -> Evidence:
+        """Return the frames from position ``start`` up to ``stop``."""
+        rows = slice(start, stop)
+        hypotheses = None if self.hypotheses is None else self.hypotheses[rows]
+        return Evidence(self.key_points[rows], self.valid[rows], hypotheses)
+
 
 @dataclass(frozen=True)
 class Scene:
-    """For pictures."""
+    """What a picture shows besides the skeleton."""
 
     cameras: Cameras
     """The views, in the order of ``About.camera_names``; leading dimension V."""
@@ -38,57 +43,70 @@ class Scene:
 
 
 def title(about: About) -> str:
-    """Of a picture; says where the data are not real."""
-    return f"{about.name}: 3D poses from {'synthetic data' if about.source == 'synthetic' else about.source}"
+    """Return the title of a picture; it says where the data are not real."""
+    source = "synthetic data" if about.source == "synthetic" else about.source
+    return f"{about.name}: 3D poses from {source}"
 
 
 def origin_note(about: About) -> str:
-    """Where a picture's zero is, in words; nothing where it is the world's own."""
-    place = ", ".join(f"{x:.15g}" for x in about.origin)
-    return f"zero is at ({place}) mm of the cameras' world" if any(about.origin) else ""
+    """Return where a picture's zero is, in words; nothing where it is the world's own."""
+    if not any(about.origin):
+        return ""
+    position = ", ".join(f"{x:.15g}" for x in about.origin)
+    return f"zero is at ({position}) mm of the cameras' world"
 
 
 def bones_of(joints: tuple[str, ...]) -> list[tuple[int, int]]:
-    """The skeleton's bones whose ends are among these joints."""
-    named = ((JOINTS[a], JOINTS[b]) for a, b in BONES)
-    return [(joints.index(a), joints.index(b)) for a, b in named if a in joints and b in joints]
+    """Return the skeleton's bones whose ends are among these joints."""
+    bones = []
+    for a, b in BONES:
+        start = JOINTS[a]
+        end = JOINTS[b]
+        if start in joints and end in joints:
+            bones.append((joints.index(start), joints.index(end)))
+    return bones
 
 
 def side_of(joint: str) -> str:
-    """left, right or middle."""
-    return next((side for side in ("left", "right") if side in joint.lower()), "middle")
+    """Return left, right or middle."""
+    for side in ("left", "right"):
+        if side in joint.lower():
+            return side
+    return "middle"
 
 
-def upright(joints: tuple[str, ...], piece: Reconstruction) -> Float[Tensor, " 3"]:
-    """The sum over the frames of the way from pelvis to thorax, mm; 0 where there is none."""
+def upward(joints: tuple[str, ...], piece: Reconstruction) -> Float[Tensor, " 3"]:
+    """Return the sum over the frames of the vector from pelvis to thorax, mm; 0 without any."""
     if not {"pelvis", "thorax"} <= set(joints):
         return torch.zeros(3, dtype=torch.float64)
     ends = [joints.index("pelvis"), joints.index("thorax")]
     both = piece.has_position[:, ends].all(1)
-    way = piece.points[both][:, ends].double()
-    return (way[:, 1] - way[:, 0]).sum(0)
+    points = piece.points[both][:, ends].double()
+    trunk = points[:, 1] - points[:, 0]
+    return trunk.sum(0)
 
 
 def to_z_up(up: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
-    """The rotation that brings the world's axis nearest to ``up``, with its sign, to z; none for 0."""
+    """Return the rotation that brings the world's axis nearest to ``up``, with its sign, to z.
+
+    It is the identity for 0.
+    """
     axis = int(up.abs().argmax()) if up.any() else 2
     z = torch.zeros(3, dtype=torch.float64)
     z[axis] = -1.0 if up[axis] < 0 else 1.0
     x = torch.zeros(3, dtype=torch.float64)
     x[1 if axis == 0 else 0] = 1.0
-    return torch.stack([x, torch.linalg.cross(z, x), z])
+    y = torch.linalg.cross(z, x)
+    return torch.stack([x, y, z])
 
 
 def frustum(cameras: Cameras, depth: float) -> Float[Tensor, "V 4 3"]:
-    """World corners, ``depth`` mm before each camera, of an image whose middle is the principal
-    point.
+    """Return the world corners, ``depth`` mm before each camera, of an image.
+
+    Its middle is the principal point.
     """
-    c = cameras.K[:, :2, 2]
-    corners = torch.stack(
-        [c * c.new_tensor(s) for s in ((0.0, 0.0), (2.0, 0.0), (2.0, 2.0), (0.0, 2.0))], dim=1
-    )
-    rays = (
-        torch.cat([corners, torch.ones_like(corners[..., :1])], dim=-1)
-        @ torch.linalg.inv(cameras.K).mT
-    )
+    centre = cameras.K[:, :2, 2]
+    factors = centre.new_tensor([[0.0, 0.0], [2.0, 0.0], [2.0, 2.0], [0.0, 2.0]])
+    corners = centre[:, None] * factors
+    rays = homogeneous(corners) @ torch.linalg.inv(cameras.K).mT
     return (depth * rays - cameras.t[:, None]) @ cameras.R

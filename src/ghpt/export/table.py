@@ -4,43 +4,46 @@ from __future__ import annotations
 
 import csv
 import json
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from io import StringIO
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from ghpt.errors import GhptConfigError
 from ghpt.export.stream import Chunks, pieces, plain_names, text_rows
 from ghpt.files import atomic_write
+from ghpt.geometry.masking import where
 from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
 
 _STATES = np.array([state.name.lower() for state in FILE_STATES])
 
 
-class Column(NamedTuple):
+@dataclass(frozen=True)
+class Column:
     """One column; a number that is NaN, and a text that is empty, is missing."""
 
     name: str
     values: np.ndarray
     form: str
-    """How its numbers are written: 9 digits give back a float32 exactly, 6 decimals a nanometre."""
+    """How its numbers are written: 9 digits give back a float32 exactly, 6 decimals a nanometre.
+    Empty for texts.
+    """
 
 
 def columns(path: Path, about: About, piece: Reconstruction) -> list[Column]:
-    """frame, time_s and score; then for each joint its position x_mm y_mm z_mm, state, error_px
-    (reprojection), views (how many made it) and spread_mm, the root of the covariance's trace.
+    """Return frame, time_s and score; then the columns of each joint.
+
+    These are its position x_mm y_mm z_mm, state, error_px (reprojection), views (how many made it)
+    and spread_mm, the root of the covariance's trace.
     """
     rate = about.rate_hz if about.rate_hz else np.nan
     observed = piece.state == State.OBSERVED
-    placed = piece.has_position
-    points = torch.where(placed[..., None], piece.points, torch.nan).numpy()
+    points = where(piece.has_position, piece.points, torch.nan).numpy()
     error = torch.where(observed, piece.error, torch.nan).numpy()
-    spread = torch.where(
-        observed, piece.covariance[..., [0, 3, 5]].sum(-1).clamp(min=0).sqrt(), torch.nan
-    ).numpy()
+    spread = torch.where(observed, _spread(piece.covariance), torch.nan).numpy()
     counts = piece.views.sum(1).numpy().astype(np.int32)
     states = _STATES[piece.state.numpy()]
     frame = piece.frame.numpy()
@@ -50,9 +53,10 @@ def columns(path: Path, about: About, piece: Reconstruction) -> list[Column]:
         Column("score", piece.score.numpy(), "%.9g"),
     ]
     for j, joint in enumerate(plain_names(path, "joints", about.joints)):
-        position = [(f"{joint}_{axis}_mm", points[:, j, i]) for i, axis in enumerate("xyz")]
-        found += [Column(name, values, "%.6f") for name, values in position]
         found += [
+            Column(f"{joint}_x_mm", points[:, j, 0], "%.6f"),
+            Column(f"{joint}_y_mm", points[:, j, 1], "%.6f"),
+            Column(f"{joint}_z_mm", points[:, j, 2], "%.6f"),
             Column(f"{joint}_state", states[:, j], ""),
             Column(f"{joint}_error_px", error[:, j], "%.9g"),
             Column(f"{joint}_views", counts[:, j], "%d"),
@@ -61,53 +65,68 @@ def columns(path: Path, about: About, piece: Reconstruction) -> list[Column]:
     return found
 
 
+def _spread(covariance: Tensor) -> Tensor:
+    """Return the root of the trace of covariances xx xy xz yy yz zz."""
+    trace = covariance[..., [0, 3, 5]].sum(-1)
+    return trace.clamp(min=0).sqrt()
+
+
 def write_csv(path: Path, about: About, chunks: Chunks) -> None:
-    """A row for each frame under a row of names; commas, decimal points, UTF-8; what is missing is
-    an empty cell.
+    """Write a row for each frame under a row of names; what is missing is an empty cell.
+
+    Commas, decimal points, UTF-8.
     """
     with atomic_write(path, "w") as handle:
-        named = False
+        has_names = False
         for piece in pieces(path, about, chunks):
             table = columns(path, about, piece)
-            if not named:
-                line = StringIO()
-                csv.writer(line, lineterminator="\n").writerow(column.name for column in table)
-                handle.write(line.getvalue())
-                named = True
-            texts = np.array([not column.form for column in table])
-            numbers = np.array(
-                [np.zeros(len(piece)) if t else c.values for c, t in zip(table, texts, strict=True)]
-            ).T
-            there = ~np.isnan(numbers) & ~texts
-            cells = np.where(there, np.array([column.form for column in table]), "").astype(object)
-            cells[:, texts] = np.array([column.values for column in table if not column.form]).T
-            handle.write(text_rows(cells, numbers[there], ",", "\n"))
+            if not has_names:
+                handle.write(_name_row(table))
+                has_names = True
+            handle.write(_rows(table))
+
+
+def _name_row(table: list[Column]) -> str:
+    line = StringIO()
+    writer = csv.writer(line, lineterminator="\n")
+    writer.writerow(column.name for column in table)
+    return line.getvalue()
+
+
+def _rows(table: list[Column]) -> str:
+    forms = np.array([column.form for column in table])
+    is_text = forms == ""
+    nothing = np.zeros(len(table[0].values))
+    numbers = np.array([column.values if column.form else nothing for column in table]).T
+    texts = np.array([column.values for column in table if not column.form]).T
+    present = ~np.isnan(numbers) & ~is_text
+    cells = np.where(present, forms, "").astype(object)
+    cells[:, is_text] = texts
+    return text_rows(cells, numbers[present], ",", "\n")
 
 
 def write_parquet(path: Path, about: About, chunks: Chunks) -> None:
-    """The same columns as in the CSV file; what is missing is null; the rest of ``About`` is the
-    schema's metadata.
+    """Write the same columns as in the CSV file; what is missing is null.
 
-    Raises GhptConfigError without pyarrow.
+    The rest of ``About`` is the schema's metadata. Raises GhptConfigError without pyarrow.
     """
     try:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
-        raise GhptConfigError(
-            "parquet", "needs pyarrow", "pip install 'ghpt[io]', or leave parquet out"
-        ) from error
-    notes = {"ghpt": json.dumps(asdict(about) | {"unit": "mm"}, allow_nan=False)}
+        hint = "pip install 'ghpt[io]', or leave parquet out"
+        raise GhptConfigError("parquet", "needs pyarrow", hint) from error
+    notes = json.dumps(asdict(about) | {"unit": "mm"}, allow_nan=False)
     writer = None
     with atomic_write(path) as handle:
         for piece in pieces(path, about, chunks):
             table = columns(path, about, piece)
-            arrays = [
-                pa.array(c.values, mask=np.isnan(c.values) if c.form else None) for c in table
-            ]
-            batch = pa.table(
-                arrays, names=[column.name for column in table]
-            ).replace_schema_metadata(notes)
+            names = [column.name for column in table]
+            arrays = []
+            for column in table:
+                missing = np.isnan(column.values) if column.form else None
+                arrays.append(pa.array(column.values, mask=missing))
+            batch = pa.table(arrays, names=names).replace_schema_metadata({"ghpt": notes})
             writer = writer or pq.ParquetWriter(handle, batch.schema)
             writer.write_table(batch)
         if writer is not None:

@@ -48,7 +48,9 @@ class Cameras:
         return camera_centre(self.R, self.t)
 
     def relative_pose(
-        self, reference: int, target: int | slice
+        self,
+        reference: int,
+        target: int | slice,
     ) -> tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"]]:
         """Return R and t of ``x_target = R x_reference + t``.
 
@@ -203,7 +205,8 @@ _CALIBRATE = (
 
 
 def project(
-    cameras: Cameras, points: Float[Tensor, "*B J 3"]
+    cameras: Cameras,
+    points: Float[Tensor, "*B J 3"],
 ) -> tuple[Float[Tensor, "*B V J 2"], Float[Tensor, "*B V J"]]:
     """Return pixels and depths (mm) of world points in every view.
 

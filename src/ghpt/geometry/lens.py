@@ -98,7 +98,8 @@ def _pad(coefficients: Float[Tensor, "*B C"]) -> Float[Tensor, "*B 1 8"]:
 
 
 def _normalise(
-    pixels: Float[Tensor, "*B N 2"], K: Float[Tensor, "*B 3 3"]
+    pixels: Float[Tensor, "*B N 2"],
+    K: Float[Tensor, "*B 3 3"],
 ) -> Float[Tensor, "*B N 2"]:
     K = K.double()[..., None, :, :]
     x, y = (pixels.double() - K[..., :2, 2]).unbind(-1)
@@ -108,7 +109,8 @@ def _normalise(
 
 
 def _to_pixels(
-    point: Float[Tensor, "*B N 2"], K: Float[Tensor, "*B 3 3"]
+    point: Float[Tensor, "*B N 2"],
+    K: Float[Tensor, "*B 3 3"],
 ) -> Float[Tensor, "*B N 2"]:
     K = K.double()
     principal_point = K[..., None, :2, 2]
@@ -139,7 +141,8 @@ class _Jacobian:
 
 
 def _apply_lens(
-    point: Float[Tensor, "*B N 2"], lens: Float[Tensor, "*B 1 8"]
+    point: Float[Tensor, "*B N 2"],
+    lens: Float[Tensor, "*B 1 8"],
 ) -> tuple[Float[Tensor, "*B N 2"], _Jacobian]:
     """Return the distorted points and the Jacobian."""
     k1, k2, p1, p2, k3, k4, k5, k6 = lens.unbind(-1)
@@ -164,7 +167,8 @@ def _apply_lens(
 
 
 def _clamp_radius(
-    point: Float[Tensor, "*B N 2"], limit: Float[Tensor, "*B 1"]
+    point: Float[Tensor, "*B N 2"],
+    limit: Float[Tensor, "*B 1"],
 ) -> Float[Tensor, "*B N 2"]:
     """Pull points back onto the circle of radius ``limit``, where the lens folds the image over."""
     radius = vector_norm(point, dim=-1)

@@ -6,7 +6,9 @@ from torch import Tensor
 
 
 def where(
-    mask: Bool[Tensor, "*B"], value: Tensor, fallback: Tensor | float
+    mask: Bool[Tensor, "*B"],
+    value: Tensor,
+    fallback: Tensor | float,
 ) -> Shaped[Tensor, "..."]:
     """Return ``value`` where ``mask`` holds and ``fallback`` elsewhere.
 

@@ -55,7 +55,8 @@ def valid_cameras(cameras: Cameras) -> Bool[Tensor, "*B V"]:
 
 
 def valid_key_points(
-    cameras: Cameras, key_points: Float[Tensor, "*B V J 2"]
+    cameras: Cameras,
+    key_points: Float[Tensor, "*B V J 2"],
 ) -> Bool[Tensor, "*B V J"]:
     """Return which key points can be triangulated: finite, not absurd, and of a valid camera."""
     bounded = (key_points.abs() <= LARGEST).all(-1)
@@ -63,7 +64,8 @@ def valid_key_points(
 
 
 def local_cameras(
-    cameras: Cameras, valid: Bool[Tensor, "*B V"] | None = None
+    cameras: Cameras,
+    valid: Bool[Tensor, "*B V"] | None = None,
 ) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
     """Return float64 cameras in a world whose origin is the rig's median centre, and that origin.
 
@@ -121,7 +123,9 @@ class ViewComponents:
 
 
 def view_components(
-    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], valid: Bool[Tensor, "V J B"]
+    cameras: Cameras,
+    key_points: Float[Tensor, "B V J 2"],
+    valid: Bool[Tensor, "V J B"],
 ) -> ViewComponents:
     """Return the components of cameras and key points.
 
@@ -163,7 +167,8 @@ def form_equations(a: Sequence[Tensor], b: Sequence[Tensor]) -> Float[Tensor, "V
 
 
 def weighted_sum(
-    equations: Float[Tensor, "V E ..."], weights: Float[Tensor, "V ..."]
+    equations: Float[Tensor, "V E ..."],
+    weights: Float[Tensor, "V ..."],
 ) -> Float[Tensor, "E ..."]:
     """Return the sum over the views, in their order.
 
@@ -176,7 +181,9 @@ def weighted_sum(
 
 
 def view_equations(
-    cameras: Cameras, key_points: Float[Tensor, "B V J 2"], valid: Bool[Tensor, "B V J"]
+    cameras: Cameras,
+    key_points: Float[Tensor, "B V J 2"],
+    valid: Bool[Tensor, "B V J"],
 ) -> Float[Tensor, "B V J 9"]:
     """Return the normal equations of each view alone, float64; all 0 where a key point is invalid.
 

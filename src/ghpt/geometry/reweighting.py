@@ -168,7 +168,9 @@ def _move_origin(row: Row, origin: Float[Tensor, "3 J B"]) -> Row:
 
 
 def _weights(
-    rows: Float[Tensor, "V 13 N"], offset: Float[Tensor, "3 N"], weigh: Weigh
+    rows: Float[Tensor, "V 13 N"],
+    offset: Float[Tensor, "3 N"],
+    weigh: Weigh,
 ) -> Float[Tensor, "V N"]:
     ax, ay, az, right_a, bx, by, bz, right_b, rx, ry, rz, depth, square = rows.unbind(1)
     x, y, z = offset

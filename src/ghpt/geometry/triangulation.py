@@ -194,7 +194,8 @@ class System:
         self.length = torch.linalg.vector_norm(t, dim=-1)
 
     def solve(
-        self, weight: Float[Tensor, "V J B"]
+        self,
+        weight: Float[Tensor, "V J B"],
     ) -> tuple[Float[Tensor, "3 J B"], Float[Tensor, "J B"]]:
         """Return the solution in the local world and tr(M) tr(M^-1).
 
@@ -322,7 +323,9 @@ def _rays(cameras: Cameras, views: ViewComponents) -> list[Float[Tensor, "V J B"
 
 
 def _share_centre(
-    cameras: Cameras, distance: Float[Tensor, "V 1 B"], used: Bool[Tensor, "V J B"]
+    cameras: Cameras,
+    distance: Float[Tensor, "V 1 B"],
+    used: Bool[Tensor, "V J B"],
 ) -> Bool[Tensor, "J B"]:
     """Return whether the used cameras have one and the same centre.
 
@@ -375,7 +378,8 @@ def triangulate_subsets(
 
 
 def _look_up(
-    solver: _SubsetSolver, subsets: Bool[Tensor, "B H J V"]
+    solver: _SubsetSolver,
+    subsets: Bool[Tensor, "B H J V"],
 ) -> tuple[Float[Tensor, "B H J 3"], Bool[Tensor, "B H J"]]:
     """Solve each of the 2^V subsets once and return the solutions of these."""
     views = subsets.shape[-1]
@@ -399,7 +403,8 @@ class _SubsetSolver:
     valid: Bool[Tensor, "B J V"]
 
     def solve(
-        self, subsets: Bool[Tensor, "B H J V"]
+        self,
+        subsets: Bool[Tensor, "B H J V"],
     ) -> tuple[Float[Tensor, "B H J 3"], Bool[Tensor, "B H J"]]:
         chosen = subsets.permute(0, 2, 3, 1).contiguous()
         summed = self.equations.mT @ chosen.double()

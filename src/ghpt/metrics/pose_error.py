@@ -44,7 +44,7 @@ def joint_errors(
 
 
 class PoseErrors(NamedTuple):
-    """What ``MPJPE`` computes: means over all measured joint-frames, mm; NaN where there is none."""
+    """What ``MPJPE`` computes: means over all measured joint-frames, mm, NaN for none."""
 
     mean: Float[Tensor, ""]
     six_joints: Float[Tensor, ""]

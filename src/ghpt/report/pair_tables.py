@@ -207,13 +207,13 @@ def _median_table(metrics: Metrics, error: str) -> Table:
     """Return the medians of an error of every name on every pair, and their means."""
 
     def cell(numbers: Mapping[str, Any]) -> str:
-        return _short(_scaled(error, numbers[error]))
+        return _short(_in_unit(error, numbers[error]))
 
     selections = metrics["selections"]
     table = _error_table(metrics, {name: _cells(metrics, name, cell) for name in selections})
     if len(pair_order(metrics)) > MANY:
         return table
-    means = [_short(_scaled(error, numbers[error])) for numbers in selections.values()]
+    means = [_short(_in_unit(error, numbers[error])) for numbers in selections.values()]
     rows = [[*row, mean] for row, mean in zip(table.rows, means, strict=True)]
     return Table([*table.header, "mean"], rows)
 
@@ -222,8 +222,8 @@ def _mean_table(metrics: Metrics, error: str) -> Table:
     """Return means and deviations of an error of every name on every pair."""
 
     def cell(numbers: Mapping[str, Any]) -> str:
-        mean = _short(_scaled(error, numbers["mean"][error]))
-        deviation = _short(_scaled(error, numbers["deviation"][error]))
+        mean = _short(_in_unit(error, numbers["mean"][error]))
+        deviation = _short(_in_unit(error, numbers["deviation"][error]))
         return f"{mean} ± {deviation}"
 
     cells = {name: _cells(metrics, name, cell) for name in metrics["selections"]}
@@ -256,13 +256,13 @@ def _worst_first(metrics: Metrics, name: str) -> list[str]:
 
 
 def _beside_paper(error: str, value: float | None, paper: float | None) -> str:
-    ours = _short(_scaled(error, value))
+    ours = _short(_in_unit(error, value))
     if paper is None:
         return ours
     return f"{ours} ({_as_printed(1000 * paper if error == 'E_R' else paper)})"
 
 
-def _scaled(error: str, value: float | None) -> float | None:
+def _in_unit(error: str, value: float | None) -> float | None:
     """Return an error in its unit of ``UNITS``."""
     if value is None:
         return None

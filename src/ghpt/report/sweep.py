@@ -35,7 +35,7 @@ class Statistics:
     median: float
 
     @classmethod
-    def of(cls, values: Sequence[float]) -> Statistics:
+    def from_values(cls, values: Sequence[float]) -> Statistics:
         """Return the statistics of some repeats."""
         array = np.array(values, dtype=np.float64)
         if not len(array):
@@ -77,7 +77,7 @@ def frames_sweep(sweep: Sweep, heading: str) -> Figure:
 def _draw_method(axes: Axes, name: str, by_frames: Mapping[int, Sequence[float]]) -> None:
     style = METHOD_STYLES.get(name, OTHER_STYLE)
     frames = sorted(by_frames)
-    statistics = [Statistics.of(by_frames[m]) for m in frames]
+    statistics = [Statistics.from_values(by_frames[m]) for m in frames]
     mean = np.array([of_frames.mean for of_frames in statistics])
     deviation = np.array([of_frames.deviation for of_frames in statistics])
     low = _clip(mean - deviation)
@@ -121,7 +121,7 @@ def sweep_table(sweep: Sweep) -> Table:
 def _cell(values: Sequence[float]) -> str:
     if not len(values):
         return NONE
-    statistics = Statistics.of(values)
+    statistics = Statistics.from_values(values)
     mean = _number(statistics.mean)
     deviation = _number(statistics.deviation)
     return f"{mean} ± {deviation} ({_number(statistics.median)})"
@@ -140,7 +140,7 @@ def pairs_table(sweeps: Mapping[str, Sweep], methods: Sequence[str]) -> Table:
     for m in _all_frames(sweeps.values()):
         cells = []
         for sweep in sweeps.values():
-            medians = [Statistics.of(sweep[method][m]).median for method in methods]
+            medians = [Statistics.from_values(sweep[method][m]).median for method in methods]
             best = all(medians[0] < other for other in medians[1:])
             numbers = " / ".join(map(_number, medians))
             cells.append(numbers if best else f"{numbers} *")
@@ -153,6 +153,8 @@ def count_wins(sweeps: Iterable[Sweep], ours: str, other: str, statistic: Statis
     count = 0
     for sweep in sweeps:
         for m, values in sweep[ours].items():
-            won = statistic(Statistics.of(values)) < statistic(Statistics.of(sweep[other][m]))
+            won = statistic(Statistics.from_values(values)) < statistic(
+                Statistics.from_values(sweep[other][m])
+            )
             count += won
     return count

@@ -28,18 +28,18 @@ def print_document(document: Document, console: Console | None = None) -> None:
     """Print the document to ``console``, by default to standard output."""
     console = console or Console()
     if document.title:
-        console.print(styled(document.title, "bold"), soft_wrap=True)
+        console.print(style_text(document.title, "bold"), soft_wrap=True)
     for block in document.blocks:
         _print_block(block, console)
 
 
-def styled(text: Text, style: str = "") -> rich.text.Text:
+def style_text(text: Text, style: str = "") -> rich.text.Text:
     """Return the text for the terminal, in which ``[red]`` and ``:smile:`` are letters."""
-    parts = [(_shown(span), _style(span)) for span in spans(text)]
+    parts = [(_plain_span(span), _style(span)) for span in spans(text)]
     return rich.text.Text.assemble(*parts, style=style)
 
 
-def _shown(span: Span) -> str:
+def _plain_span(span: Span) -> str:
     return printable(span if isinstance(span, str) else span.text)
 
 
@@ -58,32 +58,32 @@ def _print_block(block: Block, console: Console) -> None:
         case Table():
             console.print(_table(block))
         case Heading(text):
-            console.print(styled(text, "bold"), soft_wrap=True)
+            console.print(style_text(text, "bold"), soft_wrap=True)
         case Paragraph(text):
-            console.print(styled(text), soft_wrap=True)
+            console.print(style_text(text), soft_wrap=True)
         case Bullets(items):
             for item in items:
-                console.print(styled(("- ", *spans(item))), soft_wrap=True)
+                console.print(style_text(("- ", *spans(item))), soft_wrap=True)
         case Figure(path, caption):
-            console.print(styled(f"{caption}: {path}"), soft_wrap=True)
+            console.print(style_text(f"{caption}: {path}"), soft_wrap=True)
         case CodeBlock(code, _, summary):
             if summary:
-                console.print(styled(f"{summary}:"), soft_wrap=True)
+                console.print(style_text(f"{summary}:"), soft_wrap=True)
             for line in code.splitlines():
-                console.print(styled(line), soft_wrap=True)
+                console.print(style_text(line), soft_wrap=True)
 
 
 def _table(table: Table) -> rich.table.Table:
-    lines = [styled(line, "table.caption") for line in table.caption]
+    lines = [style_text(line, "table.caption") for line in table.caption]
     result = rich.table.Table(
-        title=styled(table.title, "table.title") if table.title else None,
+        title=style_text(table.title, "table.title") if table.title else None,
         caption=rich.text.Text("\n").join(lines) if lines else None,
         title_justify="left",
         caption_justify="left",
     )
     for column, name in enumerate(table.header):
         left = column in table.left_columns
-        result.add_column(styled(name), justify="left" if left else "right")
+        result.add_column(style_text(name), justify="left" if left else "right")
     for number, row in enumerate(table.rows):
-        result.add_row(*map(styled, row), end_section=number in table.last_rows)
+        result.add_row(*map(style_text, row), end_section=number in table.last_rows)
     return result

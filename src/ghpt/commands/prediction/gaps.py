@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import re
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,12 +21,12 @@ from scipy.signal import butter, sosfiltfilt
 
 from ghpt.commands.prediction.shards import Shards
 from ghpt.errors import GhptConfigError, check
+from ghpt.export.stream import Chunks
 from ghpt.files import allocate
 from ghpt.reconstruction import Reconstruction, State
 
 _ORDER = 2
 """Of the filter in one direction; forwards and backwards it is twice that."""
-Chunks = Callable[[], Iterator[Reconstruction]]
 
 
 @dataclass(frozen=True)

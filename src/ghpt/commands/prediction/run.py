@@ -125,7 +125,7 @@ def predict_shards(
             with module.bar, told(trainer):
                 trainer.predict(module, return_predictions=False)
                 trainer.strategy.barrier()
-            shards.look()
+            shards.refresh()
         yield shards if first else None
 
 
@@ -136,7 +136,7 @@ def _report_stop(shards: Shards, first: bool) -> Iterator[None]:
         yield
     except BaseException:
         if first:
-            shards.look()
+            shards.refresh()
             total = len(shards)
             done = total - len(shards.missing())
             folder = display_path(shards.folder)

@@ -1,5 +1,6 @@
-"""A long reconstruction in parts of so many frames, each whole or absent, whatever kills the
-writer.
+"""A long reconstruction in parts of so many frames.
+
+Each part is whole or absent, whatever kills the writer.
 """
 
 from __future__ import annotations
@@ -66,8 +67,10 @@ class Shards:
             folder.mkdir(parents=True, exist_ok=True)
             self._lock = acquire(folder / "lock", "another prediction writes here")
             self._check_folder()
-        there = self._manifest()
-        self.kept = {shard: entry for shard, entry in there.items() if self._vouched(shard, entry)}
+        listed = self._manifest()
+        self.kept = {
+            shard: entry for shard, entry in listed.items() if self._is_intact(shard, entry)
+        }
         if clean:
             self._clean()
 
@@ -84,12 +87,11 @@ class Shards:
             self._lock.release()
         self._lock = None
 
-    def look(self) -> None:
+    def refresh(self) -> None:
         """Take in what other processes have written."""
-        there = self._manifest()
-        self.kept |= {
-            s: entry for s, entry in there.items() if s not in self.kept and self._vouched(s, entry)
-        }
+        for shard, entry in self._manifest().items():
+            if shard not in self.kept and self._is_intact(shard, entry):
+                self.kept[shard] = entry
 
     def missing(self) -> list[int]:
         """The shards that are not there yet."""
@@ -161,7 +163,7 @@ class Shards:
             lines = (self.folder / MANIFEST).read_bytes().split(b"\n")
         except FileNotFoundError:
             return {}
-        entries = [entry for line in lines if isinstance(entry := _parsed(line), dict)]
+        entries = [entry for line in lines if isinstance(entry := _parse(line), dict)]
         if not entries or entries[0] != self._header:
             _log.info("%s is of other key points, cameras or settings: starting anew.", self.folder)
             return {}
@@ -171,7 +173,7 @@ class Shards:
             if type(e.get("shard")) is int and 0 <= e["shard"] < len(self)
         }
 
-    def _vouched(self, shard: int, entry: dict[str, Any]) -> bool:
+    def _is_intact(self, shard: int, entry: dict[str, Any]) -> bool:
         path = self.path(shard)
         if not path.is_file() or path.stat().st_size != entry.get("bytes"):
             return False
@@ -193,7 +195,7 @@ def _line(entry: dict[str, Any]) -> bytes:
     return json.dumps(entry).encode() + b"\n"
 
 
-def _parsed(line: bytes) -> Any:
+def _parse(line: bytes) -> Any:
     try:
         return json.loads(line)
     except ValueError:

@@ -1,4 +1,4 @@
-"""The paper's five camera arrangements as DataModules, each from its synthetic or its real source."""
+"""The paper's five camera arrangements as DataModules, of their synthetic or real sources."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -26,49 +26,48 @@ class Synthetic(TypedDict):
 class _Arrangement(KeyPointDataModule):
     """The choice between the synthetic and the real source."""
 
+    name: str
+
     def __init__(self, cameras: Sequence[int], synthetic: Synthetic, **settings: Any) -> None:
         super().__init__(**settings)
-        check(
-            len(cameras) >= 2,
-            "data.cameras",
-            f"is {list(cameras)}",
-            "Triangulation needs at least 2 views.",
-        )
+        hint = "Triangulation needs at least 2 views."
+        check(len(cameras) >= 2, "data.cameras", f"is {list(cameras)}", hint)
         check_arguments(Detector, synthetic["detector"], "data.synthetic.detector")
         self.cameras = list(cameras)
         self.synthetic = synthetic
 
-    def _synthetic(self, split: str) -> Iterable[LabelledRecording]:
+    def _synthesize(self, split: str) -> Iterable[LabelledRecording]:
+        seed = self.synthetic["seed"]
         detector = Detector(**self.synthetic["detector"])
-        return synthetic_recordings(
-            self.name, split, self.synthetic["seed"], detector, self.cameras
-        )
+        return synthetic_recordings(self.name, split, seed, detector, self.cameras)
 
-    def _key(self, split: str, files: list[Path] | None, **more: Any) -> dict[str, Any]:
-        key = {
-            "name": f"{self.name}-{split}-{'real' if self.root else 'synthetic'}",
-            "cameras": self.cameras,
-        }
+    def _key(self, split: str, files: list[Path] | None) -> dict[str, Any]:
+        """Return what the recordings of a split depend on; ``files`` are those of a real source."""
+        source = "real" if self.root else "synthetic"
+        key = {"name": f"{self.name}-{split}-{source}", "cameras": self.cameras}
         if files is None:
-            return key | {"synthetic": self.synthetic, "made by": _made_by()}
-        return key | more | {"root": self.source, "files": file_stamps(files, self._root())}
+            return key | {"synthetic": self.synthetic, "made by": _synthesis_digest()}
+        return key | {"root": self.source, "files": file_stamps(files, self._root())}
 
     def _root(self) -> Path:
         root = Path(self.root or "").expanduser()
         if not root.is_dir():
-            raise GhptDataError(
-                root, "data.root", "there is no such folder", "Give the data set's folder, or none."
-            )
+            hint = "Give the data set's folder, or none."
+            raise GhptDataError(root, "data.root", "there is no such folder", hint)
         return root
 
 
-def _made_by() -> str:
-    """A hash of the files that make the synthetic recordings: whoever changes them need not clear a
-    cache.
+def _synthesis_digest() -> str:
+    """Return a hash of the files that make the synthetic recordings.
+
+    Whoever changes them need not clear a cache.
     """
     package = Path(__file__).parents[2]
-    digest = hashlib.sha256((package / "geometry" / "lens.py").read_bytes())
-    for path in sorted((package / "data" / "synthetic").iterdir()):
+    geometry = package / "geometry"
+    files = [geometry / "lens.py", geometry / "masking.py"]
+    files += sorted((package / "data" / "synthetic").iterdir())
+    digest = hashlib.sha256()
+    for path in files:
         if path.is_file():
             digest.update(path.read_bytes())
     return digest.hexdigest()
@@ -88,23 +87,22 @@ class Human36M(_Arrangement):
     def generate(self, split: str) -> Iterable[LabelledRecording]:
         if self.root is not None:
             return human36m_recordings(self._root(), split, self.cameras, self.damaged)
-        return (r for r in self._synthetic(split) if self.damaged or r.name not in DAMAGED)
+        recordings = self._synthesize(split)
+        return (r for r in recordings if self.damaged or r.name not in DAMAGED)
 
     def cache_key(self, split: str) -> dict[str, Any]:
-        return self._key(split, human36m_files(self._root(), split) if self.root else None) | {
-            "damaged": self.damaged
-        }
+        files = human36m_files(self._root(), split) if self.root else None
+        return self._key(split, files) | {"damaged": self.damaged}
 
 
 class Panoptic(_Arrangement):
     """CMU Panoptic Studio's HD cameras by number; each sequence 60/20/20 % in time."""
 
     def generate(self, split: str) -> Iterable[LabelledRecording]:
-        return (
-            panoptic_recordings(self._root(), self.cameras, split)
-            if self.root
-            else self._synthetic(split)
-        )
+        if self.root is not None:
+            return panoptic_recordings(self._root(), self.cameras, split)
+        return self._synthesize(split)
 
     def cache_key(self, split: str) -> dict[str, Any]:
-        return self._key(split, panoptic_files(self._root(), self.cameras) if self.root else None)
+        files = panoptic_files(self._root(), self.cameras) if self.root else None
+        return self._key(split, files)

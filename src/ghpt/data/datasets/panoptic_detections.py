@@ -1,4 +1,4 @@
-"""The user's 2D detections beside a Panoptic sequence: one file per camera, or the authors' array."""
+"""The user's 2D detections beside a Panoptic sequence: a file for each camera, or one array."""
 
 from __future__ import annotations
 

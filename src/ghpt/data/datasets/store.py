@@ -208,7 +208,8 @@ def write_store(
 
 
 def _write_fields(
-    folder: Path, recordings: Iterable[LabelledRecording]
+    folder: Path,
+    recordings: Iterable[LabelledRecording],
 ) -> tuple[list[RecordingEntry], dict[str, str]]:
     """Write the fields' files. Returns the recordings' entries and the files' SHA-256."""
     hashes = {field.name: hashlib.sha256() for field in FIELDS}
@@ -306,7 +307,8 @@ def _digest(manifest: Mapping[str, Any]) -> str:
 
 
 def _check_entry(
-    recording: LabelledRecording, previous: Sequence[RecordingEntry]
+    recording: LabelledRecording,
+    previous: Sequence[RecordingEntry],
 ) -> RecordingEntry:
     """Return the manifest's entry of a recording, checked against those already written."""
     views = len(recording.camera_names)

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Int
 
 from ghpt.data.datasets.detections import uncrop
-from ghpt.data.formats.validate import check_view_count, read_json, read_npy
+from ghpt.data.formats.validate import check_view_count, finite_points, read_json, read_npy
 from ghpt.data.people.detections import Detections, joints_for
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
+_FARTHEST = 1e6
+"""Pixels."""
 _LAYOUT = (
     "A folder must hold all_2d_preds.npy and all_bboxes.npy, "
     "or all_2d_preds<n>.npy and all_bboxes<n>.npy."
@@ -32,70 +36,90 @@ def read_authors(path: Path, skeleton: str | None) -> Detections:
     folder = path if path.is_dir() else path.parent
     pixels: list[np.ndarray] = []
     there: list[np.ndarray] = []
-    for predictions, boxes in _chunks(folder, path):
-        crop = read_npy(predictions, (None, None, None, 2), "f")
-        check_view_count(predictions, crop.shape[1])
-        if not boxes.is_file():
-            raise GhptDataError(
-                boxes, "", "there is no such file: the predictions are in pixels of a crop", _LAYOUT
-            )
-        corners = read_npy(boxes, (*crop.shape[:2], 2, 2), "fiu").astype(np.float64)
-        if pixels and crop.shape[1:] != pixels[0].shape[1:]:
-            problem = (
-                f"has {crop.shape[1]} views of {crop.shape[2]} joints, the chunks before others"
-            )
-            raise GhptDataError(predictions, "", problem, "Keep the chunks of one rig in a folder.")
-        with np.errstate(over="ignore", invalid="ignore"):
-            found, valid = uncrop(crop.astype(np.float64), corners)
+    for chunk in _chunks(folder, path):
+        found, valid = _read_chunk(chunk)
+        if pixels and found.shape[1:] != pixels[0].shape[1:]:
+            _, views, count, _ = found.shape
+            problem = f"has {views} views of {count} joints, the chunks before others"
+            hint = "Keep the chunks of one rig in a folder."
+            raise GhptDataError(chunk.predictions, "", problem, hint)
         pixels.append(found)
-        there.append(valid & np.isfinite(found).all(-1))
+        there.append(valid)
     valid = np.concatenate(there)
     points = np.where(valid[..., None], np.concatenate(pixels), 0)
-    if (np.abs(points) >= 1e6).any():
-        raise GhptDataError(path, "", "holds a number beyond 1e6", "Detect again; check the boxes.")
+    if (np.abs(points) >= _FARTHEST).any():
+        hint = "Detect again; check the boxes."
+        raise GhptDataError(path, "", "holds a number beyond 1e6", hint)
     frames, views, count, _ = points.shape
-    frame = np.arange(frames)
-    if (folder / "all_frames.npy").is_file():
-        frame = read_npy(folder / "all_frames.npy", (frames,), "iu").astype(np.int64)
-    if not frames or (np.diff(frame) <= 0).any():
-        raise GhptDataError(
-            folder, "all_frames.npy", "is empty, or does not rise", "Number the frames in order."
-        )
-    names = _names(folder, views)
+    names = _view_names(folder, views)
     joints = joints_for(path, skeleton or "human36m", count)
     key_points = KeyPoints(points, valid.astype(np.float64), valid)
+    frame = _frame_numbers(folder, frames)
     return Detections.of_person(path, names, joints, frame, key_points)
 
 
-def _chunks(folder: Path, path: Path) -> list[tuple[Path, Path]]:
-    numbered = {
-        int(m[1])
-        for f in folder.iterdir()
-        if (m := re.fullmatch(r"all_2d_preds(\d{1,6})\.npy", f.name))
-    }
+@dataclass(frozen=True)
+class _Chunk:
+    """Files that belong together."""
+
+    predictions: Path
+    boxes: Path
+
+
+def _chunks(folder: Path, path: Path) -> list[_Chunk]:
+    """Return the chunks of a folder in order, or the one of a file. Raises GhptDataError."""
     if path.is_file():
-        if not (match := re.fullmatch(r"all_2d_preds(\d*)\.npy", path.name)):
+        match = re.fullmatch(r"all_2d_preds(\d*)\.npy", path.name)
+        if not match:
             raise GhptDataError(path, "", "is no file of predictions", _LAYOUT)
-        return [(path, folder / f"all_bboxes{match[1]}.npy")]
-    if not numbered:
-        return [(folder / "all_2d_preds.npy", folder / "all_bboxes.npy")]
-    for number in range(max(numbered)):
-        if number not in numbered:
-            raise GhptDataError(
-                folder / f"all_2d_preds{number}.npy", "", "there is no such file", _LAYOUT
-            )
-    return [
-        (folder / f"all_2d_preds{n}.npy", folder / f"all_bboxes{n}.npy") for n in sorted(numbered)
-    ]
+        return [_Chunk(path, folder / f"all_bboxes{match[1]}.npy")]
+    numbers = set()
+    for file in folder.iterdir():
+        match = re.fullmatch(r"all_2d_preds(\d{1,6})\.npy", file.name)
+        if match:
+            numbers.add(int(match[1]))
+    if not numbers:
+        return [_Chunk(folder / "all_2d_preds.npy", folder / "all_bboxes.npy")]
+    chunks = []
+    for number in range(max(numbers) + 1):
+        predictions = folder / f"all_2d_preds{number}.npy"
+        if number not in numbers:
+            raise GhptDataError(predictions, "", "there is no such file", _LAYOUT)
+        chunks.append(_Chunk(predictions, folder / f"all_bboxes{number}.npy"))
+    return chunks
 
 
-def _names(folder: Path, views: int) -> tuple[str, ...]:
+def _read_chunk(chunk: _Chunk) -> tuple[np.ndarray, np.ndarray]:
+    """Return the image pixels [T V K 2] of a chunk, and which are valid."""
+    crop = read_npy(chunk.predictions, (None, None, None, 2), "f")
+    check_view_count(chunk.predictions, crop.shape[1])
+    if not chunk.boxes.is_file():
+        problem = "there is no such file: the predictions are in pixels of a crop"
+        raise GhptDataError(chunk.boxes, "", problem, _LAYOUT)
+    corners = read_npy(chunk.boxes, (*crop.shape[:2], 2, 2), "fiu")
+    with np.errstate(over="ignore", invalid="ignore"):
+        pixels, valid = uncrop(crop.astype(np.float64), corners.astype(np.float64))
+    return pixels, valid & finite_points(pixels)
+
+
+def _frame_numbers(folder: Path, count: int) -> Int[np.ndarray, " T"]:
+    file = folder / "all_frames.npy"
+    frame = np.arange(count)
+    if file.is_file():
+        frame = read_npy(file, (count,), "iu").astype(np.int64)
+    if not count or (np.diff(frame) <= 0).any():
+        problem = "is empty, or does not rise"
+        raise GhptDataError(folder, "all_frames.npy", problem, "Number the frames in order.")
+    return frame
+
+
+def _view_names(folder: Path, views: int) -> tuple[str, ...]:
     file = folder / "all_cameras.json"
     if not file.is_file():
         return tuple(f"cam_{view}" for view in range(views))
-    names = read_json(file)
-    if not isinstance(names, list) or len(names) != views or len({*map(str, names)}) != views:
-        raise GhptDataError(
-            file, "", f"is not a list of {views} different names", 'Write ["00_03", "00_06", ...].'
-        )
-    return tuple(map(str, names))
+    listed = read_json(file)
+    names = tuple(map(str, listed)) if isinstance(listed, list) else ()
+    if len(names) != views or len(set(names)) != views:
+        problem = f"is not a list of {views} different names"
+        raise GhptDataError(file, "", problem, 'Write ["00_03", "00_06", ...].')
+    return names

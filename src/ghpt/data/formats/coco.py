@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter, defaultdict
+from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -22,8 +23,18 @@ from ghpt.data.people.detections import (
 )
 from ghpt.errors import GhptDataError
 
+_MOST_DIGITS = 15
+"""Of a frame number."""
 _HINT = 'It must be a list of {"image_id": 12, "keypoints": [x, y, score, ...], "score": 0.9}.'
-_Found = list[tuple[int, Float[np.ndarray, "K 3"]]]
+
+
+@dataclass
+class _View:
+    """What the images of one view hold, in any order."""
+
+    frames: list[int] = field(default_factory=list)
+    people: list[tuple[int, Float[np.ndarray, "K 3"]]] = field(default_factory=list)
+    """Each person's frame number and joints."""
 
 
 def read_coco(path: Path, skeleton: str | None) -> Detections:
@@ -37,16 +48,17 @@ def read_coco(path: Path, skeleton: str | None) -> Detections:
     files = json_files(path)
     found: list[Detections] = []
     for file in files:
-        views, frames = _views(file, named=path.is_dir())
-        found += [sort_people(file, view, frames[view], views[view]) for view in sorted(frames)]
+        views = _views(file, named=path.is_dir())
+        for name in sorted(views):
+            found.append(sort_people(file, name, views[name].frames, views[name].people))
     counts = {view.points.valid.shape[1] for view in found if len(view)}
     if skeleton is None and counts == {len(SKELETONS["coco_17"])}:
         skeleton = "coco_17"
     return merge_views(path, found, skeleton)
 
 
-def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[int]]]:
-    """Return each view's people as (frame number, joints), and the numbers of its frames."""
+def _views(file: Path, named: bool) -> dict[str, _View]:
+    """Return what each view holds; ``named``: the file is one view and has its name."""
     content = read_json(file)
     whole = content if isinstance(content, dict) else {"annotations": content}
     images = _objects(file, "images", whole.get("images", []))
@@ -54,25 +66,29 @@ def _views(file: Path, named: bool) -> tuple[dict[str, _Found], dict[str, list[i
     counts = Counter(_key(person.get("image_id")) for person in people)
     check_people(file, "annotations", max(counts.values(), default=0))
     names = {_key(image.get("id")): image.get("file_name") for image in images}
-    views: dict[str, _Found] = defaultdict(list)
-    frames: dict[str, list[int]] = defaultdict(list)
-    for image_id, name in names.items():
+    views: dict[str, _View] = defaultdict(_View)
+    places: dict[int | str | None, tuple[str, int]] = {}
+
+    def find(image_id: int | str | None) -> tuple[str, int]:
+        """Return the view and the frame number of an image, and note the frame."""
+        name = names.get(image_id)
         view, frame = _image(file, name if isinstance(name, str) else image_id, named)
-        frames[view].append(frame)
-    check_view_count(file, len(frames))
-    places: dict[Any, tuple[str, int]] = {}
+        views[view].frames.append(frame)
+        return view, frame
+
+    for image_id in names:
+        find(image_id)
+    check_view_count(file, len(views))
     for index, person in enumerate(people):
         image_id = _key(person.get("image_id"))
         if image_id not in places:
-            name = names.get(image_id)
-            places[image_id] = _image(file, name if isinstance(name, str) else image_id, named)
-            frames[places[image_id][0]].append(places[image_id][1])
-            check_view_count(file, len(frames))
+            places[image_id] = find(image_id)
+            check_view_count(file, len(views))
         joints = joint_values(file, f"[{index}].keypoints", person.get("keypoints"))
         if len(joints):
             view, frame = places[image_id]
-            views[view].append((frame, joints))
-    return views, frames
+            views[view].people.append((frame, joints))
+    return views
 
 
 def _objects(file: Path, field: str, listed: object) -> list[dict[str, Any]]:
@@ -87,13 +103,13 @@ def _key(image_id: Any) -> int | str | None:
 
 def _image(file: Path, image: int | str | None, named: bool) -> tuple[str, int]:
     """Return the view and the frame number of an image's name or number."""
-    if isinstance(image, str) and image.isdigit() and len(image) <= 15:
+    if isinstance(image, str) and image.isdigit() and len(image) <= _MOST_DIGITS:
         image = int(image)
-    if isinstance(image, int) and 0 <= image < 10**15:
+    if isinstance(image, int) and 0 <= image < 10**_MOST_DIGITS:
         return view_name(file), image
     name = PurePosixPath(image.replace("\\", "/")) if isinstance(image, str) else PurePosixPath()
     digits = list(re.finditer(r"\d+", name.stem))
-    if not digits or len(digits[-1][0]) > 15:
+    if not digits or len(digits[-1][0]) > _MOST_DIGITS:
         problem = f"{image!r} has no frame number"
         if image is None:
             problem = "an image has neither number nor name"

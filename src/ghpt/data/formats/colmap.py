@@ -9,7 +9,6 @@ import io
 import math
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
@@ -18,6 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from ghpt.data.formats.camera_entry import CameraEntry
 from ghpt.data.formats.validate import MOST_VIEWS, check_view_count, open_input
 from ghpt.errors import GhptDataError
 from ghpt.geometry.rotations import quaternion_to_matrix
@@ -47,27 +47,13 @@ class Image(NamedTuple):
     camera: int
 
 
-@dataclass(frozen=True)
-class ColmapCamera:
-    """One camera of a rig, in the model's own unit of length."""
-
-    name: str
-    other: str
-    K: Float[np.ndarray, "3 3"]
-    distortion: Float[np.ndarray, " 5"]
-    size: tuple[int, int]
-    R: Float[np.ndarray, "3 3"]
-    t: Float[np.ndarray, " 3"]
-
-
 def is_colmap(folder: Path) -> bool:
-    """Whether a folder holds a model."""
+    """Return whether a folder holds a model."""
     return any((folder / f"images.{end}").is_file() for end in ("bin", "txt"))
 
 
-def read_colmap(folder: Path) -> list[ColmapCamera]:
-    """The cameras of a folder with cameras and images as .bin or .txt, in the order of the images'
-    names.
+def read_colmap(folder: Path) -> list[CameraEntry]:
+    """Return the cameras of a folder with cameras and images as .bin or .txt, by the images' names.
 
     An image's camera is called as the image, without its ending; where images are called alike
     (``cam1/0001.png``, ``cam2/0001.png``), as their folders. COLMAP's first pixel has its centre at
@@ -99,12 +85,17 @@ def read_colmap(folder: Path) -> list[ColmapCamera]:
                 image_file, f"image {image.name}", f"there is no camera {image.camera}", _HINT
             )
         model, size, parameters = cameras[image.camera]
-        K, lens = _intrinsics(camera_file, name, model, parameters)
-        rig.append(
-            ColmapCamera(
-                name, other, K, lens, size, _rotation(image_file, image), np.array(image.t)
-            )
+        K, distortion = _intrinsics(camera_file, name, model, parameters)
+        entry = CameraEntry(
+            name=name,
+            other_name=other,
+            K=K,
+            distortion=distortion,
+            size=list(size),
+            R=_rotation(image_file, image),
+            t=np.array(image.t),
         )
+        rig.append(entry)
     return rig
 
 

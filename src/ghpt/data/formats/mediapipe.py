@@ -26,9 +26,11 @@ _MOST_PORTS = 1000
 _WRITE = "It must be an xy_*.csv that caliscope wrote."
 _JOINTS = len(SKELETONS["mediapipe_33"])
 
+_LARGEST_NUMBER = 1e12
+
 
 def opening(start: bytes) -> str:
-    """The text that a file begins with, whatever its encoding's mark says (UTF-8 without one)."""
+    """Return the text that a file begins with; without an encoding's mark it is UTF-8."""
     marks = (
         (codecs.BOM_UTF8, "utf-8"),
         (codecs.BOM_UTF16_LE, "utf-16-le"),
@@ -41,11 +43,13 @@ def opening(start: bytes) -> str:
 
 
 def is_caliscope(text: str) -> bool:
-    """Whether a file that starts so is one of caliscope's 2D tables, its columns parted by commas
-    or not.
+    """Return whether a file that starts so is one of caliscope's 2D tables.
+
+    Its columns may be parted by commas or not.
     """
     header = text.splitlines()[0] if text else ""
-    return set(COLUMNS) <= {name.strip().strip('"') for name in re.split("[,;\t]", header)}
+    names = {name.strip().strip('"') for name in re.split("[,;\t]", header)}
+    return set(COLUMNS) <= names
 
 
 def read_caliscope(path: Path) -> Detections:
@@ -56,25 +60,26 @@ def read_caliscope(path: Path) -> Detections:
     point twice.
     """
     table = _table(path)
-    body = (table[:, 2] >= 0) & (table[:, 2] < _JOINTS)
+    landmark = table[:, 2]
+    body = (landmark >= 0) & (landmark < _JOINTS)
     table = table[body & np.isfinite(table).all(1)]
     if not len(table):
-        raise GhptDataError(path, "point_id", f"has no body landmark (0 to {_JOINTS - 1})", _WRITE)
-    index = table[:, :3].astype(np.int64)
-    frames, row = np.unique(index[:, 0], return_inverse=True)
-    ports, view = np.unique(index[:, 1], return_inverse=True)
+        problem = f"has no body landmark (0 to {_JOINTS - 1})"
+        raise GhptDataError(path, "point_id", problem, _WRITE)
+    frame, port, joint = table[:, :3].astype(np.int64).T
+    frames, row = np.unique(frame, return_inverse=True)
+    ports, view = np.unique(port, return_inverse=True)
     if len(ports) > _MOST_PORTS:
         raise GhptDataError(path, "port", f"names {len(ports)} cameras", _WRITE)
-    place = (row * len(ports) + view) * _JOINTS + index[:, 2]
-    if len(np.unique(place)) != len(place):
-        raise GhptDataError(
-            path, "point_id", "a point is there twice in a frame of a camera", _WRITE
-        )
+    cell = (row * len(ports) + view) * _JOINTS + joint
+    if len(np.unique(cell)) != len(cell):
+        problem = "a point is there twice in a frame of a camera"
+        raise GhptDataError(path, "point_id", problem, _WRITE)
     shape = (len(frames), len(ports), _JOINTS)
     points = np.zeros((*shape, 2))
     valid = np.zeros(shape, np.bool_)
-    points.reshape(-1, 2)[place] = table[:, 3:5]
-    valid.reshape(-1)[place] = True
+    points.reshape(-1, 2)[cell] = table[:, 3:5]
+    valid.reshape(-1)[cell] = True
     views = tuple(f"cam_{port}" for port in ports)
     key_points = KeyPoints(points, valid.astype(np.float64), valid)
     return Detections.of_person(path, views, SKELETONS["mediapipe_33"], frames, key_points)
@@ -88,17 +93,17 @@ def _table(path: Path) -> Float[np.ndarray, "N 5"]:
         encoding = "utf-16" if utf16 else "utf-8-sig"
         raw.seek(-min(2, path.stat().st_size), 2)
         if not raw.read().strip(b"\0").endswith((b"\n", b"\r")):
-            raise GhptDataError(
-                path, "", "ends in the middle of a line: it is truncated", "Copy it again."
-            )
+            problem = "ends in the middle of a line: it is truncated"
+            raise GhptDataError(path, "", problem, "Copy it again.")
         raw.seek(0)
         with io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline="") as handle:
             table = _rows(path, handle)
-    whole = table[:, :3][np.isfinite(table[:, :3])]
-    if not (np.abs(np.nan_to_num(table)) < 1e12).all() or (whole != np.round(whole)).any():
-        raise GhptDataError(
-            path, "", "holds an index that is not whole, or a number beyond 1e12", _WRITE
-        )
+    index = table[:, :3]
+    index = index[np.isfinite(index)]
+    whole = (index == np.round(index)).all()
+    if not whole or not (np.abs(np.nan_to_num(table)) < _LARGEST_NUMBER).all():
+        problem = "holds an index that is not whole, or a number beyond 1e12"
+        raise GhptDataError(path, "", problem, _WRITE)
     return table
 
 

@@ -42,36 +42,38 @@ class _Loader(_Base):
 
 
 def read_yml(path: Path) -> dict[str, Node | None]:
-    """Key -> matrix, number, text or list of texts. Raises GhptDataError for a file that is too
-    large or damaged.
+    """Return what each key holds: a matrix, a number, a text or a list of texts.
+
+    Raises GhptDataError for a file that is too large or damaged.
     """
     with open_input(path) as handle:
         data = handle.read(_LARGEST + 1)
     if len(data) > _LARGEST:
         raise GhptDataError(path, "", f"has more than {_LARGEST >> 10} KiB", _HINT)
     if not data.endswith((b"\n", b"\r")):
-        raise GhptDataError(
-            path, "", "ends in the middle of a line: it is truncated", "Copy it again."
-        )
-    characters = np.frombuffer(data, np.uint8)
-    deeper, higher = (np.isin(characters, list(signs)).astype(np.int32) for signs in (b"[{", b"]}"))
-    if np.cumsum(deeper - higher).max(initial=0) > _DEEPEST or _INDENTED.search(data):
+        problem = "ends in the middle of a line: it is truncated"
+        raise GhptDataError(path, "", problem, "Copy it again.")
+    if _depth(data) > _DEEPEST or _INDENTED.search(data):
         raise GhptDataError(path, "", f"has more than {_DEEPEST} lists in lists", _HINT)
+    lines = data.removeprefix(codecs.BOM_UTF8).splitlines()
     # %YAML:1.0 is no directive of YAML's
-    body = b"\n".join(
-        line
-        for line in data.removeprefix(codecs.BOM_UTF8).splitlines()
-        if not line.startswith(b"%")
-    )
+    body = b"\n".join(line for line in lines if not line.startswith(b"%"))
     try:
         content = yaml.load(body.decode(), Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise GhptDataError(
-            path, "", f"is not valid yml ({' '.join(str(error).split())})", _HINT
-        ) from error
+        reason = " ".join(str(error).split())
+        raise GhptDataError(path, "", f"is not valid yml ({reason})", _HINT) from error
     if not isinstance(content, dict):
         raise GhptDataError(path, "", "holds no keys", _HINT)
     return {str(key): _node(path, str(key), value) for key, value in content.items()}
+
+
+def _depth(data: bytes) -> int:
+    """Return how many brackets are open at once."""
+    characters = np.frombuffer(data, np.uint8)
+    opened = np.isin(characters, list(b"[{")).astype(np.int32)
+    closed = np.isin(characters, list(b"]}")).astype(np.int32)
+    return int(np.cumsum(opened - closed).max(initial=0))
 
 
 def _node(path: Path, key: str, value: Any) -> Node | None:

@@ -14,6 +14,7 @@ from jaxtyping import Int
 
 from ghpt.data.formats.skeletons import recognise
 from ghpt.data.formats.validate import (
+    Shape,
     check_view_count,
     finite_points,
     frame_rate,
@@ -62,54 +63,65 @@ def read_own(path: Path, skeleton: str | None) -> Detections:
 
     Raises GhptDataError.
     """
-    there = _members(path)
-    for field in ("key_points", "views"):
-        if field not in there:
-            raise GhptDataError(
-                path, field, "is missing", "See docs/calibration.md for what the file holds."
-            )
-    if "members" in there and there - {"members"} != {*_texts(path, "members")}:
-        raise GhptDataError(
-            path, "members", "are others than when it was written", "Write it again."
-        )
-    values = read_npz(path, {"key_points": ((None, None, None, 2), "f")})["key_points"].astype(
-        np.float64
-    )
-    frames, count_views, count, _ = values.shape
-    check_view_count(path, count_views)
-    shape = (frames, count_views, count)
-    forms = {
+    members = _members(path)
+    _check_members(path, members)
+    pixels = read_npz(path, {"key_points": ((None, None, None, 2), "f")})["key_points"]
+    pixels = pixels.astype(np.float64)
+    frames, view_count, joint_count, _ = pixels.shape
+    check_view_count(path, view_count)
+    arrays = _read_optional(path, members, pixels.shape[:3])
+    finite = finite_points(pixels)
+    valid = finite & arrays.get("seen", finite)
+    pixels = np.where(valid[..., None], pixels, 0)
+    views = _texts(path, "views")
+    check_names(path, "views", views, view_count)
+    if skeleton is None and "skeleton" in members:
+        skeleton = _texts(path, "skeleton")[0]
+    if skeleton is None and "joints" in members:
+        joints = _texts(path, "joints")
+    else:
+        people = pixels.reshape(-1, joint_count, 2)
+        name = skeleton or recognise(path, people, valid.reshape(-1, joint_count))
+        joints = joints_for(path, name, joint_count)
+    check_names(path, "joints", joints, joint_count)
+    confidence = arrays.get("confidence", np.ones(valid.shape)).astype(np.float64)
+    confidence = np.nan_to_num(confidence).clip(0, 1)
+    frame = arrays.get("frame", np.arange(frames)).astype(np.int64)
+    if not frames or (np.diff(frame) <= 0).any():
+        problem = "is empty, or does not rise"
+        raise GhptDataError(path, "frame", problem, "Number the frames in order.")
+    rate = arrays.get("rate_hz")
+    rate_hz = None if rate is None else frame_rate(path, float(rate))
+    points = KeyPoints(pixels, np.where(valid, confidence, 0), valid)
+    return Detections.of_person(path, views, joints, frame, points, rate_hz)
+
+
+def check_names(path: Path, field: str, names: tuple[str, ...], expected: int) -> None:
+    """Raise GhptDataError unless there are so many names, all different."""
+    if len(names) != expected or len(set(names)) != len(names):
+        problem = f"names {len(names)} for {expected} of key_points, or one twice"
+        raise GhptDataError(path, field, problem, "Give each a name of its own.")
+
+
+def _read_optional(path: Path, members: set[str], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+    """Return the arrays that a file may lack, of these frames, views and joints."""
+    forms: dict[str, tuple[Shape, str]] = {
         "confidence": (shape, "f"),
         "seen": (shape, "b"),
-        "frame": ((frames,), "iu"),
+        "frame": (shape[:1], "iu"),
         "rate_hz": ((), "fiu"),
     }
-    more = read_npz(path, {field: form for field, form in forms.items() if field in there})
-    views = _texts(path, "views")
-    if skeleton is None and "skeleton" in there:
-        skeleton = _texts(path, "skeleton")[0]
-    joints = _texts(path, "joints") if skeleton is None and "joints" in there else ()
-    finite = finite_points(values)
-    valid = finite & more.get("seen", finite)
-    values = np.where(valid[..., None], values, 0)
-    joints = joints or joints_for(
-        path,
-        skeleton or recognise(path, values.reshape(-1, count, 2), valid.reshape(-1, count)),
-        count,
-    )
-    for field, names, expected in (("views", views, count_views), ("joints", joints, count)):
-        if len(names) != expected or len(set(names)) != len(names):
-            problem = f"names {len(names)} for {expected} of key_points, or one twice"
-            raise GhptDataError(path, field, problem, "Give each a name of its own.")
-    confidence = np.nan_to_num(more.get("confidence", np.ones(shape)).astype(np.float64)).clip(0, 1)
-    frame = more.get("frame", np.arange(frames)).astype(np.int64)
-    if not frames or (np.diff(frame) <= 0).any():
-        raise GhptDataError(
-            path, "frame", "is empty, or does not rise", "Number the frames in order."
-        )
-    rate = frame_rate(path, float(more["rate_hz"])) if "rate_hz" in more else None
-    points = KeyPoints(values, np.where(valid, confidence, 0), valid)
-    return Detections.of_person(path, views, joints, frame, points, rate)
+    return read_npz(path, {field: form for field, form in forms.items() if field in members})
+
+
+def _check_members(path: Path, members: set[str]) -> None:
+    for field in ("key_points", "views"):
+        if field not in members:
+            hint = "See docs/calibration.md for what the file holds."
+            raise GhptDataError(path, field, "is missing", hint)
+    if "members" in members and members - {"members"} != {*_texts(path, "members")}:
+        problem = "are others than when it was written"
+        raise GhptDataError(path, "members", problem, "Write it again.")
 
 
 _DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError)

@@ -112,8 +112,9 @@ def joints_of(where: object, skeleton: str) -> tuple[str, ...]:
 
 
 def parts_of(where: object, joints: Sequence[str]) -> list[tuple[str, ...]]:
-    """For each of the 17 joints the detector's joints whose mean it is; () where the detector has
-    none.
+    """Return for each of the 17 joints the detector's joints whose mean it is.
+
+    It is () where the detector has none.
 
     Raises GhptDataError if a detector's joint is there twice or fewer than 8 of the 17 joints can
     be had.
@@ -165,15 +166,17 @@ def joints17(where: object, joints: Sequence[str], points: KeyPoints) -> KeyPoin
 def recognise(
     where: object, key_points: Float[np.ndarray, "N K 2"], valid: Bool[np.ndarray, "N K"]
 ) -> str:
-    """The name of the skeleton of N people: of those with K joints the one whose bones are shortest
-    in the images.
+    """Return the name of the skeleton of N people.
+
+    Of those with K joints it is the one whose bones are shortest in the images.
 
     Raises GhptDataError if none has K joints, or if two of them are as good.
     """
-    choices = [name for name, joints in SKELETONS.items() if len(joints) == key_points.shape[1]]
+    count = key_points.shape[1]
+    choices = [name for name, joints in SKELETONS.items() if len(joints) == count]
     if not choices:
         known = ", ".join(f"{name} ({len(joints)})" for name, joints in SKELETONS.items())
-        problem = f"no known skeleton has {key_points.shape[1]} joints"
+        problem = f"no known skeleton has {count} joints"
         raise GhptDataError(where, "skeleton", problem, f"Known: {known}.")
     if len(choices) == 1:
         return choices[0]
@@ -181,22 +184,22 @@ def recognise(
     (shortest, name) = lengths[0]
     (second, other) = lengths[1]
     if not shortest < _CLEARLY * second:
-        problem = f"it may be {name} or {other}: both have {key_points.shape[1]} joints"
+        problem = f"it may be {name} or {other}: both have {count} joints"
         raise GhptDataError(where, "skeleton", problem, f"Name it: skeleton={name}.")
     return name
 
 
 def _bone_length(joints: tuple[str, ...], key_points: np.ndarray, valid: np.ndarray) -> float:
-    """Mean over the bones of their median length, pixels; inf if none is ever seen."""
-    bones = [[joints.index(a), joints.index(b)] for a, b in _BONES if a in joints and b in joints]
-    a, b = np.array(bones).T
-    length = np.where(
-        valid[:, a] & valid[:, b],
-        np.linalg.norm(key_points[:, a] - key_points[:, b], axis=-1),
-        np.nan,
-    )
+    """Return the mean over the bones of their median length, pixels; inf if none is ever valid."""
+    bones = [(a, b) for a, b in _BONES if a in joints and b in joints]
+    starts = [joints.index(a) for a, _ in bones]
+    ends = [joints.index(b) for _, b in bones]
+    length = np.linalg.norm(key_points[:, starts] - key_points[:, ends], axis=-1)
+    length = np.where(valid[:, starts] & valid[:, ends], length, np.nan)
     measured = ~np.isnan(length).all(0)
-    return float(np.nanmedian(length[:, measured], axis=0).mean()) if measured.any() else np.inf
+    if not measured.any():
+        return np.inf
+    return float(np.nanmedian(length[:, measured], axis=0).mean())
 
 
 _OTHER_WORDS = {
@@ -212,22 +215,27 @@ _OTHER_WORDS = {
 
 
 def canonical(names: Sequence[str]) -> tuple[str, ...]:
-    """A file's own names of joints in the words of ``SKELETONS``: ``Left Elbow``, ``LElbow`` and
-    ``leftElbow`` are ``left_elbow``; what is not known stays as it is. MMPose's ``h36m`` calls the
-    nose the base of the neck.
+    """Return a file's own names of joints in the words of ``SKELETONS``.
+
+    ``Left Elbow``, ``LElbow`` and ``leftElbow`` are ``left_elbow``; what is not known stays as it
+    is. MMPose's ``h36m`` calls the nose the base of the neck.
     """
     found = tuple(_canonical(name) for name in names)
-    return tuple(
-        "nose" if name == "neck" and "thorax" in found and "nose" not in found else name
-        for name in found
-    )
+    if "thorax" in found and "nose" not in found:
+        return tuple("nose" if name == "neck" else name for name in found)
+    return found
 
 
 def _canonical(name: str) -> str:
-    word = re.sub(r"(?<=[a-z])(?=[A-Z])|(?<=^[LR])(?=[A-Z][a-z])|[ .-]+", "_", name.strip()).lower()
-    word = re.sub(r"^l_", "left_", re.sub(r"^r_", "right_", word))
-    word = re.sub(r"^(.+)_(left|right|l|r)$", lambda m: f"{_SIDES.get(m[2], m[2])}_{m[1]}", word)
+    word = _WORD_BORDER.sub("_", name.strip()).lower()
+    word = re.sub(r"^r_", "right_", word)
+    word = re.sub(r"^l_", "left_", word)
+    side_last = re.fullmatch(r"(.+)_(left|right|l|r)", word)
+    if side_last:
+        part, side = side_last.groups()
+        word = f"{_SIDES.get(side, side)}_{part}"
     return _OTHER_WORDS.get(word, word)
 
 
 _SIDES = {"l": "left", "r": "right"}
+_WORD_BORDER = re.compile(r"(?<=[a-z])(?=[A-Z])|(?<=^[LR])(?=[A-Z][a-z])|[ .-]+")

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from ghpt.data.formats.names import Name
+from ghpt.data.formats.own_npz import check_names
 from ghpt.data.formats.skeletons import joints17, recognise
 from ghpt.data.formats.stored_npz import Member, members_of, read_rows, text_table
 from ghpt.data.formats.validate import check_view_count, finite_points, frame_rate
@@ -133,8 +134,8 @@ def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -
         written = next(iter(texts.get("skeleton", ())), None)
         name = skeleton or written or _recognise(file, joint_count)
         joints = joints_for(path, name, joint_count)
-    _check_names(path, "views", views, view_count)
-    _check_names(path, "joints", joints, joint_count)
+    check_names(path, "views", views, view_count)
+    check_names(path, "joints", joints, joint_count)
     if (np.diff(frame) <= 0).any():
         raise GhptDataError(path, "frame", "does not rise", "Number the frames in order.")
     file = replace(file, joints=joints)
@@ -200,9 +201,3 @@ def _check_views(file: StoredFile) -> None:
     for view in np.flatnonzero(~valid):
         hint = "Detect this view again, or leave it out."
         raise GhptDataError(file.path, f"view {file.views[view]}", "has no key point", hint)
-
-
-def _check_names(path: Path, field: str, names: tuple[str, ...], expected: int) -> None:
-    if len(names) != expected or len(set(names)) != len(names):
-        problem = f"names {len(names)} for {expected} of key_points, or one twice"
-        raise GhptDataError(path, field, problem, "Give each a name of its own.")

@@ -383,7 +383,7 @@ def _inside_image(
     size: np.ndarray,
 ) -> Bool[np.ndarray, "T J"]:
     inside = (pixels >= -0.5) & (pixels <= size - 0.5)
-    return inside.all(axis=-1)
+    return np.logical_and(inside[..., 0], inside[..., 1])
 
 
 def _mirror_sides(bias: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:

@@ -49,7 +49,8 @@ def _bell(
 
 
 def _leg_flexion(
-    body: Body, phase: Float[np.ndarray, " T"]
+    body: Body,
+    phase: Float[np.ndarray, " T"],
 ) -> tuple[Float[np.ndarray, " T"], Float[np.ndarray, " T"]]:
     """Return the flexion of thigh and shank, ``phase`` strides after the heel strike.
 

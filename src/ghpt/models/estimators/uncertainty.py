@@ -36,8 +36,8 @@ class UncertaintyModel:
     """Covariance = noise variance x (sum over the used views of J^T J / scale^2)^-1 + shared^2.
 
     J is the derivative of the view's pixels by the position, ``scale`` the person's in the view
-    (``person_scale``). ``noise``: deviation of a pixel coordinate as a fraction of the scale;
-    null: each batch's own (``pooled_noise``). A joint's own residuals count as their 2 V - 3 degrees of
+    (``person_scale``). ``noise``: deviation of a pixel coordinate as a fraction of the scale; null:
+    each batch's own (``pooled_noise``). A joint's own residuals count as their 2 V - 3 degrees of
     freedom, the pooled noise as ``prior``: few views say little about their noise. ``shared``:
     deviation (mm) of what all views have in common, and no residual shows: where a detector takes
     the joint to be.
@@ -46,8 +46,8 @@ class UncertaintyModel:
     synthetic Human3.6M lie within the ellipsoids of 50, 90 and 95 % for people that the detector
     was trained on (too cautious), 49, 88 and 93 % for others. On synthetic Panoptic, whose joints
     are defined 19 mm elsewhere, 18, 48 and 55 %: there shared = 11 fits. Views are taken to be
-    weighted by ``scale``^-2, as linear triangulation and so adaptive RANSAC weights them where focal
-    lengths are equal.
+    weighted by ``scale``^-2, as linear triangulation and so adaptive RANSAC weights them where
+    focal lengths are equal.
     """
 
     noise: float | None

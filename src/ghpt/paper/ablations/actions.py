@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ghpt.config import build
+from ghpt.config import Target, build, settings
 from ghpt.data.datasets.frames import Frames
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE
@@ -28,22 +28,34 @@ class PoolSetting:
     temperature: float | None = None
 
 
+@dataclass(frozen=True)
+class PoolsSettings:
+    """The settings of `measure_pools`."""
+
+    splits: Mapping[str, Target]
+    """A DataModule by a split's name."""
+    pools: Sequence[PoolSetting]
+    seed: int
+    files: Mapping[str, Any] = field(default_factory=dict)
+    """What identifies the files of a real data set."""
+
+
 @torch.no_grad()
 def measure_pools(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
-    """Test the model of the dependency ``model`` on each of ``splits`` with each of ``pools``.
+    """Test the model of the dependency ``model`` on each split with each pool.
 
-    ``splits`` holds a DataModule by a split's name, ``pools`` holds `PoolSetting`s. result.json:
-    split -> for each pool, selection -> pelvis-relative MPJPE (mm). A smaller pool is the beginning
-    of a larger one, the same that test.py draws with so many hypotheses.
+    See `PoolsSettings`. result.json: split -> for each pool, selection -> pelvis-relative MPJPE
+    (mm). A smaller pool is the beginning of a larger one, the same that test.py draws with so many
+    hypotheses.
     """
-    model, _ = load_model(dependencies["model"] / LAST, seed=config["seed"])
+    own = settings(PoolsSettings, config)
+    model, _ = load_model(dependencies["model"] / LAST, seed=own.seed)
     model.eval()
-    pools = [PoolSetting(**pool) for pool in config["pools"]]
     result = {}
-    for name, settings in config["splits"].items():
-        data = build(settings, "data")
+    for name, split in own.splits.items():
+        data = build(split, "data")
         data.setup("test")
-        result[name] = measure_frames(model, data.frames["test"], pools, data.batch_size)
+        result[name] = measure_frames(model, data.frames["test"], own.pools, data.batch_size)
     write_json(folder / "result.json", result)
 
 

@@ -16,7 +16,15 @@ from ghpt.paper.ablations.tasks import (
     read_error,
     train_variant,
 )
-from ghpt.paper.engine.artefact import Claim, Number, Results, Section, Spread, figure_block, signed
+from ghpt.paper.engine.artefact import (
+    Claim,
+    Number,
+    Results,
+    Section,
+    Spread,
+    figure_block,
+    format_signed,
+)
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
 from ghpt.paper.robustness.figure import LABELS, Line, Panel, draw_curves
@@ -67,9 +75,9 @@ class Defaults:
     samples: int
 
     @classmethod
-    def of(cls, setup: Setup) -> Defaults:
+    def from_setup(cls, setup: Setup) -> Defaults:
         """Return the defaults in a setup's configuration of training."""
-        config = setup.trained(BASE).config
+        config = setup.training(BASE).config
         model = config["model"]
         samples = config["data"]["train_samples"]
         return cls(float(model["temperature"]), model["hypotheses"], samples)
@@ -77,12 +85,12 @@ class Defaults:
 
 def temperature_tasks(setup: Setup) -> dict[str, Task]:
     """Return models trained with each temperature, and the default's tested with each."""
-    default = Defaults.of(setup).temperature
+    default = Defaults.from_setup(setup).temperature
     values = _temperatures(setup)
     pools = [PoolSetting(temperature=value) for value in values]
     trainings = {DEFAULT: BASE, **{data: data for data in _novel(setup)}}
     tasks = {
-        name: evaluate_model(setup, setup.trained(data), pools) for name, data in trainings.items()
+        name: evaluate_model(setup, setup.training(data), pools) for name, data in trainings.items()
     }
     for value in values:
         if value != default:
@@ -93,7 +101,7 @@ def temperature_tasks(setup: Setup) -> dict[str, Task]:
 
 
 def _temperatures(setup: Setup) -> list[float]:
-    return sorted({*setup.sizes.ablation.temperature, Defaults.of(setup).temperature})
+    return sorted({*setup.sizes.ablation.temperature, Defaults.from_setup(setup).temperature})
 
 
 def _novel(setup: Setup) -> Sequence[str]:
@@ -104,7 +112,7 @@ def _novel(setup: Setup) -> Sequence[str]:
 def temperature(results: Results) -> Section:
     """Return the section of the temperature."""
     setup = results.setup
-    default = Defaults.of(setup).temperature
+    default = Defaults.from_setup(setup).temperature
     values = _temperatures(setup)
     trained = {value: Source(f"{value:g}", "weight") for value in values}
     trained[default] = Source(DEFAULT, "weight", values.index(default))
@@ -132,9 +140,9 @@ def _pool_sources(task: str, selection: str, values: Sequence[Number]) -> dict[N
 
 def hypotheses_tasks(setup: Setup) -> dict[str, Task]:
     """Return the default's model tested with each number, and models trained with some."""
-    default = Defaults.of(setup).hypotheses
+    default = Defaults.from_setup(setup).hypotheses
     pools = [PoolSetting(hypotheses=value) for value in _hypotheses(setup)]
-    tasks = {DEFAULT: evaluate_model(setup, setup.trained(BASE), pools, seconds=30.0)}
+    tasks = {DEFAULT: evaluate_model(setup, setup.training(BASE), pools, seconds=30.0)}
     for value in setup.sizes.ablation.hypotheses_trained:
         if value != default:
             model = train_variant(
@@ -149,13 +157,13 @@ def hypotheses_tasks(setup: Setup) -> dict[str, Task]:
 
 
 def _hypotheses(setup: Setup) -> list[int]:
-    return sorted({*setup.sizes.ablation.hypotheses, Defaults.of(setup).hypotheses})
+    return sorted({*setup.sizes.ablation.hypotheses, Defaults.from_setup(setup).hypotheses})
 
 
 def hypotheses(results: Results) -> Section:
     """Return the section of the number of hypotheses."""
     setup = results.setup
-    default = Defaults.of(setup).hypotheses
+    default = Defaults.from_setup(setup).hypotheses
     values = _hypotheses(setup)
     weight = f"learned, trained with {default}, tested with it"
     labels = {"weight": weight, "average": LABELS["average"], "best": LABELS["best"]}
@@ -176,9 +184,9 @@ def hypotheses(results: Results) -> Section:
 
 def samples_tasks(setup: Setup) -> dict[str, Task]:
     """Return models trained with each number of samples, in smaller pools."""
-    defaults = Defaults.of(setup)
+    defaults = Defaults.from_setup(setup)
     pool = setup.sizes.ablation.samples_hypotheses
-    tasks = {"model": setup.trained(BASE)}
+    tasks = {"model": setup.training(BASE)}
     for value in _samples(setup):
         overrides = [f"model.hypotheses={pool}"]
         name = f"hypotheses{pool}"
@@ -193,13 +201,13 @@ def samples_tasks(setup: Setup) -> dict[str, Task]:
 
 
 def _samples(setup: Setup) -> list[int]:
-    return sorted({*setup.sizes.ablation.samples, Defaults.of(setup).samples})
+    return sorted({*setup.sizes.ablation.samples, Defaults.from_setup(setup).samples})
 
 
 def samples(results: Results) -> Section:
     """Return the section of the number of training samples."""
     setup = results.setup
-    defaults = Defaults.of(setup)
+    defaults = Defaults.from_setup(setup)
     values = _samples(setup)
     pool = setup.sizes.ablation.samples_hypotheses
     lines = {}
@@ -221,7 +229,7 @@ def _enough_claim(results: Results, values: Sequence[int], default: int) -> Clai
     """Return what appendix C says of the number of samples."""
     errors = {value: read_error(results, f"{value}", "test").mean for value in values}
     best = min(errors, key=errors.__getitem__)
-    gain = signed(100 * (errors[best] / errors[default] - 1))
+    gain = format_signed(100 * (errors[best] / errors[default] - 1))
     tested = ", ".join(f"{value:g}" for value in values)
     return Claim(
         "best results with only 500 samples (held if within 1 % of the best)",
@@ -301,8 +309,8 @@ def _choice(errors: Mapping[str, Errors], default: Number) -> str:
     validation = {value: error.mean for value, error in errors["validation"]["weight"].items()}
     test = {value: error.mean for value, error in errors["test"]["weight"].items()}
     best = min(validation, key=validation.__getitem__)
-    gain = signed(100 * (validation[best] / validation[default] - 1))
-    worth = signed(100 * (test[best] / test[default] - 1))
+    gain = format_signed(100 * (validation[best] / validation[default] - 1))
+    worth = format_signed(100 * (test[best] / test[default] - 1))
     if validation[best] > (1 - CHANCE) * validation[default]:
         least = "" if best == default else f" (the least error is at {best:g}, {gain} %)"
         return f"Validation keeps the default, {default:g}{least}. {NOTE}"

@@ -18,7 +18,7 @@ from ghpt.paper.ablations.tasks import (
     read_error,
     train_variant,
 )
-from ghpt.paper.engine.artefact import Artefact, Results, Section, Spread, signed
+from ghpt.paper.engine.artefact import Artefact, Results, Section, Spread, format_signed
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
 from ghpt.report.document import Paragraph, Table
@@ -53,7 +53,7 @@ def _tasks(setup: Setup, variants: Variants) -> dict[str, Task]:
 
 def _train(setup: Setup, data: str, experiment: str) -> Task:
     if not experiment:
-        return setup.trained(data)
+        return setup.training(data)
     return train_variant(setup, data, f"experiment={experiment}", name=experiment)
 
 
@@ -100,7 +100,7 @@ def _changes(errors: Sequence[Spread], default: Sequence[Spread]) -> str:
     """Return the changes against the default in each column."""
     pairs = zip(errors, default, strict=True)
     changes = [100 * (error.mean / usual.mean - 1) for error, usual in pairs]
-    return ", ".join(f"{signed(change)} %" for change in changes)
+    return ", ".join(f"{format_signed(change)} %" for change in changes)
 
 
 def _training(label: str, title: str, variants: Variants, about: str) -> Artefact:

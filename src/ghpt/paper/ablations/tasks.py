@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict
 
-from ghpt.paper.ablations.actions import PoolSetting
+from ghpt.paper.ablations.actions import PoolSetting, PoolsSettings
 from ghpt.paper.engine.artefact import Results, Spread
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
@@ -28,7 +28,7 @@ def train_variant(
 ) -> Task:
     """Return the training of a model with other settings than the default."""
     stride = f"data.stride={_SELDOM}"
-    return setup.trained(data, *overrides, stride, name=name, seconds=seconds)
+    return setup.training(data, *overrides, stride, name=name, seconds=seconds)
 
 
 def evaluate_model(
@@ -45,15 +45,13 @@ def evaluate_model(
     for split in splits:
         stride = f"data.stride={setup.sizes.ablation.stride[split]}"
         words = (*setup.overrides.test, f"data.evaluate={split}", stride)
-        whole = setup.composed("test", BASE, *words)
+        whole = setup.configuration("test", BASE, *words)
         data[split] = whole["data"]
         files = whole.get("files", {})
-        dependencies[split] = setup.prepared(BASE, split)
-    config = {"pools": [asdict(pool) for pool in pools], "seed": setup.seed, "splits": data}
-    if files:
-        config["files"] = files
+        dependencies[split] = setup.preparation(BASE, split)
+    config = PoolsSettings(data, list(pools), setup.seed, files)
     name = model.name.replace("train-pose", "ablation")
-    return Task(name, ACTION, config, dependencies, seconds=seconds)
+    return Task(name, ACTION, asdict(config), dependencies, seconds=seconds)
 
 
 def read_error(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from ghpt.models.relative_pose.evaluation import ALONE
-from ghpt.paper.camera.tasks import PAIRS, pair_error, scaled, tested_pairs
+from ghpt.paper.camera.tasks import PAIRS, pair_error, pair_tests, rescale
 from ghpt.paper.engine.artefact import (
     Artefact,
     Claim,
@@ -52,7 +52,7 @@ def _dissection(results: Results) -> Section:
             Comparison(
                 f"{pair} {error}, {part.replace('_', ' ')}",
                 printed[part][error],
-                scaled(pair_error(results, "weight", pair, part, error)),
+                rescale(pair_error(results, "weight", pair, part, error)),
             )
             for part in ALONE
             for error in ("E_2D", "E_3D")
@@ -124,6 +124,6 @@ DISSECTION = Artefact(
     "fundamental-dissection",
     "table",
     "Relative camera poses, one part estimated",
-    tested_pairs,
+    pair_tests,
     _dissection,
 )

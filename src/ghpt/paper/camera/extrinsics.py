@@ -6,7 +6,7 @@ One estimates extrinsics from draws of frames, the other the poses that they giv
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghpt.config import build, settings
+from ghpt.config import Target, build, settings
 from ghpt.data.datasets.frames import Frames
 from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.errors import GhptDataError
@@ -49,7 +49,7 @@ class StoredExtrinsics:
     """mm."""
 
     @classmethod
-    def of(cls, extrinsics: Extrinsics) -> StoredExtrinsics:
+    def from_extrinsics(cls, extrinsics: Extrinsics) -> StoredExtrinsics:
         R, t = extrinsics
         return cls(R.tolist(), t.tolist())
 
@@ -156,28 +156,47 @@ class WholeRig:
         return with_true_scale(rig.cameras, truth)
 
 
+@dataclass(frozen=True)
+class ExtrinsicsSettings:
+    """The settings of `estimate_extrinsics`."""
+
+    data: Target
+    source: str
+    """``weight``, the camera model of the dependency ``model``, ``rig``, or a classical name."""
+    frames: int
+    """Frames of a draw."""
+    draws: int
+    """Draws of each rig."""
+    seed: int
+    hypotheses: int | None
+    estimator: Target | None = None
+    """What estimates where the source is not ``weight``."""
+    scale: Target | None = None
+    """What gives the t of a pair its length where the source is a classical estimator."""
+    files: Mapping[str, Any] = field(default_factory=dict)
+    """What identifies the files of a real data set."""
+
+
 @torch.no_grad()
 def estimate_extrinsics(
     config: dict[str, Any], dependencies: dict[str, Path], folder: Path
 ) -> None:
-    """Estimate extrinsics from draws of frames of each rig; ``draws`` and ``frames`` say how many.
+    """Estimate extrinsics from draws of frames of each rig; see `ExtrinsicsSettings`.
 
-    They are estimated by ``source``: ``weight``, the camera model of the dependency ``model``;
-    ``rig``; or one of the pairs' classical estimators. What is not ``weight`` is built from
-    ``estimator``, and a pair's t gets its length from ``scale``. result.json: a list of `RigDraws`.
+    result.json: a list of `RigDraws`.
     """
-    draws = config["draws"]
-    data = build(config["data"], "data")
+    own = settings(ExtrinsicsSettings, config)
+    data = build(own.data, "data")
     recordings = data.recordings(data.evaluate)
-    pairs = Pairs(recordings, PairSettings(config["frames"], draws, 1), config["seed"])
+    pairs = Pairs(recordings, PairSettings(own.frames, own.draws, 1), own.seed)
     pairs.pairs = [pair for pair in pairs.pairs if pair[0] == 0]
-    estimator = _estimator(config, dependencies)
+    estimator = _build_estimator(own, dependencies)
     stored: list[list[StoredExtrinsics]] = [[] for _ in pairs.rigs]
-    for draw in range(len(pairs.rigs) * draws):
-        rig = draw // draws
+    for draw in range(len(pairs.rigs) * own.draws):
+        rig = draw // own.draws
         rows = range(draw * len(pairs.pairs), (draw + 1) * len(pairs.pairs))
         extrinsics = estimator(pairs[rows].observations, pairs.rigs[rig].cameras)
-        stored[rig].append(StoredExtrinsics.of(extrinsics))
+        stored[rig].append(StoredExtrinsics.from_extrinsics(extrinsics))
     rigs = [
         RigDraws(list(rig.recordings), of_rig)
         for rig, of_rig in zip(pairs.rigs, stored, strict=True)
@@ -185,40 +204,55 @@ def estimate_extrinsics(
     write_json(folder / "result.json", [asdict(rig) for rig in rigs])
 
 
-def _estimator(config: Mapping[str, Any], dependencies: Mapping[str, Path]) -> Estimator:
-    source = config["source"]
-    if source == "weight":
-        changes = {
-            "seed": config["seed"],
-            "hypotheses": config["hypotheses"],
-            "problem.frames": config["frames"],
+def _build_estimator(own: ExtrinsicsSettings, dependencies: Mapping[str, Path]) -> Estimator:
+    if own.source == "weight":
+        changes: dict[str, Any] = {
+            "seed": own.seed,
+            "hypotheses": own.hypotheses,
+            "problem.frames": own.frames,
         }
         return LearnedPairs(load_model(dependencies["model"] / LAST, **changes)[0].eval())
-    estimator = build(config["estimator"], "estimator")
-    if source == "rig":
+    estimator = build(own.estimator, "estimator")
+    if own.source == "rig":
         return WholeRig(estimator)
-    return ClassicalPairs(estimator, build(config["scale"], "scale"), source)
+    return ClassicalPairs(estimator, build(own.scale, "scale"), own.source)
+
+
+@dataclass(frozen=True)
+class PosesSettings:
+    """The settings of `poses_from_extrinsics`."""
+
+    data: Target
+    seed: int
+    hypotheses: int | None
+    parts: Sequence[str] = ()
+    """Which parts of the estimated extrinsics are tested, of ``PARTS``."""
+    files: Mapping[str, Any] = field(default_factory=dict)
+    """What identifies the files of a real data set."""
 
 
 def poses_from_extrinsics(
     config: dict[str, Any], dependencies: dict[str, Path], folder: Path
 ) -> None:
-    """Test the pose model of the dependency ``model`` with some ``parts`` of estimated extrinsics.
+    """Test the pose model of the dependency ``model`` with some parts of estimated extrinsics.
 
     They are those of the dependency ``extrinsics``; where there is none, the true ones are used.
     result.json: part of ``PARTS`` (or ``known``) -> kind -> MPJPE (mm) of ``weight``.
     """
-    changes = {"seed": config["seed"], "hypotheses": config["hypotheses"]}
+    own = settings(PosesSettings, config)
+    changes: dict[str, Any] = {"seed": own.seed, "hypotheses": own.hypotheses}
     model = load_model(dependencies["model"] / LAST, **changes)[0].eval()
-    data = build(config["data"], "data")
+    data = build(own.data, "data")
     data.setup("test")
     true_frames = data.frames["test"]
     frames = {"known": true_frames}
     if "extrinsics" in dependencies:
         contents = read_json(dependencies["extrinsics"] / "result.json")
         rigs = [settings(RigDraws, content) for content in contents]
-        frames = {part: through_draws(true_frames, rigs, part) for part in config["parts"]}
-    errors = {part: pose_errors(model, own, data.batch_size) for part, own in frames.items()}
+        frames = {part: through_draws(true_frames, rigs, part) for part in own.parts}
+    errors = {
+        part: pose_errors(model, of_part, data.batch_size) for part, of_part in frames.items()
+    }
     write_json(folder / "result.json", errors)
 
 

@@ -29,7 +29,7 @@ NAME = "comparison-to-8-point"
 
 def _tasks(setup: Setup) -> dict[str, Task]:
     size = setup.sizes.frames_sweep
-    whole = setup.composed("test", "h36m", *setup.overrides.test)
+    whole = setup.configuration("test", "h36m", *setup.overrides.test)
     baselines = {name: whole["camera_baselines"][name] for name in BASELINES}
     config = {
         **common_settings(whole),
@@ -39,7 +39,7 @@ def _tasks(setup: Setup) -> dict[str, Task]:
     }
     dependencies = {
         "model": camera_model(setup),
-        "data": setup.prepared("h36m", whole["data"]["evaluate"]),
+        "data": setup.preparation("h36m", whole["data"]["evaluate"]),
     }
     tasks = {}
     for frames in size.frames:
@@ -129,8 +129,8 @@ def _at_ends(sweep: Sweep, frames: Sequence[int], statistic: Statistic) -> str:
     """Return a statistic beside the 8-point algorithm's at the least and at the most frames."""
     parts = []
     for m in dict.fromkeys((frames[0], frames[-1])):
-        ours = statistic(Statistics.of(sweep["weight"][m]))
-        theirs = statistic(Statistics.of(sweep["eight_point"][m]))
+        ours = statistic(Statistics.from_values(sweep["weight"][m]))
+        theirs = statistic(Statistics.from_values(sweep["eight_point"][m]))
         sign = "<" if ours < theirs else "≥"
         parts.append(f"M = {m}: {ours:.1f} {sign} {theirs:.1f} mm")
     return "; ".join(parts)

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ghpt.config import build
+from ghpt.config import Target, build, settings
 from ghpt.files import write_json
 from ghpt.models.checkpoint import LAST, load_model
 from ghpt.models.collect import CollectPredictions
@@ -19,27 +20,49 @@ from ghpt.models.relative_pose.evaluation import errors_of_pair, pair_name
 from ghpt.models.relative_pose.schema import PAIRS
 
 
+@dataclass(frozen=True)
+class DrawsSettings:
+    """The settings of `errors_of_draws`."""
+
+    data: Target
+    camera_baselines: Mapping[str, Target]
+    frames: int
+    """Frames of a draw."""
+    draws: int
+    """Draws of each rig."""
+    pairs: Sequence[tuple[int, int]] | None
+    """Pairs of the views, counted from 1; None: all."""
+    seed: int
+    hypotheses: int | None
+    files: Mapping[str, Any] = field(default_factory=dict)
+    """What identifies the files of a real data set."""
+
+
 @torch.no_grad()
 def errors_of_draws(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
     """Test the camera model of the dependency ``model`` on draws of frames of each rig.
 
-    ``draws`` and ``frames`` say how many. ``pairs`` are those of the views, counted from 1; None:
-    all. result.json: pair -> selection or baseline -> E_3D (mm, null where a draw was not
-    estimated) of each draw; beside it predictions.npz.
+    See `DrawsSettings`. result.json: pair -> selection or baseline -> E_3D (mm, null where a draw
+    was not estimated) of each draw; beside it predictions.npz.
     """
-    changes = {"problem.frames": config["frames"], "problem.draws": config["draws"]}
-    changes |= {"seed": config["seed"], "hypotheses": config["hypotheses"]}
+    own = settings(DrawsSettings, config)
+    changes: dict[str, Any] = {
+        "problem.frames": own.frames,
+        "problem.draws": own.draws,
+        "seed": own.seed,
+        "hypotheses": own.hypotheses,
+    }
     model = load_model(dependencies["model"] / LAST, **changes)[0].eval()
-    data = build(config["data"], "data")
+    data = build(own.data, "data")
     data.bind(model.problem)
     data.setup("test")
     dataset = data.frames["test"]
     views = range(1, len(dataset.rigs[0].names) + 1)
-    chosen = config["pairs"] or combinations(views, 2)
+    chosen = own.pairs or combinations(views, 2)
     dataset.pairs = [(a - 1, b - 1) for a, b in chosen]
     origin = {"data": data.name, "source": data.source, "split": data.evaluate}
-    baselines = build(config["camera_baselines"], "camera_baselines")
-    meta = {**origin, "seed": config["seed"]}
+    baselines = build(own.camera_baselines, "camera_baselines")
+    meta = {**origin, "seed": own.seed}
     collect = CollectPredictions(folder, model.problem, baselines, meta)
     collect.open(dataset)
     for first in range(0, len(dataset), data.batch_size):

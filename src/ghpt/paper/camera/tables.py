@@ -12,7 +12,7 @@ from ghpt.models.predictions import open_predictions
 from ghpt.models.relative_pose import schema
 from ghpt.paper.camera.dissection import DISSECTION
 from ghpt.paper.camera.figures import SWEEP
-from ghpt.paper.camera.tasks import PAIRS, pair_error, scaled, tested_pairs
+from ghpt.paper.camera.tasks import PAIRS, pair_error, pair_tests, rescale
 from ghpt.paper.camera.unknown_extrinsics import UNKNOWN
 from ghpt.paper.engine.artefact import (
     Artefact,
@@ -114,7 +114,7 @@ def _fundamental(results: Results) -> Section:
 def _compare(results: Results, pair: str, printed: Mapping[str, float]) -> list[Comparison]:
     comparisons = []
     for error, column in COLUMNS.items():
-        ours = scaled(pair_error(results, "weight", pair, error), column.factor)
+        ours = rescale(pair_error(results, "weight", pair, error), column.factor)
         paper = column.factor * printed[error]
         comparisons.append(Comparison(f"{pair} {error}", paper, ours, digits=column.digits))
     return comparisons
@@ -218,7 +218,7 @@ ARTEFACTS = (
         "fundamental-evaluation",
         "table",
         "Relative camera poses on Human3.6M",
-        tested_pairs,
+        pair_tests,
         _fundamental,
     ),
     SWEEP,

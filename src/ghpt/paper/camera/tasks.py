@@ -17,7 +17,7 @@ PAIRS = tuple(f"{a}-{b}" for a, b in FUNDAMENTAL)
 
 def camera_model(setup: Setup) -> Task:
     """Return the training of the paper's model, on Human3.6M."""
-    return setup.trained("h36m", model="camera", seconds=100.0)
+    return setup.training("h36m", model="camera", seconds=100.0)
 
 
 def common_settings(composed: Mapping[str, Any]) -> dict[str, Any]:
@@ -26,10 +26,10 @@ def common_settings(composed: Mapping[str, Any]) -> dict[str, Any]:
     return {name: composed[name] for name in names if name in composed}
 
 
-def tested_pairs(setup: Setup) -> dict[str, Task]:
+def pair_tests(setup: Setup) -> dict[str, Task]:
     """Return the test of the camera model on Human3.6M with all classical estimators."""
     model = camera_model(setup)
-    return {"test": setup.tested(model, "h36m", f"frames={FUNDAMENTAL_FRAMES}", seconds=75.0)}
+    return {"test": setup.test(model, "h36m", f"frames={FUNDAMENTAL_FRAMES}", seconds=75.0)}
 
 
 def pair_error(results: Results, method: str, pair: str, *keys: str) -> Spread:
@@ -38,7 +38,7 @@ def pair_error(results: Results, method: str, pair: str, *keys: str) -> Spread:
     return Spread(tuple(math.inf if number is None else number for number in numbers))
 
 
-def scaled(spread: Spread, factor: float = 1.0) -> Spread | None:
+def rescale(spread: Spread, factor: float = 1.0) -> Spread | None:
     """Return the number in another unit, None where it is not finite."""
     if not math.isfinite(spread.mean):
         return None

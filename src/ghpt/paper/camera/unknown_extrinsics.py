@@ -12,8 +12,8 @@ from ghpt.paper.engine.artefact import (
     Section,
     Spread,
     comparison_rows,
+    format_signed,
     over_seeds,
-    signed,
 )
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
@@ -37,9 +37,9 @@ POSES = "ghpt.paper.camera.extrinsics.poses_from_extrinsics"
 
 def _tasks(setup: Setup) -> dict[str, Task]:
     stride = f"data.stride={setup.sizes.unknown_extrinsics.stride}"
-    whole = setup.composed("test", "h36m", *setup.overrides.test, stride)
+    whole = setup.configuration("test", "h36m", *setup.overrides.test, stride)
     config = common_settings(whole)
-    data = setup.prepared("h36m", whole["data"]["evaluate"])
+    data = setup.preparation("h36m", whole["data"]["evaluate"])
     baselines = whole["camera_baselines"]
     estimators = {"poselib": baselines["poselib"], "rig": baselines["rig"]["calibration"]}
     extrinsics = {"weight": _learned_extrinsics(setup, config, data)}
@@ -47,7 +47,7 @@ def _tasks(setup: Setup) -> dict[str, Task]:
         extrinsics[source] = _classical_extrinsics(setup, config, data, source, estimator)
     tasks = {}
     for trained in MODELS:
-        dependencies = {"model": setup.trained(trained), "data": data}
+        dependencies = {"model": setup.training(trained), "data": data}
         name = f"{trained}-seed{setup.seed}"
         tasks[trained] = Task(f"poses-known-{name}", POSES, config, dependencies, seconds=7.0)
         for source, estimated in extrinsics.items():
@@ -167,7 +167,7 @@ def _increases_table(results: Results) -> Table:
     rows = []
     for trained, name in MODELS.items():
         paper = UNKNOWN_EXTRINSICS[trained]
-        increase = signed(_paper_increase(trained, "both"))
+        increase = format_signed(_paper_increase(trained, "both"))
         both = f"{paper['both']} ({increase} %)"
         rows.append([f"{name}, the paper's pairs", str(paper["known"]), both, NONE, NONE])
         for source, how in SOURCES.items():
@@ -182,7 +182,7 @@ def _increase_cells(results: Results, trained: str, source: str) -> list[str]:
     for kind in KINDS:
         known = _error(results, trained, source, "known", kind).text()
         both = _error(results, trained, source, "both", kind).text()
-        increase = signed(_increase(results, trained, source, "both", kind).mean)
+        increase = format_signed(_increase(results, trained, source, "both", kind).mean)
         cells += [known, f"{both} ({increase} %)"]
     return cells
 
@@ -232,7 +232,7 @@ def _base_claim(results: Results) -> Claim:
 
 def _goal_claim(results: Results, trained: str) -> Claim:
     increase = _increase(results, trained, "weight", "both").mean
-    rig = signed(_increase(results, trained, "rig", "both").mean)
+    rig = format_signed(_increase(results, trained, "rig", "both").mean)
     paper = _paper_increase(trained, "both")
     goal = 100 * GOAL
     return Claim(
@@ -245,7 +245,7 @@ def _goal_claim(results: Results, trained: str) -> Claim:
 
 def _explanation(results: Results) -> str:
     increases = [_increase(results, trained, "rig", "both").mean for trained in MODELS]
-    rig = " and ".join(f"{signed(increase)} %" for increase in increases)
+    rig = " and ".join(f"{format_signed(increase)} %" for increase in increases)
     return (
         "Errors of an estimated rotation and translation make up for one another; with one of them "
         "from the truth they cannot (tab:fundamental-dissection). All views calibrated together "

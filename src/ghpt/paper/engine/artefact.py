@@ -45,7 +45,7 @@ class Spread:
         return mean if self.deviation is None else f"{mean} ± {self.deviation:.{digits}f}"
 
 
-def signed(value: float) -> str:
+def format_signed(value: float) -> str:
     """Return ``+1.2``, ``-0.4``, and ``+0.0`` for what rounds to nothing."""
     return f"{round(value, 1) + 0.0:+.1f}"
 
@@ -99,7 +99,7 @@ class Comparison:
         if self.difference is None:
             return [paper, ours, NONE]
         mark = " (miss)" if self.miss else ""
-        return [paper, ours, f"{signed(100 * self.difference)} %{mark}"]
+        return [paper, ours, f"{format_signed(100 * self.difference)} %{mark}"]
 
 
 def comparison_table(comparisons: Sequence[Comparison], head: str) -> Table:

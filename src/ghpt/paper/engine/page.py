@@ -21,7 +21,7 @@ from ghpt.paper.engine.artefact import (
     Comparison,
     Section,
     figure_path,
-    signed,
+    format_signed,
 )
 from ghpt.report.document import (
     Block,
@@ -221,7 +221,7 @@ def _summary_row(entry: Entry) -> list[Text]:
     return [
         Link(entry.label, entry.label),
         str(len(comparisons)) if comparisons else NONE,
-        f"{signed(100 * statistics.median(differences))} %" if differences else NONE,
+        f"{format_signed(100 * statistics.median(differences))} %" if differences else NONE,
         str(len(entry.misses)) if comparisons else NONE,
         f"{held} of {len(claims)}" if claims else NONE,
     ]

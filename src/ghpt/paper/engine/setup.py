@@ -63,7 +63,7 @@ class Setup:
         folder = [] if root is None else [shell_override("data.root", root)]
         return (f"data={data}", *folder, f"seed={self.seed}", *overrides)
 
-    def composed(self, name: str, data: str, *overrides: str) -> dict[str, Any]:
+    def configuration(self, name: str, data: str, *overrides: str) -> dict[str, Any]:
         """Return a command's whole configuration, and of real data what identifies the files."""
         config = compose(self.conf, name, self.words(data, "trainer.devices=1", *overrides))
         unused = ("output", "progress_bar")
@@ -75,15 +75,15 @@ class Setup:
             return {}
         return {"files": _cache_keys(self.conf, self.words(data))}
 
-    def prepared(self, data: str, split: str) -> Task:
+    def preparation(self, data: str, split: str) -> Task:
         """Return the task that has the recordings of a split in the cache."""
-        settings = self.composed("test", data)["data"]
+        settings = self.configuration("test", data)["data"]
         # Settings that do not change the recordings have one value, so that seeds share them.
         shared = settings | {"seed": 0, "evaluate": "test", "stride": 64}
         config = {"data": shared, "split": split} | self._identity(data)
         return Task(f"prepare-{data}-{split}", PREPARATION, config, seconds=8.0)
 
-    def trained(
+    def training(
         self, data: str, *overrides: str, name: str = "", model: str = "pose", seconds: float = 30.0
     ) -> Task:
         """Return the training of a model on a data set.
@@ -91,13 +91,13 @@ class Setup:
         ``overrides`` are those of train.py; ``name`` tells trainings with different ones apart.
         """
         words = (f"model={model}", *self.overrides.train, *overrides)
-        config = _without(self.composed("train", data, *words), ("save_every", "resume"))
-        dependencies = {split: self.prepared(data, split) for split in ("train", "validation")}
-        name = _joined("train", model, data, name, f"seed{self.seed}")
+        config = _without(self.configuration("train", data, *words), ("save_every", "resume"))
+        dependencies = {split: self.preparation(data, split) for split in ("train", "validation")}
+        name = _join("train", model, data, name, f"seed{self.seed}")
         command = _command("train.py", *self.words(data), *words, f"output={_folder(name)}")
         return Task(name, TRAINING, config, dependencies, command, seconds)
 
-    def tested(
+    def test(
         self,
         model: Task,
         data: str,
@@ -107,13 +107,13 @@ class Setup:
         view_weights: bool = True,
         seconds: float | None = None,
     ) -> Task:
-        """Return the test of the model of a `trained` task on a data set.
+        """Return the test of the model of a `training` task on a data set.
 
         ``overrides`` are those of test.py. ``baselines`` False leaves the classical estimators out,
         ``view_weights`` False the learned view weights.
         """
         overrides = (*self.overrides.test, *overrides)
-        config = self.composed("test", data, *overrides)
+        config = self.configuration("test", data, *overrides)
         of_pairs = "frames" in model.config["model"]["problem"]
         unused = ("baselines", "view_weights") if of_pairs else ("camera_baselines",)
         config = _without(config, ("ckpt", *unused))
@@ -122,9 +122,9 @@ class Setup:
                 config[key] = {}
         if "view_weights" in config and not view_weights:
             config["view_weights"] = {}
-        dependencies = {"model": model, "data": self.prepared(data, config["data"]["evaluate"])}
+        dependencies = {"model": model, "data": self.preparation(data, config["data"]["evaluate"])}
         trained = model.name.removeprefix("train-").removesuffix(f"-seed{self.seed}")
-        name = _joined("test", trained, "on", data, name, f"seed{self.seed}")
+        name = _join("test", trained, "on", data, name, f"seed{self.seed}")
         checkpoint = f"ckpt={_folder(model.name)}/last.ckpt"
         words = (checkpoint, *self.words(data), *overrides, f"output={_folder(name)}")
         seconds = seconds or TEST_SECONDS.get(data, OTHER_SECONDS)
@@ -135,7 +135,7 @@ def _without(config: Mapping[str, Any], names: tuple[str, ...]) -> dict[str, Any
     return {name: value for name, value in config.items() if name not in names}
 
 
-def _joined(*parts: str) -> str:
+def _join(*parts: str) -> str:
     return "-".join(part for part in parts if part)
 
 

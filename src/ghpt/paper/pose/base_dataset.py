@@ -45,7 +45,7 @@ _WITH_TRUTH = ("best", "worst")
 
 def on_itself(setup: Setup, *names: str) -> dict[str, Task]:
     """Return tests of models on their own arrangement, with all classical estimators."""
-    return {SELF[data]: setup.tested(setup.trained(data), data) for data in names}
+    return {SELF[data]: setup.test(setup.training(data), data) for data in names}
 
 
 def _quantitative(results: Results) -> Section:
@@ -221,14 +221,14 @@ def _hypotheses_claims(
 
 
 def _limitation_tasks(setup: Setup) -> dict[str, Task]:
-    model = setup.trained("h36m")
+    model = setup.training("h36m")
     tasks = {}
     for split in ("train", "validation"):
         override = f"data.evaluate={split}"
-        tasks[split] = setup.tested(
+        tasks[split] = setup.test(
             model, "h36m", override, name=split, baselines=False, view_weights=False
         )
-    tasks["test"] = setup.tested(model, "h36m")
+    tasks["test"] = setup.test(model, "h36m")
     return tasks
 
 

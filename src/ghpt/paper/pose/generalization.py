@@ -31,9 +31,9 @@ def grid(
 
     Classical estimators are tested where the two are the same.
     """
-    models = {data: setup.trained(data) for data in trained}
+    models = {data: setup.training(data) for data in trained}
     return {
-        f"{train} on {test}": setup.tested(models[train], test, baselines=train == test)
+        f"{train} on {test}": setup.test(models[train], test, baselines=train == test)
         for train, test in product(trained, tested)
     }
 

@@ -13,8 +13,8 @@ from ghpt.paper.engine.artefact import (
     Results,
     Section,
     Spread,
+    format_signed,
     over_seeds,
-    signed,
 )
 from ghpt.paper.pose.generalization import PANOPTIC, grid, panoptic_name
 from ghpt.paper.published import ARRANGEMENTS, ISKAKOV, REMELLI, REMELLI_INTER, REMELLI_OURS, SOTA
@@ -148,7 +148,7 @@ def _remelli_row(
         _range_text(*published),
         f"{low.text()} to {high.text()}",
         f"{_largest_drop(errors).text()} %",
-        f"{signed(honest.mean)} %",
+        f"{format_signed(honest.mean)} %",
     ]
 
 

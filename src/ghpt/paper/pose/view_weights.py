@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from itertools import product
 
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section, signed
+from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section, format_signed
 from ghpt.paper.pose.generalization import PANOPTIC, grid, panoptic_name
 from ghpt.paper.published import ARRANGEMENTS
 from ghpt.report.document import Paragraph, Table, prose
@@ -72,8 +72,8 @@ def _claims(results: Results, classical: Mapping[str, Classical]) -> list[Claim]
         errors[train, test] = error
         gains.append(1 - error / results.relative(f"{train} on {test}").mean)
     better = sum(gain > 0 for gain in gains)
-    smallest = signed(100 * min(gains))
-    largest = signed(100 * max(gains))
+    smallest = format_signed(100 * min(gains))
+    largest = format_signed(100 * max(gains))
     of_panoptic = {test: classical[test] for test in PANOPTIC}
     return [
         Claim(
@@ -96,7 +96,7 @@ def _classical_claim(
             leads[train, test] = 1 - error / classical[test].error
     train, test = min(leads, key=leads.__getitem__)
     better = sum(lead > 0 for lead in leads.values())
-    least = signed(100 * leads[train, test])
+    least = format_signed(100 * leads[train, test])
     return Claim(
         f"trained on any arrangement, view weights beat every classical estimator on {where}",
         "not in the paper",

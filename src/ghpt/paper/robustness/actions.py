@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from ghpt.config import build
+from ghpt.config import Target, build, settings
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE, Kind
 from ghpt.models.checkpoint import LAST, load_model
@@ -27,6 +27,20 @@ LEARNED = (*OF_POOL, "view_weights")
 
 Estimator = Callable[[Any], Any]
 """From observations to an estimate, as the problem of the model has them."""
+
+
+@dataclass(frozen=True)
+class CurveSettings:
+    """The settings of `measure_curve`."""
+
+    data: Target
+    baselines: Mapping[str, Target]
+    view_weights: Target
+    seed: int
+    perturbations: Sequence[Target | None]
+    """None: the data as they are."""
+    files: Mapping[str, Any] = field(default_factory=dict)
+    """What identifies the files of a real data set."""
 
 
 @dataclass(frozen=True)
@@ -75,26 +89,26 @@ class LevelMetrics:
 
 @torch.no_grad()
 def measure_curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
-    """Measure all estimators on ``data`` under each of the ``perturbations`` (None: as it is).
+    """Measure all estimators on the data under each of the perturbations; see `CurveSettings`.
 
-    They are the model of the dependency ``model``, the settings' ``view_weights`` and
-    ``baselines``. result.json: `CurveContent`.
+    They are the model of the dependency ``model``, view weights and baselines. result.json:
+    `CurveContent`.
     """
-    data = build(config["data"], "data")
+    own = settings(CurveSettings, config)
+    data = build(own.data, "data")
     data.setup("test")
     frames = data.frames["test"]
-    seed = config["seed"]
-    model, _ = load_model(dependencies["model"] / LAST, seed=seed)
-    groups = BaselineSettings(config["baselines"], {}, config.get("view_weights"))
+    model, _ = load_model(dependencies["model"] / LAST, seed=own.seed)
+    groups = BaselineSettings(own.baselines, {}, own.view_weights)
     estimate = all_estimators(model.eval(), model.problem.baselines(groups, model))
-    perturbations = build(config["perturbations"], "perturbations")
+    perturbations = build(own.perturbations, "perturbations")
     levels = [LevelMetrics() for _ in perturbations]
     for first in range(0, len(frames), data.batch_size):
         batch = frames[range(first, min(first + data.batch_size, len(frames)))]
         for metrics, perturbation in zip(levels, perturbations, strict=True):
             observations = batch.observations
             if perturbation is not None:
-                observations = perturbation(observations, seed)
+                observations = perturbation(observations, own.seed)
             metrics.update(estimate(Labelled(observations, batch.truth)), batch.truth)
     content = CurveContent(len(frames), [metrics.compute() for metrics in levels])
     write_json(folder / "result.json", asdict(content))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 from ghpt.config import settings
@@ -12,7 +12,13 @@ from ghpt.paper.engine.artefact import Number, Results, Spread
 from ghpt.paper.engine.settings import Robustness
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
-from ghpt.paper.robustness.actions import KINDS, LEARNED, CurveContent, LevelErrors
+from ghpt.paper.robustness.actions import (
+    KINDS,
+    LEARNED,
+    CurveContent,
+    CurveSettings,
+    LevelErrors,
+)
 
 ACTION = "ghpt.paper.robustness.actions.measure_curve"
 PERTURBATIONS = "ghpt.paper.robustness.perturbation"
@@ -54,31 +60,39 @@ class Curve:
             for level in self.levels(setup)
             if level
         ]
-        return _measured(setup, self.name, self.data, perturbations)
+        return _curve_task(setup, self.name, self.data, perturbations)
 
 
 def curve_tasks(setup: Setup, curves: Sequence[Curve]) -> dict[str, Task]:
     """Return the tasks of some curves by name, with that of the unperturbed data."""
     tasks = {curve.name: curve.task(setup) for curve in curves}
     if any(0 in curve.levels(setup) for curve in curves):
-        tasks[CLEAN] = _measured(setup, CLEAN, "h36m", [None])
+        tasks[CLEAN] = _curve_task(setup, CLEAN, "h36m", [None])
     return tasks
 
 
-def _measured(
+def _curve_task(
     setup: Setup, name: str, data: str, perturbations: Sequence[Mapping[str, Any] | None]
 ) -> Task:
     """Return the task that measures every estimator under each of the perturbations."""
     sizes = setup.sizes.robustness
     stride = f"data.stride={sizes.stride[data]}"
-    whole = setup.composed("test", data, *setup.overrides.test, stride)
-    keys = ("data", "view_weights", "baselines", "seed", "files")
-    config = {key: whole[key] for key in keys if key in whole}
-    config["perturbations"] = list(perturbations)
-    dependencies = {"model": setup.trained(sizes.trained_on), "data": setup.prepared(data, "test")}
+    whole = setup.configuration("test", data, *setup.overrides.test, stride)
+    config = CurveSettings(
+        data=whole["data"],
+        baselines=whole["baselines"],
+        view_weights=whole["view_weights"],
+        seed=setup.seed,
+        perturbations=list(perturbations),
+        files=whole.get("files", {}),
+    )
+    dependencies = {
+        "model": setup.training(sizes.trained_on),
+        "data": setup.preparation(data, "test"),
+    }
     seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
     name = f"robustness-{name}-seed{setup.seed}"
-    return Task(name, ACTION, config, dependencies, seconds=seconds)
+    return Task(name, ACTION, asdict(config), dependencies, seconds=seconds)
 
 
 @dataclass(frozen=True)

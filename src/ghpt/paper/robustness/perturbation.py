@@ -171,7 +171,7 @@ def _displace(batch: Observations, offset: Float[Tensor, "B V J 2"]) -> Observat
     return replace(batch, key_points=displaced)
 
 
-def _normal(keys: Int[Tensor, "*B"], shape: tuple[int, ...]) -> Float[Tensor, "..."]:
+def _normal(keys: Int[Tensor, "*B"], shape: tuple[int, ...]) -> Float[Tensor, ...]:
     """Return standard normal numbers, float64 (Box and Muller)."""
     one, other = uniform(keys, (*shape, 2)).unbind(dim=-1)
     radius = (-2 * one.log()).sqrt()

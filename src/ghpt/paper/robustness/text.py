@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ghpt.paper.engine.artefact import Spread, signed
+from ghpt.paper.engine.artefact import Spread, format_signed
 from ghpt.paper.robustness.curve import Curve, CurveResult, nan_to_inf
 from ghpt.paper.robustness.figure import LABELS
 from ghpt.report.document import Strong, Table, Text
@@ -103,7 +103,7 @@ def margin(result: CurveResult, level: int, name: str = "view_weights") -> str:
     other = result.best_classical(level)
     ours = result.mean(name, level)
     theirs = result.mean(other, level)
-    lead = signed(100 * result.lead(name, level))
+    lead = format_signed(100 * result.lead(name, level))
     return f"{lead} % ({ours:.1f} mm, {LABELS.get(other, other)} {theirs:.1f})"
 
 
