@@ -10,6 +10,8 @@ from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 
+pytestmark = pytest.mark.usefixtures("little_data")
+
 
 def settings(*words: str) -> CamerasSettings:
     return cameras_settings("camera_check.frames=24", "camera_check.shift=4", *words)

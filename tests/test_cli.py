@@ -274,7 +274,7 @@ def restored(number):
         signal.signal(number, before)
 
 
-STOPPED = {"trainer": {"max_epochs": 20}, "train": {"save_every": 2}}
+STOPPED = {"trainer": {"max_epochs": 12}, "train": {"save_every": 2}}
 
 
 @pytest.fixture(scope="module")

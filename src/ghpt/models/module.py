@@ -5,7 +5,6 @@ from typing import Any
 
 import lightning as L
 import torch
-from jaxtyping import Int
 from torch import Tensor, nn
 from torchmetrics import MeanMetric
 
@@ -14,7 +13,7 @@ from ghpt.errors import GhptError, check
 from ghpt.models.aggregation import aggregation_weights, softmax_weights
 from ghpt.models.loss import LossTerms, mean_over_all
 from ghpt.models.pool import Pool
-from ghpt.models.problem import Problem
+from ghpt.models.problem import Keys, Problem
 from ghpt.models.scorer import Scorer
 from ghpt.observations import Batch, Labelled, Samples
 
@@ -97,9 +96,7 @@ class StochasticEstimator(L.LightningModule):
             self.problem, hypotheses, logits, self.temperature, self.logit_std_cap, keys, truth
         )
 
-    def keys(
-        self, purpose: str, observations: Samples, step: int | None = None
-    ) -> Int[Tensor, " B"]:
+    def keys(self, purpose: str, observations: Samples, step: int | None = None) -> Keys:
         """Return the key of each sample's random draws."""
         index = observations.index
         steps = () if step is None else (step,)
@@ -122,7 +119,7 @@ class StochasticEstimator(L.LightningModule):
             batches = data.all_training_batches()
             self.fit_statistics(batch.observations.to(self.device) for batch in batches)
 
-    def terms(self, pool: Pool, keys: Int[Tensor, " B"]) -> LossTerms:
+    def terms(self, pool: Pool, keys: Keys) -> LossTerms:
         """Return the loss of each item; ``keys`` are those of the Gumbel noise."""
         logits = pool.capped_logits
         noise = None

@@ -26,6 +26,15 @@ from ghpt.report.report import Report
 
 HypothesesT = TypeVar("HypothesesT", bound="Hypotheses")
 
+Keys = Int[Tensor, " B"]
+"""Keys of the samples' random draws."""
+Features = Float[Tensor, "B H D"]
+"""What the scorer sees of each hypothesis."""
+Weights = Float[Tensor, "B H"]
+"""Weights of the hypotheses, which sum to 1."""
+Errors = tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]
+"""Each estimate's error, and which samples can be compared with a truth."""
+
 
 @dataclass(frozen=True)
 class Hypotheses(Batch):
@@ -71,15 +80,15 @@ class Problem(ABC):
     """D, the length of the feature vector that the scorer sees."""
 
     @abstractmethod
-    def generate(self, observations: Any, count: int, keys: Int[Tensor, " B"]) -> Any:
+    def generate(self, observations: Any, count: int, keys: Keys) -> Any:
         """Return ``count`` random hypotheses for each sample: a function of sample and key."""
 
     @abstractmethod
-    def featurize(self, hypotheses: Any) -> Float[Tensor, "B H D"]:
+    def featurize(self, hypotheses: Any) -> Features:
         """Return what the scorer sees of each hypothesis: float32, finite, never the cameras."""
 
     @abstractmethod
-    def aggregate(self, hypotheses: Any, weights: Float[Tensor, "B H"]) -> Any:
+    def aggregate(self, hypotheses: Any, weights: Weights) -> Any:
         """Return the estimate under weights that sum to 1; differentiable in the weights.
 
         One-hot weights select a hypothesis.
@@ -90,7 +99,7 @@ class Problem(ABC):
         """Return all hypotheses as estimates with leading dimensions B H."""
 
     @abstractmethod
-    def error(self, estimate: Any, truth: Any) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
+    def error(self, estimate: Any, truth: Any) -> Errors:
         """Return each estimate's error, and which samples can be compared with a truth.
 
         A sample that cannot gets 0.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.config import build
@@ -20,7 +20,15 @@ from ghpt.models.pose.evaluation import evaluate_poses
 from ghpt.models.pose.features import bone_lengths, normalised_coordinates
 from ghpt.models.pose.schema import POSES, PosePredictions, PoseSample, PoseTables
 from ghpt.models.predictions import with_nan
-from ghpt.models.problem import BaselineSettings, Hypotheses, Problem
+from ghpt.models.problem import (
+    BaselineSettings,
+    Errors,
+    Features,
+    Hypotheses,
+    Keys,
+    Problem,
+    Weights,
+)
 from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
 from ghpt.report.report import Report
 from ghpt.skeleton import BONES, JOINTS
@@ -60,9 +68,7 @@ class PoseTriangulation(Problem):
         self.feature_size = len(JOINTS) * 3 * coordinates + len(BONES) * lengths
 
     @torch.no_grad()
-    def generate(
-        self, observations: Observations, count: int, keys: Int[Tensor, " B"]
-    ) -> PoseHypotheses:
+    def generate(self, observations: Observations, count: int, keys: Keys) -> PoseHypotheses:
         """Triangulate each joint from a uniformly random subset of at least two valid views.
 
         Where a subset is degenerate (parallel rays, a point behind a camera), all valid views stand
@@ -79,7 +85,7 @@ class PoseTriangulation(Problem):
         return PoseHypotheses(points.float(), views, whole.ok)
 
     @torch.no_grad()
-    def featurize(self, hypotheses: PoseHypotheses) -> Float[Tensor, "B H D"]:
+    def featurize(self, hypotheses: PoseHypotheses) -> Features:
         """Return normalised coordinates and bone lengths, mm."""
         points = hypotheses.points
         estimated = hypotheses.estimated[:, None].expand(points.shape[:-1])
@@ -90,7 +96,7 @@ class PoseTriangulation(Problem):
             features.append(bone_lengths(points, estimated))
         return torch.cat(features, dim=-1)
 
-    def aggregate(self, hypotheses: PoseHypotheses, weights: Float[Tensor, "B H"]) -> PoseEstimate:
+    def aggregate(self, hypotheses: PoseHypotheses, weights: Weights) -> PoseEstimate:
         """Return the weighted average of the poses.
 
         It is taken about the pool's mean, so that float32 keeps its digits.
@@ -107,9 +113,7 @@ class PoseTriangulation(Problem):
         estimated = hypotheses.estimated[:, None].expand(points.shape[:-1])
         return PoseEstimate(points, estimated)
 
-    def error(
-        self, estimate: PoseEstimate, truth: Truth
-    ) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
+    def error(self, estimate: PoseEstimate, truth: Truth) -> Errors:
         """Return the pelvis-relative MPJPE (eq:mpjpe), mm, and which frames can be compared.
 
         The joints that count are estimated and have a truth.

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt import randomness
@@ -31,7 +31,15 @@ from ghpt.geometry.epipolar import (
     robust_weights,
 )
 from ghpt.geometry.rotations import average_rotation
-from ghpt.models.problem import BaselineSettings, Hypotheses, Problem
+from ghpt.models.problem import (
+    BaselineSettings,
+    Errors,
+    Features,
+    Hypotheses,
+    Keys,
+    Problem,
+    Weights,
+)
 from ghpt.models.relative_pose.evaluation import evaluate_pairs
 from ghpt.models.relative_pose.schema import PAIRS, PairPredictions, PairSample, RigTables
 from ghpt.observations import (
@@ -107,7 +115,7 @@ class RelativePose(Problem):
 
     @torch.no_grad()
     def generate(
-        self, observations: PairObservations, count: int, keys: Int[Tensor, " B"]
+        self, observations: PairObservations, count: int, keys: Keys
     ) -> RelativePoseHypotheses:
         """Apply the normalised 8-point algorithm to T random correspondences.
 
@@ -132,7 +140,7 @@ class RelativePose(Problem):
         return RelativePoseHypotheses(R, t * length[..., None], estimated, a, b, both)
 
     @torch.no_grad()
-    def featurize(self, hypotheses: RelativePoseHypotheses) -> Float[Tensor, "B H D"]:
+    def featurize(self, hypotheses: RelativePoseHypotheses) -> Features:
         """Return the distances (mm) between corresponding rays, sorted.
 
         They are D evenly spaced quantiles, so that missing joints and another number of frames
@@ -147,7 +155,7 @@ class RelativePose(Problem):
         return quantiles(distances, both, self.feature_size)
 
     def aggregate(
-        self, hypotheses: RelativePoseHypotheses, weights: Float[Tensor, "B H"]
+        self, hypotheses: RelativePoseHypotheses, weights: Weights
     ) -> RelativePoseEstimate:
         """Return the weighted average of the rotations' quaternions and of the translations.
 
@@ -168,9 +176,7 @@ class RelativePose(Problem):
         estimated = hypotheses.estimated[:, None].expand(hypotheses.t.shape[:-1])
         return RelativePoseEstimate(hypotheses.R, hypotheses.t, estimated)
 
-    def error(
-        self, estimate: RelativePoseEstimate, truth: PairTruth
-    ) -> tuple[Float[Tensor, " B *H"], Bool[Tensor, " B"]]:
+    def error(self, estimate: RelativePoseEstimate, truth: PairTruth) -> Errors:
         """Return E_3D (eq:reprojection-3d-error), mm, and which pairs can be compared.
 
         It is the mean distance of random points from what the estimated pair makes of their true
@@ -244,7 +250,7 @@ class RelativePose(Problem):
 
 
 def random_subsets(
-    both: Bool[Tensor, "B N"], count: int, size: int, keys: Int[Tensor, " B"]
+    both: Bool[Tensor, "B N"], count: int, size: int, keys: Keys
 ) -> Bool[Tensor, "B H N"]:
     """Return for each hypothesis ``size`` random correspondences that both views see.
 
