@@ -39,7 +39,7 @@ SMALL = {
         "trainer.max_epochs=1",
     ),
     "test.py": (*QUICK, "data.stride=40"),
-    "predict.py": (*QUICK, "evaluated_frames=8", "verdict.clean=1.0"),
+    "predict.py": (*QUICK, "evaluated_frames=8", "camera_check.clean=1.0"),
     "cameras.py": ("camera_check.frames=16", "camera_check.shift=2"),
     "calibrate.py": ("evaluated_frames=8", "calibration.frames=40"),
 }
