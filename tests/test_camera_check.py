@@ -121,7 +121,7 @@ def test_every_breakage_is_found_and_nothing_else(kind):
 
 def test_numbers_of_the_mistakes_are_those_that_were_made():
     numbers = {
-        "moved": pytest.approx(3.0, abs=0.5),
+        "moved": pytest.approx(3.0, abs=1.0),  # 100 mm look like a rotation too
         "late": 5,
         "early": -10,
         "metres": 1000,

@@ -23,7 +23,7 @@ from test_verdict import NAMES, RIG, late, pixels, points_file
 
 OF_THE_RESULT = ("left_out_error", "few_views_agree", "rejected")
 """What predict.py says of its own result."""
-QUICK = ("camera_check.frames=24", "camera_check.shift=12")
+QUICK = ("camera_check.clean=0.004", "camera_check.frames=24", "camera_check.shift=12")
 Said = set[tuple[str, tuple[str, ...]]]
 
 
@@ -46,7 +46,7 @@ def said_by_cameras(words: tuple[str, ...]) -> Said:
 
 
 def said_by_predict(words: tuple[str, ...], folder: Path) -> Said:
-    quick = ("evaluated_frames=40", "fitted_frames=40", "formats=[npz]")
+    quick = ("camera_check.clean=0.004", "evaluated_frames=40", "fitted_frames=40", "formats=[npz]")
     result = predict(config(*words, *quick), folder)
     assert result is not None
     assert result.verdict is not None
@@ -62,7 +62,7 @@ def rig_file(folder: Path, cameras: Cameras) -> Path:
 
 def transposed(view: int) -> Cameras:
     R = RIG.cameras.R.clone()
-    R[view] = R[view].T
+    R[view] = RIG.cameras.R[view].T
     return Cameras(RIG.cameras.K, R, RIG.cameras.t)
 
 
