@@ -297,7 +297,7 @@ def fork_ranks() -> None:
     def started(command: list[str], env: Mapping[str, str], cwd: str | None) -> Fork:
         return Fork(command[1:], env, cwd, group=os.getpgid(0))
 
-    subprocess_script.subprocess = SimpleNamespace(Popen=started)  # type: ignore[assignment]
+    subprocess_script.subprocess = SimpleNamespace(Popen=started)
 
 
 def import_modules() -> None:

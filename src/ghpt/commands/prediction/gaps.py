@@ -86,10 +86,11 @@ class Gaps:
         observed = np.flatnonzero(state == State.OBSERVED)
         following = np.searchsorted(observed, np.arange(len(frame)))
         inside = (following > 0) & (following < len(observed))
-        rows = np.flatnonzero(inside & (state != State.OBSERVED))
-        before = observed[following[rows] - 1]
-        after = observed[following[rows]]
-        rows = rows[frame[after] - frame[before] <= (longest + 1) * step]
+        missing = state != State.OBSERVED
+        rows = np.flatnonzero(inside & missing)
+        after = following[rows]
+        gap = frame[observed[after]] - frame[observed[after - 1]]
+        rows = rows[gap <= (longest + 1) * step]
         points = points.copy()
         state = state.copy()
         if len(rows):

@@ -54,7 +54,8 @@ def follow(people: Sequence[People]) -> Int[np.ndarray, " T"]:
     score = prominences[0] / best
     came_from: list[np.ndarray | None] = []
     for step, (before, now) in enumerate(pairwise(there), start=1):
-        gain = score[:, None] - _JUMP * _jump(people[before], people[now])
+        cost = _JUMP * _jump(people[before], people[now])
+        gain = score[:, None] - cost
         came_from.append(gain.argmax(0))
         score = gain.max(0) + prominences[step] / best
     person = int(score.argmax())
@@ -71,10 +72,12 @@ def valid_joints(people: Float[np.ndarray, "*B K 3"]) -> Bool[np.ndarray, "*B K"
 
 def _size(people: People) -> Float[np.ndarray, " P"]:
     valid = valid_joints(people)[..., None]
-    low = np.where(valid, people[..., :2], np.inf).min(1, initial=np.inf)
-    high = np.where(valid, people[..., :2], -np.inf).max(1, initial=-np.inf)
+    pixels = people[..., :2]
+    low = np.where(valid, pixels, np.inf).min(1, initial=np.inf)
+    high = np.where(valid, pixels, -np.inf).max(1, initial=-np.inf)
     known = np.isfinite(low)
-    extent = np.where(known, high - np.where(known, low, 0), 0)
+    low = np.where(known, low, 0)
+    extent = np.where(known, high - low, 0)
     return np.linalg.norm(extent, axis=-1)
 
 
@@ -91,9 +94,11 @@ def _jump(
     It is 1 where they share no joint.
     """
     both = valid_joints(before)[:, None] & valid_joints(now)[None]
-    distance = np.linalg.norm(before[:, None, :, :2] - now[None, :, :, :2], axis=-1)
-    ordered = np.sort(np.where(both, distance, np.inf), axis=-1)
+    offset = before[:, None, :, :2] - now[None, :, :, :2]
+    distance = np.linalg.norm(offset, axis=-1)
+    distance = np.where(both, distance, np.inf)
     middle = np.maximum(both.sum(-1) - 1, 0) // 2
+    ordered = np.sort(distance, axis=-1)
     median = np.take_along_axis(ordered, middle[..., None], -1)[..., 0]
-    size = np.maximum(_size(before)[:, None], _size(now)[None]).clip(1e-9)
-    return np.minimum(median / size, 1.0)
+    size = np.maximum(_size(before)[:, None], _size(now)[None])
+    return np.minimum(median / size.clip(1e-9), 1.0)

@@ -37,10 +37,12 @@ def box_diagonal(
     points: Float[np.ndarray, "N J D"], valid: Bool[np.ndarray, "N J"]
 ) -> Float[np.ndarray, " N"]:
     """Return the diagonal of the box around the valid points; 0 where there is none."""
-    low = np.where(valid[..., None], points, np.inf).min(1)
-    high = np.where(valid[..., None], points, -np.inf).max(1)
+    mask = valid[..., None]
+    low = np.where(mask, points, np.inf).min(1)
+    high = np.where(mask, points, -np.inf).max(1)
     known = np.isfinite(low)
-    extent = np.where(known, high - np.where(known, low, 0), 0)
+    low = np.where(known, low, 0)
+    extent = np.where(known, high - low, 0)
     return np.linalg.norm(extent, axis=-1)
 
 
@@ -112,13 +114,15 @@ def _distances(
 
     It is inf where they share too few.
     """
+    before = bodies.points[last]
+    after = bodies.points[now]
     both = bodies.valid[last][:, None] & bodies.valid[now]
-    offset = bodies.points[last][:, None] - bodies.points[now]
-    distance = np.linalg.norm(offset, axis=-1)
+    distance = np.linalg.norm(before[:, None] - after, axis=-1)
+    distance = np.where(both, distance, np.inf)
     count = both.sum(-1)
-    ordered = np.sort(np.where(both, distance, np.inf), axis=-1)
-    middle = np.maximum(count - 1, 0)[..., None] // 2
-    median = np.take_along_axis(ordered, middle, -1)[..., 0]
+    middle = np.maximum(count - 1, 0) // 2
+    ordered = np.sort(distance, axis=-1)
+    median = np.take_along_axis(ordered, middle[..., None], -1)[..., 0]
     median = np.where(count >= _LEAST_JOINTS, median, np.inf)
-    height = box_diagonal(bodies.points[now], bodies.valid[now])
+    height = box_diagonal(after, bodies.valid[now])
     return median / np.maximum(height, 1e-9)

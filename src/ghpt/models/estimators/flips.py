@@ -62,29 +62,34 @@ def undo_flips(
     frames, views = batch.valid.shape[:2]
     device = batch.valid.device
     flipped = torch.zeros(frames, views, len(LIMBS), dtype=torch.bool, device=device)
-    most = (batch.valid.any(-1).sum(-1) - 1) // 2
+    seen_views = batch.valid.any(-1).sum(-1)
+    most = (seen_views - 1) // 2
     if not len(batch) or int(most.max()) < 1:
         return batch, flipped.any(-1)
     estimate = estimate or flips.estimator(batch)
     cost = _view_costs(batch, estimate, flips.scale)
     # a view that is right in a pose that is nearly right is far from its mirror image
     mirrored = _view_costs(_flip(batch, ~flipped), estimate, flips.scale)
-    doubtful = (cost > flips.gain / 2) & (mirrored < cost + flips.gain)
-    rows = torch.nonzero(doubtful.any(-1) & (most > 0))[:, 0]
+    fits_badly = cost > flips.gain / 2
+    may_be_flipped = mirrored < cost + flips.gain
+    doubtful = (fits_badly & may_be_flipped).any(-1)
+    rows = torch.nonzero(doubtful & (most > 0))[:, 0]
     for _ in range(flips.rounds):
         if not len(rows):
             break
         candidates = _candidates(flipped[rows], cost[rows], min(flips.views, views))
         costs = _candidate_costs(batch.rows(rows), candidates, flips)
-        allowed = candidates.any(-1).sum(-1) <= most[rows, None]
-        best = torch.where(allowed, costs.sum(-1), torch.inf).argmin(-1)
+        flipped_views = candidates.any(-1).sum(-1)
+        allowed = flipped_views <= most[rows, None]
+        total = torch.where(allowed, costs.sum(-1), torch.inf)
+        best = total.argmin(-1)
         row = torch.arange(len(best), device=device)
-        gain = cost[rows].sum(-1) - costs[row, best].sum(-1)
+        best_cost = costs[row, best]
+        gain = cost[rows].sum(-1) - best_cost.sum(-1)
         better = allowed[row, best] & (gain > flips.gain)
-        improved = rows[better]
-        flipped[improved] = candidates[row, best][better]
-        cost[improved] = costs[row, best][better]
-        rows = improved
+        rows = rows[better]
+        flipped[rows] = candidates[row, best][better]
+        cost[rows] = best_cost[better]
     return _flip(batch, flipped), flipped.any(-1)
 
 
@@ -94,9 +99,10 @@ def _candidates(
     """Return the flips with one more of the worst views flipped, in every way that it can be."""
     worst = costs.topk(views, dim=-1).indices
     kinds = torch.tensor(_HYPOTHESES, device=costs.device)
-    view = torch.nn.functional.one_hot(worst, costs.shape[1]).bool()
-    change = view[:, :, None, :, None] & kinds[:, None]
-    return flipped[:, None] ^ change.flatten(1, 2)
+    view = torch.nn.functional.one_hot(worst, costs.shape[1])
+    change = view.bool()[:, :, None, :, None] & kinds[:, None]
+    change = change.flatten(1, 2)
+    return flipped[:, None] ^ change
 
 
 def _candidate_costs(
@@ -141,7 +147,8 @@ def _view_costs(batch: Observations, estimate: PoseEstimate, scale: float) -> Fl
     mirror = list(MIRROR)
     estimated = estimate.estimated & estimate.estimated[:, mirror]
     valid = batch.valid & batch.valid[:, :, mirror]
-    loss = torch.log1p(error.clamp(max=1e6) ** 2)
-    loss = torch.where(valid & estimated[:, None], loss, 0.0)
+    square = error.clamp(max=1e6) ** 2
+    measured = valid & estimated[:, None]
+    loss = torch.where(measured, torch.log1p(square), 0.0)
     limbs = [joint for group in LIMBS for joint in group]
     return loss[..., limbs].sum(-1)

@@ -91,7 +91,9 @@ class Ransac(Estimator):
         other = (draw[..., 1] * (count - 1)).long()
         other = other + (other >= one)
         rank = valid.cumsum(-1) - 1
-        return valid & ((rank == one[..., None]) | (rank == other[..., None]))
+        is_one = rank == one[..., None]
+        is_other = rank == other[..., None]
+        return valid & (is_one | is_other)
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,13 @@ class AdaptiveRansac(Ransac):
         self, residual: Float[Tensor, "V J B"], valid: Bool[Tensor, "V J B"]
     ) -> Float[Tensor, " B"]:
         """Return each frame's threshold, of residuals as fractions of the person's scale."""
-        measured = valid & (valid.sum(0) >= 2) & ~residual.isnan()
+        enough = valid.sum(0) >= 2
+        measured = valid & enough & ~residual.isnan()
         measured = measured.flatten(0, 1)
-        finite_last = torch.where(measured, residual.flatten(0, 1), torch.inf)
-        ordered = finite_last.sort(dim=0).values
-        rank = (self.quantile * (measured.sum(0) - 1).clamp(min=0)).long()
+        residual = torch.where(measured, residual.flatten(0, 1), torch.inf)
+        ordered = residual.sort(dim=0).values
+        last = (measured.sum(0) - 1).clamp(min=0)
+        rank = (self.quantile * last).long()
         noise = ordered.gather(0, rank[None])[0]
         adapted = torch.where(torch.isfinite(noise), self.adapt * noise, 0.0)
         return adapted.clamp(min=self.threshold)
@@ -175,7 +179,8 @@ class _Candidates:
         points, ok = triangulate_subsets(each, key_points, valid, pairs)
         self.valid = valid.permute(1, 2, 0)
         self.system = System(cameras, key_points, self.valid)
-        square = scale.double().clamp(min=1e-12).mT[:, None] ** 2
+        scale = scale.double().clamp(min=1e-12)
+        square = scale.mT[:, None] ** 2
         self.square = torch.where(self.system.used, square, 0.0)
         local = points - self.system.origin[:, None, None]
         points = torch.where(ok[..., None], local, torch.nan)
@@ -209,9 +214,11 @@ class _Candidates:
         slope = 1 / (thresholds * (len(residual) + 1))
         score = torch.zeros_like(residual[0])
         for of_view in residual:
-            score = score + torch.where(of_view <= thresholds, 1 - of_view * slope, 0.0)
+            merit = 1 - of_view * slope
+            score = score + torch.where(of_view <= thresholds, merit, 0.0)
         best = score.argmax(0).expand(len(residual), 1, -1, -1)
-        return residual.gather(1, best)[:, 0] <= thresholds
+        own = residual.gather(1, best)[:, 0]
+        return own <= thresholds
 
     def point(self, inlier: Bool[Tensor, "V J B"]) -> Float[Tensor, "3 J B"]:
         """Return the points of the inliers; of all views where those do not fix one."""
