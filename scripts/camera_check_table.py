@@ -111,9 +111,9 @@ def main() -> None:
                 )
                 print(f"{name}, {kind}: {words} [{before} -> {after} px]", flush=True)
     print_table(table)
-    print(
-        f"\n{len(cases)} recordings; seconds: median {torch.tensor(seconds).median():.1f}, most {max(seconds):.1f}"
-    )
+    median = torch.tensor(seconds).median()
+    times = f"seconds: median {median:.1f}, most {max(seconds):.1f}"
+    print(f"\n{len(cases)} recordings; {times}")
 
 
 def first_views(case: Case, count: int) -> Case:

@@ -285,7 +285,7 @@ def everything(scene, valid):
     found = [result.points, result.status, result.angle, result.depth_min, few, many]
     for subsets in (few, many):
         found += triangulate_subsets(scene.cameras, scene.key_points, valid, subsets)
-    batch = replace(scene.batch(valid), sample=keys)
+    batch = replace(scene.batch(valid), index=keys)
     for name in ("linear", "ransac_random", "m_estimator"):
         estimate = BASELINES[name](batch)
         found += [estimate.points, estimate.estimated]
