@@ -1,4 +1,4 @@
-"""The camera doctor: ``python cameras.py cameras=Calib.toml keypoints=pose/``; ``--help`` says
+"""The camera check: ``python cameras.py cameras=Calib.toml keypoints=pose/``; ``--help`` says
 more.
 """
 

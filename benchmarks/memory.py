@@ -23,7 +23,9 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def peak(command: list[str], **environment: str) -> tuple[float, float, float]:
     """Peak of a process's whole and private memory, MiB, and its seconds."""
-    start, whole, private = time.perf_counter(), 0, 0
+    start = time.perf_counter()
+    whole = 0
+    private = 0
     with open(os.devnull, "w", encoding="utf-8") as nowhere:
         process = subprocess.Popen(
             [sys.executable, *command],
@@ -34,7 +36,8 @@ def peak(command: list[str], **environment: str) -> tuple[float, float, float]:
         )
     while process.poll() is None:
         fields = _status(process.pid)
-        whole, private = max(whole, fields.get("VmHWM", 0)), max(private, fields.get("RssAnon", 0))
+        whole = max(whole, fields.get("VmHWM", 0))
+        private = max(private, fields.get("RssAnon", 0))
         time.sleep(0.01)
     if process.returncode:
         sys.exit(f"{' '.join(command)} failed:\n{process.stderr.read().decode()[-2000:]}")
@@ -75,7 +78,8 @@ def main() -> None:
     from measure import machine, settings, show
 
     wanted = settings(frames="1000,8000", hypotheses=20)
-    title, lengths, rows = machine(), [int(n) for n in wanted["frames"].split(",")], []
+    title = machine()
+    lengths = [int(n) for n in wanted["frames"].split(",")]
     with tempfile.TemporaryDirectory() as folder:
         train = [
             "train.py",

@@ -39,7 +39,8 @@ def draws(data: str, frames: int, count: int) -> Pairs:
 def solve(baseline: Robust, batch: PairObservations) -> list[float]:
     """Seconds that the solver itself takes for each pair."""
     a, b, used = batch.correspondences()
-    size, taken = size_in_image(batch).tolist(), []
+    size = size_in_image(batch).tolist()
+    taken = []
     for i in range(len(batch)):
         pair = Correspondences(a[i, used[i]], b[i, used[i]], size[i], batch.index[i])
         start = time.perf_counter()
@@ -53,7 +54,8 @@ def race(frames: int, size: int, rounds: int) -> list[list[str]]:
     pairs = draws("h36m", frames, -(-size * rounds // 12))
     model = build(configuration("train", "model=camera")["model"], "model")
     baselines = build(configuration("test")["camera_baselines"], "camera_baselines")
-    ours, theirs = [], {name: [] for name in THEIRS}
+    ours = []
+    theirs = {name: [] for name in THEIRS}
     for number in range(-1, rounds):
         first = max(number, 0) * size % (len(pairs) - size + 1)
         batch = pairs[range(first, first + size)].observations
@@ -88,7 +90,8 @@ def rigs(data: str, frames: int, count: int) -> list[str]:
     calibration = build(
         configuration("test")["camera_baselines"]["rig"]["calibration"], "calibration"
     )
-    taken, succeeded = [], 0
+    taken = []
+    succeeded = 0
     for draw in range(count):
         batch = pairs[[draw * len(pairs.pairs)]].observations
         names = list(pairs.rigs[0].names)

@@ -1,6 +1,4 @@
-"""Synthetic recordings of any length before any number of cameras, made in moments: the benchmarks'
-data.
-"""
+"""Synthetic recordings of any length and number of cameras, made in moments, for benchmarks."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -74,12 +72,14 @@ class SceneData(KeyPointDataModule):
 
     def __init__(self, views: int, frames: dict[str, int], **settings: Any) -> None:
         super().__init__(**settings)
-        self.views, self.lengths = views, frames
+        self.views = views
+        self.lengths = frames
 
     def cache_key(self, split: str) -> dict[str, Any]:
         return {"name": f"scene-{split}", "views": self.views, "frames": self.lengths[split]}
 
     def generate(self, split: str) -> Iterable[LabelledRecording]:
-        rng, cameras = np.random.default_rng(len(split)), ring(self.views)
+        rng = np.random.default_rng(len(split))
+        cameras = ring(self.views)
         for first in range(0, self.lengths[split], _TAKE):
             yield take(f"{split}-{first}", min(_TAKE, self.lengths[split] - first), cameras, rng)

@@ -1,5 +1,4 @@
-"""Set the synthetic motion and detector beside real ones, as the Markdown tables of
-docs/synthetic.md.
+"""Compare the synthetic motion and detector with real ones: the tables of docs/synthetic.md.
 
     python scripts/compare_synthetic.py [--shared ../shared/data]
 
@@ -23,6 +22,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
+from ghpt.data.datasets.panoptic import joints17
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import synthetic_recordings, takes
 from ghpt.geometry import lens
@@ -75,53 +75,29 @@ class Detected:
 
 def cmu_mocap(shared: Path) -> Motion:
     with np.load(shared / "cmu_mocap/cmu_mocap_17_joints_60hz.npz") as data:
-        joints, starts, rate = (
-            data["joints_mm"].astype(float),
-            data["clip_start"],
-            float(data["rate_hz"]),
-        )
+        joints = data["joints_mm"].astype(float)
+        starts = data["clip_start"]
+        rate = float(data["rate_hz"])
     clips = [joints[a:b] for a, b in pairwise(starts)]
     return Motion(rate, clips, np.array([0.0, 0.0, 1.0]))
 
 
 def range_of_motion(shared: Path) -> Motion:
-    """COCO19 to the 17 joints; frames with a missing joint are left out."""
+    """Return the 17 joints of COCO19; frames with a missing joint are left out."""
     with np.load(shared / "panoptic/171026_pose3_joints19.npz") as data:
         poses = data["poses"] * 10.0
-    whole = ~(poses == 0).all(axis=-1).any(axis=-1)
-    order = [
-        "thorax",
-        "nose",
-        "pelvis",
-        "left_shoulder",
-        "left_elbow",
-        "left_wrist",
-        "left_hip",
-        "left_knee",
-        "left_ankle",
-    ]
-    order += [
-        "right_shoulder",
-        "right_elbow",
-        "right_wrist",
-        "right_hip",
-        "right_knee",
-        "right_ankle",
-    ]
-    made = {"spine": (poses[:, 0] + poses[:, 2]) / 2, "head_top": poses[:, 15:].mean(axis=1)}
-    joints = np.stack(
-        [made[name] if name in made else poses[:, order.index(name)] for name in JOINTS], axis=1
-    )
+    valid = ~(poses == 0).all(axis=-1)
+    whole = valid.all(axis=-1)
+    joints, _ = joints17(poses, valid)
     cuts = np.flatnonzero(np.diff(whole.astype(int))) + 1
-    clips = [
-        clip
-        for clip, ok in zip(np.split(joints, cuts), np.split(whole, cuts), strict=True)
-        if ok[0]
-    ]
-    return Motion(30.0, [clip for clip in clips if len(clip) > 30], np.array([0.0, -1.0, 0.0]))
+    clips = []
+    for clip, complete in zip(np.split(joints, cuts), np.split(whole, cuts), strict=True):
+        if complete[0] and len(clip) > 30:
+            clips.append(clip.astype(float))
+    return Motion(30.0, clips, np.array([0.0, -1.0, 0.0]))
 
 
-def embedded_motion(data: str) -> Motion:
+def synthetic_motion(data: str) -> Motion:
     up = np.array([0.0, 0.0, 1.0] if data == "h36m" else [0.0, -1.0, 0.0])
     every = list(takes(data, "test", 0))
     return Motion(every[0].rate_hz, [take.truth for take in every], up)
@@ -146,7 +122,7 @@ def pose2sim(shared: Path) -> Detected:
             )
         views.append(frames)
     raw = np.array(views).swapaxes(0, 1)
-    return _undistorted(entries, rotations, raw[..., :2], raw[..., 2], raw[..., 2] > 0, 60.0, True)
+    return _undistort(entries, rotations, raw[..., :2], raw[..., 2], raw[..., 2] > 0, 60.0, True)
 
 
 def caliscope(shared: Path) -> Detected:
@@ -170,12 +146,12 @@ def caliscope(shared: Path) -> Detected:
     sizes = np.array([entry["size"] for entry in entries])[:, None]
     valid = ((raw >= 0) & (raw <= sizes - 1)).all(axis=-1)
     rotations = np.array([entry["rotation"] for entry in entries])
-    return _undistorted(
+    return _undistort(
         entries, rotations, np.nan_to_num(raw), np.ones(valid.shape), valid, 30.0, False
     )
 
 
-def _undistorted(
+def _undistort(
     entries: list[Mapping[str, list]],
     rotations: np.ndarray,
     raw: np.ndarray,
@@ -197,23 +173,19 @@ def _undistorted(
     return Detected(rate_hz, cameras, [(undone, confidence, valid & exists)], confident)
 
 
-def embedded_detections(data: str) -> Detected:
+def synthetic_detections(data: str) -> Detected:
     config = "human36m" if data == "h36m" else "panoptic"
     detector = Detector(**yaml.safe_load((ROOT / f"conf/detector/{config}.yaml").read_text()))
     columns = [JOINT[name] for name in COMMON]
-    some = [
-        r
-        for i, r in enumerate(synthetic_recordings(data, "test", 0, detector))
-        if data != "h36m" or i % 4 == 0
-    ]
-    some = [
-        recording for recording in some if recording.subject == some[0].subject or data != "h36m"
-    ]
-    clips = [
-        (r.key_points[:, :, columns], r.confidence[:, :, columns], r.valid[:, :, columns])
-        for r in some
-    ]
-    return Detected(some[0].rate_hz, some[0].cameras, clips, True)
+    recordings = list(synthetic_recordings(data, "test", 0, detector))
+    first = recordings[0]
+    if data == "h36m":
+        recordings = [r for r in recordings[::4] if r.subject == first.subject]
+    clips = []
+    for recording in recordings:
+        arrays = (recording.key_points, recording.confidence, recording.valid)
+        clips.append(tuple(array[:, :, columns] for array in arrays))
+    return Detected(first.rate_hz, first.cameras, clips, True)
 
 
 def bend(joints: np.ndarray, side: str, chain: str) -> np.ndarray:
@@ -263,7 +235,9 @@ def detector_rows(detected: Detected) -> dict[str, str]:
     """Residuals of a robust triangulation from the other views' consensus, relative to the stature
     in the image.
     """
-    errors, ranks, seen_share = [], [], []
+    errors = []
+    ranks = []
+    seen_share = []
     pairs: dict[float, list[np.ndarray]] = {0.1: [], 0.5: [], 1.0: []}
     for key_points, confidence, valid in detected.clips:
         residual = _residual(detected.cameras, key_points, confidence, valid)
@@ -306,7 +280,7 @@ def _residual(
     batch = Observations(
         index=torch.arange(frames),
         recording=torch.zeros(frames, dtype=torch.int64),
-        cameras=Cameras(*(x.expand(frames, *x.shape) for x in (cameras.K, cameras.R, cameras.t))),
+        cameras=cameras.expand(frames),
         key_points=torch.from_numpy(key_points),
         confidence=torch.from_numpy(confidence),
         valid=torch.from_numpy(valid),
@@ -359,15 +333,15 @@ def main() -> None:
     motions = {
         "CMU mocap": cmu_mocap(shared),
         "Panoptic 171026_pose3": range_of_motion(shared),
-        "synthetic h36m": embedded_motion("h36m"),
-        "synthetic panoptic": embedded_motion("cmu3"),
+        "synthetic h36m": synthetic_motion("h36m"),
+        "synthetic panoptic": synthetic_motion("cmu3"),
     }
     print(markdown({name: motion_rows(motion) for name, motion in motions.items()}), end="\n\n")
     detections = {
         "OpenPose (pose2sim_single)": pose2sim(shared),
         "MediaPipe (caliscope)": caliscope(shared),
-        "synthetic h36m": embedded_detections("h36m"),
-        "synthetic cmu3": embedded_detections("cmu3"),
+        "synthetic h36m": synthetic_detections("h36m"),
+        "synthetic cmu3": synthetic_detections("cmu3"),
     }
     print(markdown({name: detector_rows(detected) for name, detected in detections.items()}))
 

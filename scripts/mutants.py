@@ -1,8 +1,8 @@
 """Mutation testing: do the tests notice a small change of the source?
 
-    python scripts/mutants.py                                     # 100 random mutants of the files of TESTS
+    python scripts/mutants.py                # 100 random mutants of the files of TESTS
     python scripts/mutants.py --files src/ghpt/geometry/*.py --count 50 --seed 1
-    python scripts/mutants.py --planted                           # the bugs of planted_bugs.json instead
+    python scripts/mutants.py --planted      # the bugs of planted_bugs.json instead
 
 One mutant at a time is written into a temporary copy of ``src``, never into the working tree. The
 tests of its file run in a fork of this process, which has imported the large libraries already; so
@@ -312,7 +312,7 @@ def _in_child(tests: list[str], work: Path, cached: bool) -> int:
 
 
 def try_mutant(mutant: Mutant, work: Path, limit: float) -> str:
-    """What the tests of the mutant's file say of it; the copy in ``work`` is as before afterwards."""
+    """Return what the tests of the mutant's file say of it; the copy in ``work`` is restored."""
     path = work / mutant.file
     for compiled in (path.parent / "__pycache__").glob(f"{path.stem}.*"):
         compiled.unlink()  # may have the mutant's size and second

@@ -85,7 +85,8 @@ def run(words: list[str], output: Path) -> PredictionResult:
 def poses(words: list[str], output: Path) -> dict[int, np.ndarray]:
     """Frame number -> the twelve limb joints, mm, NaN where missing."""
     run(words, output)
-    at, found = [JOINT[name] for name in LIMBS], {}
+    at = [JOINT[name] for name in LIMBS]
+    found = {}
     for part in read_reconstruction(output / "poses.npz")[1]:
         values = (
             torch.where(part.has_position[..., None], part.points, torch.nan)[:, at]

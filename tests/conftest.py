@@ -31,7 +31,7 @@ if WORKER:  # each of several test processes has its own core, and so have the c
 FIRST = (
     "test_docs.py",
     "test_ddp.py",
-    "test_checkup.py",
+    "test_camera_check.py",
     "test_reproduce.py",
     "test_geometry_battery.py",
 )

@@ -74,7 +74,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def commands_of(block: Block) -> Iterator[Command]:
-    """The commands of a bash block, a line each or more, or of a console block, after its prompts."""
+    """The commands of a bash block, a line each or more, or of a console block's prompts."""
     for number, line in enumerate(block.text.splitlines()):
         if block.language != "console" or line.startswith("$ "):
             yield from _split(block.page, block.line + number, line.removeprefix("$ "))

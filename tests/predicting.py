@@ -23,7 +23,12 @@ from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
-QUICK = ("trainer.accelerator=cpu", "progress_bar=false", "evaluated_frames=4", "verdict.clean=1.0")
+QUICK = (
+    "trainer.accelerator=cpu",
+    "progress_bar=false",
+    "evaluated_frames=4",
+    "camera_check.clean=1.0",
+)
 """The camera check, which takes seconds, is not asked: tests/test_verdict.py asks it."""
 
 

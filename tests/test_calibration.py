@@ -10,7 +10,7 @@ import torch
 from ghpt.calibration.baseline import RigBaseline
 from ghpt.calibration.normal_matrix import linearise
 from ghpt.calibration.observations import choose_frames, observe, reweighted
-from ghpt.calibration.resection import Rig
+from ghpt.calibration.resection import PlacedRig
 from ghpt.calibration.uncertainty import gauge
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import Cameras
@@ -117,17 +117,17 @@ def test_uncertainty_is_the_size_of_the_error():
 
 def problem(views=3, seed=0):
     scene = people(frames=3, seed=seed).views(list(range(views)))
-    seen_by = observe(scene.K, scene.key_points, scene.valid, 0.01)
+    observed = observe(scene.K, scene.key_points, scene.valid, 0.01)
     cameras = scene.cameras
     points = scene.points.flatten(0, 1)
-    rig = Rig(
+    rig = PlacedRig(
         cameras.R,
         cameras.t / 1000,
         torch.ones(views, dtype=torch.bool),
         points / 1000,
-        seen_by.valid,
+        observed.valid,
     )
-    return seen_by, rig
+    return observed, rig
 
 
 def moved(rig, step):
@@ -139,21 +139,21 @@ def moved(rig, step):
 
 
 def test_gradient_is_that_of_the_cost():
-    seen_by, rig = problem()
-    state = linearise(seen_by, rig, rig.inlier, 3.0)
+    observed, rig = problem()
+    state = linearise(observed, rig, rig.inlier, 3.0)
     h, count = 1e-6, 18
     # in the directions of the gauge, moved points included, the cost does not change
     G = gauge(rig.R, rig.centre)
     assert (state.matrix @ G).abs().max() < 1e-6 * state.matrix.abs().max()
     assert (state.scores.sum(0) @ G).abs().max() < 1e-6 * state.scores.abs().max()
     # with the points at their best place for the views, eliminating them leaves the plain gradient
-    best = replace(rig, points=newton(seen_by, rig))
-    after = linearise(seen_by, best, best.inlier, 3.0)
+    best = replace(rig, points=newton(observed, rig))
+    after = linearise(observed, best, best.inlier, 3.0)
     plain = torch.tensor(
         [
             (
-                linearise(seen_by, moved(best, d), best.inlier, 3.0).cost
-                - linearise(seen_by, moved(best, -d), best.inlier, 3.0).cost
+                linearise(observed, moved(best, d), best.inlier, 3.0).cost
+                - linearise(observed, moved(best, -d), best.inlier, 3.0).cost
             )
             / (2 * h)
             for d in h * torch.eye(count, dtype=torch.float64)
@@ -165,7 +165,7 @@ def test_gradient_is_that_of_the_cost():
     )
 
 
-def newton(seen_by, rig):
+def newton(observed, rig):
     """The points at their best place for the views as they are."""
     points = rig.points.clone().requires_grad_()
     optimiser = torch.optim.LBFGS(
@@ -179,7 +179,7 @@ def newton(seen_by, rig):
     def cost():
         optimiser.zero_grad()
         x = points @ rig.R.mT + rig.t[:, None]
-        error = ((x[..., :2] / x[..., 2:] - seen_by.xy) / seen_by.noise[..., None])[rig.inlier]
+        error = ((x[..., :2] / x[..., 2:] - observed.xy) / observed.noise[..., None])[rig.inlier]
         value = (4.5 * torch.log1p(error.square().sum(-1) / 9)).sum()
         value.backward()
         return value
@@ -206,15 +206,15 @@ def test_frames_cover_time_and_place():
 def test_noise_of_views_and_joints_is_found():
     generator = torch.Generator().manual_seed(0)
     scene = people(frames=80, noise=0.0)
-    seen_by = observe(scene.K, scene.key_points, torch.ones_like(scene.valid), 0.01)
+    observed = observe(scene.K, scene.key_points, torch.ones_like(scene.valid), 0.01)
     view, joint = torch.tensor([1.0, 2.0, 0.5, 1.0]), torch.ones(17)
     joint[[0, 5]] = 1.7
-    sigma = (view[:, None] * joint[seen_by.joint]).double()
+    sigma = (view[:, None] * joint[observed.joint]).double()
     error = (
         sigma[..., None] * torch.randn(*sigma.shape, 2, generator=generator, dtype=torch.float64)
     ).norm(dim=-1)
     # of 2 x 4 numbers a point takes 3
-    found = reweighted(seen_by, error * (5 / 8) ** 0.5, seen_by.valid).noise / seen_by.noise
+    found = reweighted(observed, error * (5 / 8) ** 0.5, observed.valid).noise / observed.noise
     assert (found / sigma - 1).abs().max() < 0.12
 
 
@@ -296,7 +296,7 @@ def test_nobody_seen_is_said():
     estimate = replace(scene, valid=torch.zeros_like(scene.valid)).calibrate(CALIBRATE)
     assert not estimate.calibrated.any()
     assert not estimate.converged
-    assert {"few_frames", "unlinked"} <= {d.code for d in estimate.diagnoses}
+    assert {"few_frames", "unlinked"} <= {d.code for d in estimate.findings}
 
 
 def test_arrays_that_do_not_belong_together_are_refused():
@@ -326,4 +326,4 @@ def test_scaled_scales_lengths_alone():
     true = scene.cameras
     expected = (true.R[:1] @ (true.centre - true.centre[0])[..., None])[..., 0]
     assert (scaled.cameras.centre - expected).norm(dim=-1).max() < 60
-    assert scaled.diagnoses == estimate.diagnoses
+    assert scaled.findings == estimate.findings

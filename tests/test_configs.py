@@ -86,7 +86,7 @@ def test_the_length_of_t_has_its_choices(scale):
         f"scale_of_t@model.problem.scale={scale}",
         "model.scorer.layers=[2]",
     )
-    kinds = {"known": "KnownScale", "height": "BodyHeight", "segments": "SegmentLengths"}
+    kinds = {"known": "KnownScale", "height": "BodyHeight", "segments": "BoneLengths"}
     assert type(build(model["model"], "model").problem.scale).__name__ == kinds[scale]
 
 

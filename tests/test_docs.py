@@ -17,14 +17,14 @@ import documented
 import ghpt.commands.test as testing
 from documented import PAGES, ROOT, Block, Command
 from ghpt.commands import calibrate, predict, train
-from ghpt.commands import cameras as doctor
+from ghpt.commands import cameras as camera_check
 from ghpt.commands.overrides import Source, check_overrides
 
 MAINS = {
     "train.py": (train.COMMAND, {"last.ckpt", "best.ckpt"}),
     "test.py": (testing.COMMAND, {"predictions.npz", "metrics.json", "report.md"}),
     "predict.py": (predict.COMMAND, {"poses.npz", "report.md", "prediction.json"}),
-    "cameras.py": (doctor.COMMAND, {"checkup.json", "report.md"}),
+    "cameras.py": (camera_check.COMMAND, {"cameras.json", "report.md"}),
     "calibrate.py": (calibrate.COMMAND, {"rig.toml", "calibration.json", "report.md"}),
 }
 """What a script runs, and what its output folder then holds."""
@@ -39,8 +39,8 @@ SMALL = {
         "trainer.max_epochs=1",
     ),
     "test.py": (*QUICK, "data.stride=40"),
-    "predict.py": (*QUICK, "evaluated_frames=8", "verdict.clean=1.0"),
-    "cameras.py": ("doctor.frames=16", "doctor.shift=2"),
+    "predict.py": (*QUICK, "evaluated_frames=8", "camera_check.clean=1.0"),
+    "cameras.py": ("camera_check.frames=16", "camera_check.shift=2"),
     "calibrate.py": ("evaluated_frames=8", "calibration.frames=40"),
 }
 """What makes a command quick, where it does not say otherwise itself."""

@@ -8,8 +8,8 @@ import torch
 from markdown_it import MarkdownIt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ghpt.commands.cameras import _print as print_checkup
-from ghpt.commands.cameras import report as checkup_report
+from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.millimetres import RigScale
 from ghpt.commands.prediction.report import (
     report_document,
     summary_document,
@@ -17,21 +17,30 @@ from ghpt.commands.prediction.report import (
 )
 from ghpt.commands.prediction.result import PredictionResult
 from ghpt.commands.prediction.statistics import (
-    BoneVariation,
     Coverage,
     EstimatorErrors,
     Evaluation,
-    Quantiles,
     ScaledErrors,
-    ViewErrors,
 )
-from ghpt.commands.prediction.verdict import Finding, Level, Verdict
+from ghpt.commands.prediction.verdict import Verdict
 from ghpt.geometry.cameras import Cameras
-from ghpt.models.relative_pose.scale import SEGMENTS
-from ghpt.report.calibration import calibration_report, print_calibration
+from ghpt.models.relative_pose.scale import BONE_NAMES
+from ghpt.report.calibration import (
+    CalibratedCamera,
+    CalibrationResult,
+    Differences,
+    calibration_document,
+    calibration_summary,
+)
+from ghpt.report.camera_check import (
+    CameraReport,
+    CheckedCamera,
+    camera_check_document,
+    camera_check_summary,
+)
 from ghpt.report.markdown import render_markdown
-from ghpt.report.rig_comparison import Similarity
-from ghpt.report.rig_figure import rig_figure
+from ghpt.report.rig_comparison import BoneVariation, Quantiles, Similarity, ViewErrors
+from ghpt.report.rig_figure import DrawnRig, rig_figure
 from ghpt.report.terminal import print_document
 
 BAD = "a|b<c>[red]"
@@ -57,11 +66,13 @@ def prediction() -> PredictionResult:
     found = EstimatorErrors(
         reprojection=errors,
         held_out=errors,
-        segments=BoneVariation(0.1, dict.fromkeys(SEGMENTS, 0.1)),
+        segments=BoneVariation(0.1, dict.fromkeys(BONE_NAMES, 0.1)),
         placed=1.0,
         scales=ScaledErrors(None, {}),
     )
-    finding = Finding("moved", Level.LOOK, f"{BAD} is off", 0.1, 0.0, f"python cameras.py {BAD}")
+    finding = Finding(
+        "moved", Severity.WARNING, f"{BAD} is off", value=0.1, command=f"python cameras.py {BAD}"
+    )
     return PredictionResult(
         data=BAD,
         source=BAD,
@@ -81,66 +92,80 @@ def prediction() -> PredictionResult:
     )
 
 
-def calibration() -> dict:
-    camera = {
-        "name": BAD,
-        "calibrated": True,
-        "reprojection_px": 1.0,
-        "inliers": 1.0,
-        "rotation_sd_deg": 0.1,
-        "centre_sd_mm": 1.0,
-    }
-    return {
-        "data": BAD,
-        "frames": 3,
-        "seed": 0,
-        "cameras": [camera],
-        "scale": {"text": BAD},
-        "explains": {},
-        "reference": BAD,
-        "difference": {"scale": 1.0, "rotation_deg": {BAD: 1.0}, "centre_mm": {BAD: 1.0}},
-        "diagnoses": [{"severity": "error", "code": "x", "text": BAD}],
-        "provenance": PROVENANCE,
-    }
+def calibration() -> CalibrationResult:
+    camera = CalibratedCamera(
+        name=BAD,
+        calibrated=True,
+        reprojection_px=1.0,
+        inliers=1.0,
+        rotation_sd_deg=0.1,
+        centre_sd_mm=1.0,
+        R=None,
+        t_mm=None,
+        centre_mm=None,
+        covariance=None,
+        K=[],
+        distortion=[],
+        size=None,
+    )
+    return CalibrationResult(
+        data=BAD,
+        source="",
+        cameras_file="",
+        frames=3,
+        seed=0,
+        scale=RigScale("height", BAD, 1.0),
+        world="",
+        reference=BAD,
+        triangulation="linear",
+        converged=True,
+        usable=(BAD,),
+        cameras=(camera,),
+        difference=Differences({BAD: 1.0}, {BAD: 1.0}, 1.0),
+        explains={},
+        findings=(Finding("x", Severity.ERROR, BAD),),
+        provenance=PROVENANCE,
+    )
 
 
-def checkup() -> dict:
-    finding = {"code": "x", "text": BAD, "before_px": 2.0, "after_px": 1.0, "mended": True}
-    return {
-        "title": BAD,
-        "frames": 3,
-        "stature_mm": 1700.0,
-        "unit_mm": None,
-        "findings": [finding],
-        "cameras": [{"name": BAD, "error_px": 1.0, "mended_px": 1.0}],
-    }
+def camera_check() -> CameraReport:
+    return CameraReport(
+        title=BAD,
+        source="",
+        frames=3,
+        stature_mm=1700.0,
+        unit_mm=None,
+        findings=(Finding("x", Severity.ERROR, BAD, before_px=2.0, after_px=1.0, mended=True),),
+        cameras=(CheckedCamera(BAD, 1.0, 1.0),),
+        provenance=PROVENANCE,
+    )
 
 
 @pytest.mark.parametrize(
     ("numbers", "report", "times"),
     [
-        (prediction, lambda numbers: render_markdown(report_document(numbers)), 8),
-        (calibration, calibration_report, 6),
-        (checkup, checkup_report, 3),
+        (prediction, report_document, 8),
+        (calibration, calibration_document, 6),
+        (camera_check, camera_check_document, 3),
     ],
 )
 def test_a_report_shows_names_as_they_are(numbers, report, times):
-    shown = [content for _, content in rendered(report(numbers()))]
+    shown = [content for _, content in rendered(render_markdown(report(numbers())))]
     assert sum(content.count(BAD) for content in shown) == times
 
 
 @pytest.mark.parametrize(
     ("numbers", "show", "times"),
     [
-        (prediction, lambda result: print_document(summary_document(result)), 4),
-        (prediction, lambda result: print_document(verdict_document(result)), 3),
-        (calibration, print_calibration, 6),
-        (checkup, print_checkup, 3),
+        (prediction, summary_document, 4),
+        (prediction, verdict_document, 3),
+        (calibration, calibration_summary, 6),
+        (camera_check, camera_check_summary, 3),
     ],
 )
 def test_the_terminal_shows_names_as_they_are(numbers, show, times, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
-    show(numbers())
+    print_document(show(numbers()))
     assert capsys.readouterr().out.count(BAD) == times
 
 
@@ -152,8 +177,7 @@ def test_a_dollar_in_a_camera_s_name_is_no_formula():
     )
     same = Similarity(torch.eye(3).double(), 1.0, torch.zeros(3).double())
     points, estimated = torch.zeros(1, 17, 3).double(), torch.zeros(1, 17).bool()
-    figure = rig_figure(
-        r"$\a$", (r"$\b$",), rig, torch.zeros(1, 6, 6).double(), points, estimated, same
-    )
+    drawn = DrawnRig((r"$\b$",), rig, torch.zeros(1, 6, 6).double(), points, estimated)
+    figure = rig_figure(r"$\a$", drawn, same)
     FigureCanvasAgg(figure).draw()
     assert np.isfinite(figure.get_size_inches()).all()

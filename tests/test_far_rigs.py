@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from ghpt.calibration.millimetres import RigScale
 from ghpt.commands.predict import predict
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
@@ -24,6 +25,7 @@ from ghpt.errors import GhptDataError
 from ghpt.export import WRITERS, Evidence, Scene, read_reconstruction
 from ghpt.geometry.cameras import CameraSet
 from ghpt.observations import Recording
+from ghpt.report.calibration import CalibrationResult
 from ghpt.report.rig_files import write_poses
 from ghpt.skeleton import MIRROR
 from predicting import config, numbers_of, walk
@@ -252,9 +254,11 @@ def test_rig_files_have_the_digits(tmp_path, write):
 def test_the_poses_of_a_calibration_have_them_too(tmp_path):
     points = walk()[:FRAMES] + torch.tensor(OFFSETS["10,000 km"], dtype=torch.float64)
     recording = MagicMock(spec=Recording, frame=np.arange(FRAMES), rate_hz=50.0)
-    keys = ("data", "source", "scale", "world", "triangulation", "usable", "provenance")
+    result = MagicMock(spec=CalibrationResult, scale=RigScale("height", "", 1.0))
+    for name in ("data", "source", "world", "triangulation", "usable", "provenance"):
+        setattr(result, name, None)
     estimated = torch.ones(FRAMES, 17, dtype=torch.bool)
-    write_poses(tmp_path / "poses.npz", recording, points, estimated, dict.fromkeys(keys))
+    write_poses(tmp_path / "poses.npz", recording, points, estimated, result)
     assert np.abs(in_npz(tmp_path) - points.numpy()).max() == 0
 
 

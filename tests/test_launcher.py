@@ -26,8 +26,9 @@ LOCAL = "hydra/launcher=submitit_local"
 SLURM = {  # stand-ins: an array's jobs run at once, on this machine
     "sbatch": """
         for i in $(seq 0 $(sed -n 's/#SBATCH --array=0-\\([0-9]*\\).*/\\1/p' "$1")); do
-            SLURM_JOB_ID=7_$i SLURM_ARRAY_JOB_ID=7 SLURM_ARRAY_TASK_ID=$i SLURM_JOB_NODELIST=n SLURM_JOB_NUM_NODES=1 \\
-            SLURM_NTASKS=1 SLURM_PROCID=0 SLURM_LOCALID=0 SLURM_NODEID=0 bash "$1" > /dev/null 2>&1 &
+            SLURM_JOB_ID=7_$i SLURM_ARRAY_JOB_ID=7 SLURM_ARRAY_TASK_ID=$i \\
+            SLURM_JOB_NODELIST=n SLURM_JOB_NUM_NODES=1 SLURM_NTASKS=1 SLURM_PROCID=0 \\
+            SLURM_LOCALID=0 SLURM_NODEID=0 bash "$1" > /dev/null 2>&1 &
         done
         echo Submitted batch job 7""",
     "srun": 'while [ "$1" != "$PYTHON" ]; do shift; done; exec "$@"',

@@ -161,7 +161,7 @@ def trainer_of(*commands: str) -> Mock:
     [
         (
             "kill -9 $$",
-            r"^trainer.devices: process 2 of 2 was killed by signal 9; the system does so where memory is",
+            r"^trainer.devices: process 2 of 2 was killed by signal 9; the system does so",
         ),
         ("exit 3", r"^trainer.devices: process 2 of 2 ended with status 3. "),
     ],

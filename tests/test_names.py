@@ -7,7 +7,7 @@ from typing import get_type_hints
 import pytest
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from ghpt.calibration.millimetres import read_scale
+from ghpt.calibration.millimetres import ScaleSettings, read_scale
 from ghpt.commands.inputs import InputSettings
 from ghpt.config import check_type
 from ghpt.data.formats.names import chosen_name
@@ -43,10 +43,11 @@ def test_match_takes_such_names_on_both_sides(name):
 
 @pytest.mark.parametrize("name", STRANGE)
 def test_a_baseline_takes_such_names(name):
-    scale = {"height": None, "segments": None, "assumed_height": 1730}
-    read_scale(scale | {"baseline": typed(f"x=[{name},cam,3000]")}, (name, "cam"))
+    baseline = typed(f"x=[{name},cam,3000]")
+    source = read_scale(ScaleSettings(baseline=baseline), (name, "cam"))
+    assert source.names == (name, "cam")
     with pytest.raises(GhptConfigError, match=r"scale\.baseline"):
-        read_scale(scale | {"baseline": typed("x=[5,cam,3000]")}, (name, "cam"))
+        read_scale(ScaleSettings(baseline=typed("x=[5,cam,3000]")), (name, "cam"))
 
 
 def test_a_leading_zero_of_yaml_is_found_and_an_exact_name_comes_first():

@@ -189,7 +189,8 @@ def test_with_a_damaged_manifest_nothing_is_ours(tmp_path, damage):
 
 def test_b10_a_second_writer_is_refused_at_once_and_a_dead_ones_lock_is_taken_over(tmp_path):
     script = (
-        "import sys, time; from pathlib import Path; from ghpt.commands.outputs import Files, OutputFolder\n"
+        "import sys, time; from pathlib import Path\n"
+        "from ghpt.commands.outputs import Files, OutputFolder\n"
         "with OutputFolder(Path(sys.argv[1]), Files()):\n"
         "    print('in', flush=True); time.sleep(600)\n"
     )
@@ -240,24 +241,18 @@ def test_the_stamp_of_a_folder_changes_with_any_file_below_it(tmp_path):
 
 
 def test_the_inputs_of_a_command_are_those_that_its_settings_name(tmp_path):
-    settings = {
-        "ckpt": "m.ckpt",
-        "keypoints": "pose",
-        "cameras": str(tmp_path),
-        "data": {"root": "/data"},
-    }
-    found = input_paths(settings)
+    found = input_paths("m.ckpt", "pose", str(tmp_path), "/data")
     named = [Path("m.ckpt"), Path("pose"), tmp_path, Path("/data")]
     assert set(found) == {*named, tmp_path / "intri.yml", tmp_path / "extri.yml"}
-    assert input_paths({"ckpt": None, "data": {"root": None}}) == ()
+    assert input_paths(None, None) == ()
 
 
 def test_the_folder_of_key_points_is_no_output(tmp_path):
     with pytest.raises(
         GhptConfigError, match=r"output: is .*, the folder that the key points are read from"
     ):
-        check_apart({"keypoints": str(tmp_path), "output": f"{tmp_path}/."})
-    check_apart({"keypoints": str(tmp_path), "output": f"{tmp_path}/out"})
+        check_apart(str(tmp_path), f"{tmp_path}/.")
+    check_apart(str(tmp_path), f"{tmp_path}/out")
 
 
 COMMANDS = {
@@ -274,7 +269,7 @@ COMMANDS = {
     "cameras": (
         ghpt.commands.cameras.COMMAND,
         [],
-        ["cameras.toml", "keypoints.npz", "checkup.json", "report.md"],
+        ["cameras.toml", "keypoints.npz", "cameras.json", "report.md"],
     ),
     "train": (
         train.COMMAND,
@@ -308,7 +303,7 @@ def test_no_command_touches_a_foreign_folder(typed, tmp_path, name):
 
 
 def test_a_calibration_beside_its_own_inputs_is_refused_and_leaves_them(typed, tmp_path):
-    """EasyMocap's layout: cameras in intri.yml and extri.yml of the folder that is also the output."""
+    """EasyMocap's layout: intri.yml and extri.yml lie in the folder that is also the output."""
     for name in ("intri.yml", "extri.yml"):
         (tmp_path / name).write_text("%YAML:1.0\n---\n")
     before = contents(tmp_path)

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.calibration.millimetres import read_scale
+from ghpt.calibration.millimetres import ScaleSettings, read_scale
 from ghpt.data.synthetic import body
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.scale import (
-    SEGMENTS,
+    BONE_NAMES,
     BodyHeight,
+    BoneLengths,
     KnownScale,
-    SegmentLengths,
     average_lengths,
     body_scale,
     stature,
@@ -50,7 +50,7 @@ def test_every_scale_finds_the_true_length():
     length = t.norm(dim=-1)
     estimate = RelativePoseEstimate(R, t / length[:, None], torch.ones(2, dtype=torch.bool))
     true = bones(scene.points)
-    segments = SegmentLengths({SEGMENTS[i]: float(true[i]) for i in (0, 1, 11)})
+    segments = BoneLengths({BONE_NAMES[i]: float(true[i]) for i in (0, 1, 11)})
     torch.testing.assert_close(KnownScale()(estimate, problem), length)
     torch.testing.assert_close(segments(estimate, problem), length, rtol=1e-6, atol=0)
     height = float(stature(scene.points, torch.ones(scene.points.shape[:-1], dtype=torch.bool)))
@@ -70,7 +70,7 @@ def test_a_joint_that_one_of_two_views_sees_measures_nothing():
     problem, R, t, scene = batch()
     length = t.norm(dim=-1)
     estimate = RelativePoseEstimate(R, t / length[:, None], torch.ones(2, dtype=torch.bool))
-    segments = SegmentLengths({SEGMENTS[0]: float(bones(scene.points)[0])})
+    segments = BoneLengths({BONE_NAMES[0]: float(bones(scene.points)[0])})
     end = BONES[0][0]
     problem.valid[:, 0, :15, end] = False
     problem.key_points[:, 0, :15, end] = 0
@@ -119,13 +119,13 @@ def test_average_adult_is_the_median_of_many():
 
 
 def test_segments_have_names_on_both_sides():
-    assert len(set(SEGMENTS)) == len(BONES)
-    for name, ends in zip(SEGMENTS, BONES, strict=True):
+    assert len(set(BONE_NAMES)) == len(BONES)
+    for name, ends in zip(BONE_NAMES, BONES, strict=True):
         if name.endswith("thigh"):
             side = name.split("_")[0]
             assert {JOINTS[j] for j in ends} == {f"{side}_knee", f"{side}_hip"}
     both = dict(
-        zip(SEGMENTS, SegmentLengths({"thigh": 430.0, "left_forearm": 250.0}).lengths, strict=True)
+        zip(BONE_NAMES, BoneLengths({"thigh": 430.0, "left_forearm": 250.0}).lengths, strict=True)
     )
     assert {name for name, mm in both.items() if mm} == {
         "right_thigh",
@@ -137,7 +137,7 @@ def test_segments_have_names_on_both_sides():
 @pytest.mark.parametrize("lengths", [{}, {"tail": 300.0}, {"thigh": 0.0}, {"thigh": -1.0}])
 def test_bad_lengths_are_named(lengths):
     with pytest.raises(GhptConfigError, match="lengths"):
-        SegmentLengths(lengths)
+        BoneLengths(lengths)
 
 
 def test_bad_height_is_named():
@@ -145,24 +145,23 @@ def test_bad_height_is_named():
         BodyHeight(0.0)
 
 
-NOTHING = {"height": None, "segments": None, "baseline": None, "assumed_height": 1730.0}
+def scale(**given):
+    return read_scale(ScaleSettings(**given), "ab")
 
 
 @pytest.mark.parametrize(
     ("given", "mm"), [(1750, 1750.0), (1.75, 1750.0), (175, 1750.0), (1.1, 1100.0), (205.0, 2050.0)]
 )
 def test_a_height_in_metres_or_centimetres_is_taken_for_one(given, mm):
-    assert read_scale(NOTHING | {"height": given}, "ab")["height"] == pytest.approx(mm)
-    assert read_scale(NOTHING | {"assumed_height": given}, "ab")["assumed_height"] == pytest.approx(
-        mm
-    )
+    assert scale(height=given).mm == pytest.approx(mm)
+    assert scale(assumed_height=given).mm == pytest.approx(mm)
 
 
 @pytest.mark.parametrize("given", [-1, 0, math.nan, math.inf, 17500, 5.9, 69, 17.5, 0.175, True])
 @pytest.mark.parametrize("key", ["height", "assumed_height"])
 def test_a_height_that_is_nobodys_is_an_error(key, given):
     with pytest.raises(GhptConfigError, match=rf"scale\.{key}: is .*1750"):
-        read_scale(NOTHING | {key: given}, "ab")
+        scale(**{key: given})
 
 
 @pytest.mark.parametrize(
@@ -174,7 +173,7 @@ def test_a_height_that_is_nobodys_is_an_error(key, given):
     ],
 )
 def test_segments_are_all_of_one_unit(given, mm):
-    assert read_scale(NOTHING | {"segments": given}, "ab")["segments"]["thigh"] == pytest.approx(mm)
+    assert scale(segments=given).mm["thigh"] == pytest.approx(mm)
 
 
 @pytest.mark.parametrize(
@@ -189,19 +188,17 @@ def test_segments_are_all_of_one_unit(given, mm):
 )
 def test_segments_that_are_nobodys_are_an_error(given):
     with pytest.raises(GhptConfigError, match=r"scale\.segments"):
-        read_scale(NOTHING | {"segments": given}, "ab")
+        scale(segments=given)
 
 
 @pytest.mark.parametrize(("given", "mm"), [(3000, 3000.0), (3.2, 3200.0), (0.4, 400.0)])
 def test_a_baseline_in_metres_is_taken_for_one(given, mm):
-    assert read_scale(NOTHING | {"baseline": ["a", "b", given]}, "ab")["baseline"] == [
-        "a",
-        "b",
-        pytest.approx(mm),
-    ]
+    source = scale(baseline=["a", "b", given])
+    assert source.names == ("a", "b")
+    assert source.mm == pytest.approx(mm)
 
 
 @pytest.mark.parametrize("given", [30, 100, 0.01, -3, math.nan, "3000"])
 def test_a_baseline_that_could_be_of_any_unit_is_an_error(given):
     with pytest.raises(GhptConfigError, match=r"scale\.baseline"):
-        read_scale(NOTHING | {"baseline": ["a", "b", given]}, "ab")
+        scale(baseline=["a", "b", given])

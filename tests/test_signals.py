@@ -16,6 +16,7 @@ import toys
 from ghpt import provenance as origin
 from ghpt.commands import predict as prediction
 from ghpt.commands.app import Command
+from ghpt.commands.cameras import CamerasSettings
 from ghpt.commands.outputs import Files
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.data.people.sequence import Sequence
@@ -52,7 +53,11 @@ def test_a_signal_ends_a_command_with_its_status_and_no_word(typed, tmp_path, na
     status, said, errors = typed(
         CONF,
         Command(
-            name="cameras", settings=dict, task=task, summary=str, files=lambda settings: Files()
+            name="cameras",
+            settings=CamerasSettings,
+            task=task,
+            summary=str,
+            files=lambda settings: Files(),
         ),
         [f"output={tmp_path}"],
     )

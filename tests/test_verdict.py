@@ -16,10 +16,11 @@ import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+from composed import cameras_settings
 from ghpt.calibration.check.units import unit_for, unit_of
-from ghpt.commands.cameras import examine
+from ghpt.commands.cameras import CamerasSettings, check_cameras
 from ghpt.commands.prediction.next_commands import commands_on, setting
-from ghpt.commands.prediction.verdict import Commands, Judge, Level
+from ghpt.commands.prediction.verdict import Commands, Judge, Level, Measures
 from ghpt.config import build, plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_pose2sim
@@ -34,11 +35,11 @@ from single_person import SinglePerson, write_person
 
 RIG = human36m_rig("S9")
 QUICKLY = (
-    "verdict.clean=0.004",
+    "camera_check.clean=0.004",
     "evaluated_frames=40",
     "fitted_frames=40",
-    "doctor.frames=24",
-    "doctor.shift=12",
+    "camera_check.frames=24",
+    "camera_check.shift=12",
     "formats=[npz]",
 )
 NAMES = tuple(f"cam_{i:02d}" for i in range(4))
@@ -165,8 +166,8 @@ def test_a_stated_unit_that_makes_a_giant_is_not_to_be_used_and_the_command_mend
     numbers = judged(tmp_path, pixels(), rig)
     assert numbers["verdict"]["level"] == "do not use"
     (finding,) = numbers["verdict"]["findings"]
-    assert finding["code"] == "size"
-    assert finding["value"] > 1e6
+    assert finding["code"] == "unit"
+    assert finding["value"] == 1e-3
     words = shlex.split(finding["command"])
     assert words[:2] == ["python", "predict.py"]
     assert "unit_mm=1" in words
@@ -191,10 +192,8 @@ def test_most_views_out_of_time_are_not_to_be_used(tmp_path):
     assert "left_out_error" in codes(numbers)
 
 
-def cameras_settings(points: Path, cameras: Path) -> dict:
-    words = [f"keypoints={points}", f"cameras={cameras}", "output=unused"]
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return plain(hydra.compose("cameras", words))
+def check_settings(points: Path, cameras: Path) -> CamerasSettings:
+    return cameras_settings(f"keypoints={points}", f"cameras={cameras}")
 
 
 def test_another_frame_rate_is_named_by_both_commands_and_matched_by_time(tmp_path):
@@ -205,7 +204,7 @@ def test_another_frame_rate_is_named_by_both_commands_and_matched_by_time(tmp_pa
     checked = tmp_path / "checked"
     checked.mkdir()
     with pytest.raises(GhptDataError, match="cam_02: frame_rate"):
-        examine(cameras_settings(tmp_path / "points.npz", cameras_file(tmp_path)), checked)
+        check_cameras(check_settings(tmp_path / "points.npz", cameras_file(tmp_path)), checked)
     words = [f"keypoints={checked / 'keypoints.npz'}", f"cameras={checked / 'cameras.toml'}"]
     assert numbers_of(config(*QUICKLY, *words), tmp_path / "again")["verdict"]["level"] == "good"
 
@@ -221,7 +220,7 @@ def test_normalised_key_points_are_an_error_in_every_command(bounds, tmp_path):
     with pytest.raises(GhptDataError, match=f"between {bounds} in an image of 1000 x 100"):
         judged(tmp_path, SCALES[bounds])
     with pytest.raises(GhptDataError, match="normalised"):
-        examine(cameras_settings(points, cameras), tmp_path)
+        check_cameras(check_settings(points, cameras), tmp_path)
     assert not list((tmp_path / "out").glob("poses.*"))
 
 
@@ -268,15 +267,9 @@ def said(
     rejected: float = 0.0,
     unit_mm: float = 1000.0,
 ):
-    views = dict.fromkeys(NAMES, error)
-    numbers = {
-        "stature_mm": height,
-        "scales": {"all": error, "views": views},
-        "cameras": list(NAMES),
-        "share": {"rejected": rejected, "observed": 1 - rejected},
-    }
+    measures = Measures(height, error, dict.fromkeys(NAMES, error), rejected)
     commands = Commands("cameras", "calibrate", lambda **more: f"predict {more}")
-    return judge()(numbers, None, unit_mm, commands)
+    return judge()(measures, (), unit_mm, commands)
 
 
 @pytest.mark.parametrize(

@@ -120,3 +120,13 @@ def test_a_mistyped_key_ends_in_one_line(installed: Installed) -> None:
     assert done.returncode == 1
     assert done.stderr.startswith("error: dat: no such setting. Did you mean 'data'?")
     assert done.stderr.count("\n") == 1
+
+
+def test_a_folder_of_a_users_own_configurations_is_added(installed: Installed) -> None:
+    own = installed.elsewhere / "conf" / "data" / "mine.yaml"
+    own.parent.mkdir(parents=True)
+    own.write_text("defaults: [cmu1]\nstride: 7\n", encoding="utf-8")
+    words = ("-m", "ghpt", "train", "data=mine", "--config-dir", "conf", "--cfg", "job")
+    done = installed.run(*words)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "  stride: 7\n" in done.stdout

@@ -7,16 +7,22 @@ import os
 import signal
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 
 from ghpt.commands.app import Command, run
-from ghpt.commands.outputs import Files
+from ghpt.commands.outputs import Files, OutputSettings
 from ghpt.errors import GhptConfigError
 from ghpt.files import atomic_write
 
 
-def task(config, output):
-    match config["how"]:
+@dataclass(frozen=True, kw_only=True)
+class ToySettings(OutputSettings):
+    how: str
+
+
+def task(settings, output):
+    match settings.how:
         case "once":  # fails in its first run
             if not (output / "failed").exists():
                 (output / "failed").touch()
@@ -41,7 +47,7 @@ def after(jobs):
     told = [
         {
             "name": j.name,
-            "how": (j.settings or {}).get("how"),
+            "how": j.settings and j.settings.how,
             "result": j.result,
             "failed": j.failed,
         }
@@ -57,7 +63,7 @@ if __name__ == "__main__":
         submitit.Job._results_timeout_s = 0  # a local disk shows at once what a killed job has left
     command = Command(
         name="toy",
-        settings=dict,
+        settings=ToySettings,
         task=task,
         summary=lambda result: "done",
         files=lambda settings: Files(),

@@ -35,7 +35,8 @@ def main(words: Sequence[str] | None = None) -> None:
 def _help() -> str:
     width = max(map(len, SUMMARIES))
     lines = [f"  {name:<{width}}  {summary}" for name, summary in SUMMARIES.items()]
-    return "\n".join([f"{ghpt.__doc__}\n\n{_USAGE}\n", *lines])
+    title = str(ghpt.__doc__).partition("\n")[0]
+    return "\n".join([title, "", _USAGE, "", *lines])
 
 
 def _run(name: str, words: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""The errors that a user can cause and mend. Each names where, what is wrong and the mend."""
+"""The errors that a user can cause. Each names where, what is wrong and the hint what to do."""
 
 import re
 from typing import Any
@@ -7,14 +7,17 @@ _NO_MEMORY = re.compile(r"can't allocate memory|out of memory")
 
 
 class GhptError(ValueError):
-    """Base of all errors that ghpt raises on purpose. They can be sent from one process to another."""
+    """Base of all errors that ghpt raises on purpose.
+
+    They can be sent from one process to another.
+    """
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return _again, (type(self), str(self), vars(self))
+        return _restore, (type(self), str(self), vars(self))
 
 
-def _again(kind: type[GhptError], text: str, attributes: dict[str, Any]) -> GhptError:
-    """An unpickled error: its constructor takes other arguments than its text."""
+def _restore(kind: type[GhptError], text: str, attributes: dict[str, Any]) -> GhptError:
+    """Return an unpickled error, whose constructor takes other arguments than its text."""
     error = kind.__new__(kind, text)
     error.args = (text,)
     error.__dict__.update(attributes)
@@ -32,7 +35,8 @@ class GhptDataError(GhptError):
         self.field = field
         self.problem = problem
         self.hint = hint
-        super().__init__(f"{where}: {f'{field}: ' if field else ''}{problem}. {hint}")
+        place = f"{where}: {field}" if field else str(where)
+        super().__init__(f"{place}: {problem}. {hint}")
 
 
 class GhptConfigError(GhptError):
@@ -56,23 +60,27 @@ class GhptCheckpointError(GhptError):
 
 
 def one_line(error: BaseException) -> str:
-    """An error's text without its line breaks."""
-    return " ".join(str(error).split())
+    """Return an error's text without its line breaks."""
+    words = str(error).split()
+    return " ".join(words)
 
 
 def out_of_memory(error: Exception) -> GhptConfigError | None:
-    """The error in words, if it is that there was no more memory."""
-    torch_s = isinstance(error, RuntimeError) and _NO_MEMORY.search(str(error))
-    if not (isinstance(error, MemoryError) or torch_s):
+    """Return the error in words, if it is that there was no more memory."""
+    text = str(error)
+    is_torchs = isinstance(error, RuntimeError) and _NO_MEMORY.search(text)
+    if not isinstance(error, MemoryError) and not is_torchs:
         return None
-    lines = str(error).splitlines() or ["an allocation failed"]
+    first = (text.splitlines() or ["an allocation failed"])[0]
+    reason = first[:200].rstrip(".")
     hint = "Give smaller batches or fewer hypotheses, or close other programs."
-    return GhptConfigError("memory", f"there is not enough ({lines[0][:200].rstrip('.')})", hint)
+    return GhptConfigError("memory", f"there is not enough ({reason})", hint)
 
 
 def check(condition: bool, key: str, problem: str, hint: str) -> None:
-    """Raise GhptConfigError unless ``condition`` holds: for the constructors that yaml values
-    reach.
+    """Raise GhptConfigError unless ``condition`` holds.
+
+    It is for the constructors that values of the yaml reach.
     """
     if not condition:
         raise GhptConfigError(key, problem, hint)
@@ -81,4 +89,5 @@ def check(condition: bool, key: str, problem: str, hint: str) -> None:
 def check_positive(**values: float | int) -> None:
     """Raise GhptConfigError for a setting that is not > 0."""
     for name, value in values.items():
-        check(value > 0, name, f"is {value}", "It must be > 0.")
+        is_positive = value > 0
+        check(is_positive, name, f"is {value}", "It must be > 0.")

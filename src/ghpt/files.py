@@ -37,7 +37,7 @@ _ABANDONED = 24 * 3600.0
 
 @runtime_checkable
 class Guard(Protocol):
-    """Decides what may happen to the files of a folder; see `ghpt.commands.outputs.OutputFolder`."""
+    """Decides what may happen to a folder's files; see `ghpt.commands.outputs.OutputFolder`."""
 
     def before_replace(self, path: Path, new: Path) -> None:
         """``new`` is about to take the place of ``path``. Raises GhptDataError if it must not."""
@@ -85,7 +85,7 @@ def _temporary(path: Path) -> Path:
 
 @contextmanager
 def errors_name(path: str | Path) -> Iterator[None]:
-    """Have an OSError of the block that names no file name this one, such as that the disk is full."""
+    """Have an OSError of the block that names no file name this one (the disk is full, say)."""
     try:
         yield
     except OSError as error:
@@ -128,25 +128,23 @@ def atomic_write(
     temporary = _temporary(path)
     second = _temporary(path)
     try:
-        with open(
-            temporary, mode, **({} if "b" in mode else {"encoding": "utf-8", "newline": "\n"})
-        ) as handle:
+        with _open(temporary, mode) as handle:
             yield handle
             handle.flush()
             os.fsync(handle.fileno())
         if verify is not None:
             verify(temporary)
-        keep = previous is not None and path.exists()
-        if keep:
+        kept = previous if path.exists() else None
+        if kept is not None:
             _second_name(path, second)
         guard = _guard_of(path)
         if guard is not None:
             guard.before_replace(path, temporary)
-            if keep:
-                guard.before_replace(previous, second)
+            if kept is not None:
+                guard.before_replace(kept, second)
         os.replace(temporary, path)
-        if keep:
-            os.replace(second, previous)
+        if kept is not None:
+            os.replace(second, kept)
     except BaseException as error:
         for leftover in (temporary, second):
             with suppress(OSError):
@@ -155,6 +153,13 @@ def atomic_write(
             error.filename = str(path)
         raise
     _sync_folder(path.parent)
+
+
+def _open(path: Path, mode: str) -> IO[Any]:
+    """Open a file; text is UTF-8 with the same line ends on every system."""
+    if "b" in mode:
+        return open(path, mode)
+    return open(path, mode, encoding="utf-8", newline="\n")
 
 
 def remove(path: str | Path) -> None:

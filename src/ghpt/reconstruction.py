@@ -4,15 +4,17 @@ missing.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
 from typing import Any
 
+import torch
 from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from ghpt.geometry.state import FILE_STATES, State
 
-__all__ = ["FILE_STATES", "About", "Reconstruction", "State"]
+__all__ = ["FILE_STATES", "About", "Reconstruction", "State", "concatenate", "move_to_cpu"]
 
 
 @dataclass(frozen=True)
@@ -66,3 +68,17 @@ class Reconstruction:
     def has_position(self) -> Bool[Tensor, "T J"]:
         """Joints that have a position."""
         return self.state <= State.FILLED
+
+
+def move_to_cpu(part: Reconstruction) -> Reconstruction:
+    """Return the reconstruction in the memory of the CPU."""
+    values = {field.name: getattr(part, field.name).cpu() for field in fields(Reconstruction)}
+    return Reconstruction(**values)
+
+
+def concatenate(parts: Sequence[Reconstruction]) -> Reconstruction:
+    """Return successive parts as one."""
+    values = {}
+    for field in fields(Reconstruction):
+        values[field.name] = torch.cat([getattr(part, field.name) for part in parts])
+    return Reconstruction(**values)

@@ -368,7 +368,12 @@ FORMATS: dict[str, Format] = {
 
 def values(found: Any) -> dict[str, Any]:
     """What was read, without where from."""
-    return {name: value for name, value in vars(found).items() if name not in ("path", "format")}
+    held = {name: value for name, value in vars(found).items() if name not in ("path", "format")}
+    points = held.pop("points", None)
+    if points is None:
+        return held
+    own = {"key_points": points.pixels, "confidence": points.confidence, "valid": points.valid}
+    return held | own
 
 
 def same(a: Any, b: Any) -> bool:

@@ -146,7 +146,7 @@ def targets(victim: Path, ckpt: Path) -> dict[str, dict[str, Any]]:
         },
         # ours, which build, start or change something
         "ghpt.config.build": {
-            "config": {"_target_": "ghpt.commands.prediction.shards._parsed", "line": order}
+            "config": {"_target_": "ghpt.commands.prediction.shards._parse", "line": order}
         },
         "ghpt.config._is_module": {"name": "evil_module"},
         "ghpt.models.registry.check_trust": {"trust": ["mine"]},

@@ -8,15 +8,15 @@ import torch
 
 import sizes
 from ghpt.calibration.bundle import BundleAdjustment
-from ghpt.calibration.observations import Observations
-from ghpt.calibration.resection import Rig
+from ghpt.calibration.observations import Correspondences
+from ghpt.calibration.resection import PlacedRig
 from ghpt.geometry.rotations import vector_to_matrix
 
 ADJUST = BundleAdjustment(loss_scale=3.0, iterations=50, seconds=2.0, tolerance=1e-6)
 SPOILT = (math.nan, math.inf, -math.inf, 1e308, 1e30, 0.0)
 
 
-def random_problem(rng: np.random.Generator) -> tuple[Observations, Rig]:
+def random_problem(rng: np.random.Generator) -> tuple[Correspondences, PlacedRig]:
     """2 to 4 cameras around a cloud, any start from near the truth to nonsense, every third with
     broken numbers.
     """
@@ -38,12 +38,12 @@ def random_problem(rng: np.random.Generator) -> tuple[Observations, Rig]:
         broken.view(-1)[int(rng.integers(broken.numel()))] = float(rng.choice(SPOILT))
     valid &= valid.sum(0) >= 2
     frame = torch.zeros(joints, dtype=torch.int64)
-    return Observations(xy, noise, valid, frame, torch.arange(joints)), Rig(
+    return Correspondences(xy, noise, valid, frame, torch.arange(joints)), PlacedRig(
         R, t, torch.ones(views, dtype=torch.bool), points, valid
     )
 
 
-def residuals(seen_by: Observations, rig: Rig, step: torch.Tensor) -> torch.Tensor:
+def residuals(observed: Correspondences, rig: PlacedRig, step: torch.Tensor) -> torch.Tensor:
     """Of the used observations, in units of noise, after a step (rotation vectors, translations,
     points).
     """
@@ -59,20 +59,22 @@ def residuals(seen_by: Observations, rig: Rig, step: torch.Tensor) -> torch.Tens
     ).view(-1, 3, 3)
     R = rig.R + skew @ rig.R  # exp to first order: enough for derivatives at 0
     in_camera = (rig.points + x) @ R.mT + (rig.t + t)[:, None]
-    error = (in_camera[..., :2] / in_camera[..., 2:] - seen_by.xy) / seen_by.noise[..., None]
+    error = (in_camera[..., :2] / in_camera[..., 2:] - observed.xy) / observed.noise[..., None]
     return error[rig.inlier]
 
 
-def independent(seen_by: Observations, rig: Rig, scale: float) -> tuple[float, float, bool]:
+def independent(
+    observed: Correspondences, rig: PlacedRig, scale: float
+) -> tuple[float, float, bool]:
     """Cost, what a Newton step could gain (dense, by automatic derivatives), and whether all is in
     front.
     """
     depth = (rig.points @ rig.R.mT + rig.t[:, None])[..., 2]
     start = torch.zeros(6 * len(rig.R) + rig.points.numel(), dtype=torch.float64)
-    r = residuals(seen_by, rig, start)
+    r = residuals(observed, rig, start)
     square = r.square().sum(-1)
     cost = float((scale**2 / 2 * torch.log1p(square / scale**2)).sum())
-    J = torch.autograd.functional.jacobian(lambda step: residuals(seen_by, rig, step), start)
+    J = torch.autograd.functional.jacobian(lambda step: residuals(observed, rig, step), start)
     weight = 1 / (1 + square / scale**2)
     gradient = torch.einsum("nri,nr,n->i", J, r, weight)
     H = torch.einsum("nri,nrj,n->ij", J, J, weight)
@@ -92,8 +94,8 @@ def test_d5_converged_is_never_claimed_falsely(record_row):
     claims = 0
     wrong = []
     for seed in range(total):
-        seen_by, rig = random_problem(np.random.default_rng(seed))
-        found = ADJUST(seen_by, rig)
+        observed, rig = random_problem(np.random.default_rng(seed))
+        found = ADJUST(observed, rig)
         if found.iterations > ADJUST.iterations or found.seconds > ADJUST.seconds + 1:
             wrong.append((seed, "cap"))
         if found.final.cost > found.start_cost * (1 + 1e-9):
@@ -104,7 +106,7 @@ def test_d5_converged_is_never_claimed_falsely(record_row):
         if not all(torch.isfinite(x).all() for x in (found.rig.R, found.rig.t, found.rig.points)):
             wrong.append((seed, "not finite"))
             continue
-        cost, gain, in_front = independent(seen_by, found.rig, ADJUST.loss_scale)
+        cost, gain, in_front = independent(observed, found.rig, ADJUST.loss_scale)
         small = gain <= 1.1 * ADJUST.tolerance * cost + 1e-9
         if not (in_front and small and abs(cost - found.final.cost) <= 1e-9 * cost + 1e-9):
             wrong.append((seed, cost, found.final.cost, gain, in_front))
@@ -121,8 +123,8 @@ def test_d5_converged_is_never_claimed_falsely(record_row):
 @pytest.mark.parametrize("iterations", [1, 3])
 def test_d5_the_cap_holds_and_is_not_called_convergence(iterations):
     for seed in range(100):
-        seen_by, rig = random_problem(np.random.default_rng(seed))
-        whole = ADJUST(seen_by, rig)
+        observed, rig = random_problem(np.random.default_rng(seed))
+        whole = ADJUST(observed, rig)
         if (
             whole.converged
             and whole.iterations > 2 * iterations
@@ -131,15 +133,15 @@ def test_d5_the_cap_holds_and_is_not_called_convergence(iterations):
             break
     else:
         pytest.fail("no start needs that many steps")
-    found = BundleAdjustment(3.0, iterations, 2.0, 1e-12)(seen_by, rig)
+    found = BundleAdjustment(3.0, iterations, 2.0, 1e-12)(observed, rig)
     assert found.iterations <= iterations
     assert not found.converged
     assert found.final.cost <= found.start_cost
 
 
 def test_d5_nothing_to_adjust_is_no_convergence():
-    seen_by, rig = random_problem(np.random.default_rng(1))
+    observed, rig = random_problem(np.random.default_rng(1))
     empty = torch.zeros_like(rig.inlier)
-    found = ADJUST(seen_by, Rig(rig.R, rig.t, rig.placed, rig.points, empty))
+    found = ADJUST(observed, PlacedRig(rig.R, rig.t, rig.placed, rig.points, empty))
     assert not found.converged
     assert torch.equal(found.rig.R, rig.R)

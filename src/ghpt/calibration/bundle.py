@@ -12,8 +12,8 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from ghpt.calibration.normal_matrix import Linearised, linearise
-from ghpt.calibration.observations import Observations
-from ghpt.calibration.resection import Rig
+from ghpt.calibration.observations import Correspondences
+from ghpt.calibration.resection import PlacedRig
 from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
 
@@ -22,7 +22,7 @@ from ghpt.errors import check_positive
 class Adjusted:
     """A rig after bundle adjustment, and what was verified of it."""
 
-    rig: Rig
+    rig: PlacedRig
     start_cost: float
     final: Linearised
     """At the rig's state, by this project's own derivatives."""
@@ -49,16 +49,16 @@ class BundleAdjustment:
         check_positive(loss_scale=self.loss_scale, iterations=self.iterations, seconds=self.seconds)
         check_positive(tolerance=self.tolerance)
 
-    def __call__(self, seen_by: Observations, rig: Rig) -> Adjusted:
+    def __call__(self, observed: Correspondences, rig: PlacedRig) -> Adjusted:
         """Adjust the rig's placed views and its points to their inliers. Never raises on values; a
         rig that could not be improved comes back as it was, with ``converged`` False where it is
         not at a minimum.
         """
         used = rig.inlier
         rig = replace(rig, points=torch.where(used.any(0)[:, None], rig.points, 0.0))
-        start = self.state(seen_by, rig)
-        solved, report = self._solve(seen_by, rig, used) if start.finite else (rig, None)
-        final = self.state(seen_by, solved)
+        start = self.state(observed, rig)
+        solved, report = self._solve(observed, rig, used) if start.finite else (rig, None)
+        final = self.state(observed, solved)
         if not (final.finite and final.cost <= start.cost * (1 + 1e-12)):
             solved = rig
             final = start
@@ -76,13 +76,13 @@ class BundleAdjustment:
         seconds = 0.0 if report is None else report.total_time_in_seconds
         return Adjusted(solved, start.cost, final, steps, seconds, bool(converged))
 
-    def state(self, seen_by: Observations, rig: Rig) -> Linearised:
+    def state(self, observed: Correspondences, rig: PlacedRig) -> Linearised:
         """Cost and derivatives of a rig as it is."""
-        return linearise(seen_by, rig, rig.inlier, self.loss_scale)
+        return linearise(observed, rig, rig.inlier, self.loss_scale)
 
     def _solve(
-        self, seen_by: Observations, rig: Rig, used: Bool[Tensor, "V N"]
-    ) -> tuple[Rig, object | None]:
+        self, observed: Correspondences, rig: PlacedRig, used: Bool[Tensor, "V N"]
+    ) -> tuple[PlacedRig, object | None]:
         views = torch.nonzero(rig.placed & used.any(1))[:, 0].tolist()
         chosen = np.flatnonzero(used.any(0).numpy())
         if len(views) < 2 or not len(chosen):
@@ -91,11 +91,11 @@ class BundleAdjustment:
         config = pycolmap.BundleAdjustmentConfig()
         mask = used[:, chosen].numpy()
         slot = np.zeros(len(chosen), dtype=np.int64)
-        joint = seen_by.joint.numpy()[chosen]
+        joint = observed.joint.numpy()[chosen]
         for j in np.unique(joint):
             slot[joint == j] = np.arange((joint == j).sum())
         for v in views:
-            _add_view(model, config, seen_by, rig, v, chosen, joint)
+            _add_view(model, config, observed, rig, v, chosen, joint)
         ids = []
         for n, point in enumerate(rig.points.numpy()[chosen]):
             track = [
@@ -146,8 +146,8 @@ JOINTS = 1000
 def _add_view(
     model: pycolmap.Reconstruction,
     config: pycolmap.BundleAdjustmentConfig,
-    seen_by: Observations,
-    rig: Rig,
+    observed: Correspondences,
+    rig: PlacedRig,
     view: int,
     chosen: np.ndarray,
     joint: np.ndarray,
@@ -160,7 +160,7 @@ def _add_view(
     images = []
     for j in np.unique(joint).tolist():
         own = chosen[joint == j]
-        focal = 1 / float(seen_by.noise[view, own[0]])
+        focal = 1 / float(observed.noise[view, own[0]])
         number = _image(view, j)
         camera = pycolmap.Camera(
             camera_id=number, model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0.0, 0.0]
@@ -170,7 +170,9 @@ def _add_view(
             camera.sensor_id
         )
         # what is not used may be anything
-        xy = torch.where(rig.inlier[view, own][:, None], seen_by.xy[view, own], 0.0).numpy() * focal
+        xy = (
+            torch.where(rig.inlier[view, own][:, None], observed.xy[view, own], 0.0).numpy() * focal
+        )
         image = pycolmap.Image(name=str(number), keypoints=xy, camera_id=number, image_id=number)
         image.frame_id = view + 1
         frame.add_data_id(image.data_id)

@@ -1,304 +1,310 @@
-"""The rules that turn a recording and its rig into diagnoses."""
+"""The rules that turn a recording and the rig that it gave into findings."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.calibration.diagnosis import Case, Diagnosis
-from ghpt.calibration.observations import typical_size
-from ghpt.calibration.resection import Rig
+from ghpt.calibration.bundle import Adjusted
+from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.mistakes import (
+    DISAGREEMENT,
+    FEW_FRAMES,
+    FLAT,
+    ILL_CONDITIONED,
+    LARGE_RESIDUALS,
+    LITTLE_MOTION,
+    NOT_CONVERGED,
+    NOTHING_LINKED,
+    OUTSIDE_IMAGE,
+    PROPORTIONS,
+    SAME_PLACE,
+    TWO_VIEWS,
+    UNLINKED,
+    UNUSED_IMAGE,
+)
+from ghpt.calibration.observations import Correspondences, typical_size
+from ghpt.calibration.pairs import PairTable
+from ghpt.calibration.repair import Repair, RepairThresholds
+from ghpt.calibration.resection import PlacedRig, Resection
 from ghpt.calibration.uncertainty import Uncertainty
 from ghpt.errors import check_positive
-from ghpt.models.relative_pose.scale import average_lengths, part_scales
+from ghpt.geometry.cameras import camera_centre
+from ghpt.models.relative_pose.scale import average_lengths, bone_scales
+
+_MARGIN = 0.1
+"""Of the image's size: undistorted key points may lie so far outside."""
+_REACH = 0.99
+"""The quantile of the key points' coordinates that is their extent."""
+_SUSPICIOUS = ("resolution", "unlinked", "disagreement")
+"""Findings that a mistake of the camera's own may explain."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """All that is known of a rig when it is judged."""
+
+    names: tuple[str, ...]
+    K: Float[Tensor, "V 3 3"]
+    key_points: Float[Tensor, "T V J 2"]
+    valid: Bool[Tensor, "T V J"]
+    sizes: Int[Tensor, "V 2"] | None
+    frames: Int[Tensor, " F"]
+    observed: Correspondences
+    table: PairTable
+    adjusted: Adjusted | None
+    resection: Resection
+    noise: float
+    """First guess of the key points' noise, in sizes of the person."""
+    seed: int
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The numbers of frames used and of joints."""
+        return len(self.frames), self.key_points.shape[2]
+
+    @property
+    def rig(self) -> PlacedRig | None:
+        """The adjusted rig, if there is one."""
+        return None if self.adjusted is None else self.adjusted.rig
+
+    @property
+    def focal(self) -> Float[Tensor, " V"]:
+        """The focal lengths, pixels, float64."""
+        return (self.K[:, 0, 0] * self.K[:, 1, 1]).double().sqrt()
+
+    def select_names(self, views: Bool[Tensor, " V"]) -> tuple[str, ...]:
+        """Return the names of some views."""
+        chosen = zip(self.names, views.tolist(), strict=True)
+        return tuple(name for name, is_chosen in chosen if is_chosen)
+
+    def agreement(self, rig: PlacedRig) -> tuple[Float[Tensor, " V"], Float[Tensor, " V"]]:
+        """Return the median error in pixels, and the share of inliers, of each placed view's key
+        points whose point is known.
+        """
+        known = self.observed.valid & rig.inlier.any(0) & rig.placed[:, None]
+        error = self.observed.error(rig.R, rig.t, rig.points)
+        pixels = error * self.observed.noise * self.focal[:, None]
+        median = torch.where(known, pixels, torch.nan).nanmedian(-1).values
+        count = known.sum(-1).clamp(min=1).double()
+        return median.nan_to_num(0.0, posinf=0.0), rig.inlier.sum(-1) / count
 
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Where a number is a diagnosis. Standard deviations: of rotations in degrees, of centres in
-    sizes of the rig.
+    """Where a number becomes a finding. Standard deviations: of rotations in degrees, of centres
+    in sizes of the rig.
+
+    ``few_frames``: fewer are a finding. ``motion``: least motion of a joint in the image, in sizes
+    of the person; an error below half of it. ``flat``: least thickness of the cloud of all points,
+    in its length. ``inliers``: least share of a view's key points that agree. ``noise``: largest
+    noise of the key points that the residuals show, in sizes of the person; ``contrast``: and in
+    the median of the views. ``distance``: least distance of two cameras, in sizes of the rig.
+    ``proportions``: largest ratio of the bones' lengths, in an average adult's, to each other.
+    ``outside``: largest share of key points outside the image. ``unused``: share of the width and
+    of the height of the image beyond which some key points must lie. ``repair``: when a mistake
+    explains a finding.
     """
 
     few_frames: int
     motion: float
-    """Spread over the frames of a joint's place in the image, in persons' sizes; an error below
-    half of it.
-    """
     flat: float
-    """Thickness of the cloud of all points, in its length."""
     inliers: float
     noise: float
-    """Noise of the key points that the residuals show, in persons' sizes."""
     contrast: float
-    """The same in the median of the views."""
-    apart: float
-    """Distance of two cameras, in sizes of the rig."""
+    distance: float
     rotation_std: float
     centre_std: float
     proportions: float
-    """Largest over smallest ratio of the limbs' lengths to an average adult's."""
     outside: float
-    """Share of key points outside the image."""
     unused: float
-    """Share of width and of height of the image beyond which no key point lies."""
+    repair: RepairThresholds
 
     def __post_init__(self) -> None:
-        check_positive(**vars(self))
+        numbers = {name: value for name, value in vars(self).items() if name != "repair"}
+        check_positive(**numbers)
 
-    def __call__(self, case: Case, spread: Uncertainty | None) -> tuple[Diagnosis, ...]:
-        found = [*self._recording(case), *self._links(case)]
-        if case.rig is not None and spread is not None:
-            found += self._agreement(case, case.rig)
-            found += self._geometry(case, case.rig)
-            found += self._determined(case, case.rig, spread)
-        suspects = {name for d in found if d.code in _SUSPICIOUS for name in d.cameras}
+    def __call__(self, case: Case, uncertainty: Uncertainty | None) -> tuple[Finding, ...]:
+        """Return the findings.
+
+        Where the recording does not determine a rig nothing is said of the rig: what is wrong with
+        it comes from that, and shows nothing of the cameras.
+        """
+        recording = [*self._frames(case), *self._motion(case)]
+        determined = all(found.severity != Severity.ERROR for found in recording)
+        findings = [*recording, *self._resolution(case), *self._links(case)]
+        if case.rig is not None and uncertainty is not None and determined:
+            findings += self._agreement(case, case.rig)
+            findings += self._geometry(case, case.rig)
+            findings += self._proportions(case, case.rig)
+            findings += self._determined(case, case.rig, uncertainty)
+        return (*findings, *self._repairs(case, findings))
+
+    def _repairs(self, case: Case, findings: list[Finding]) -> Iterator[Finding]:
+        """Yield the mistakes that explain why views do not agree with the others."""
+        suspects = {name for f in findings if f.code in _SUSPICIOUS for name in f.cameras}
+        repair = Repair(
+            names=case.names,
+            K=case.K,
+            key_points=case.key_points[case.frames],
+            valid=case.valid[case.frames],
+            sizes=case.sizes,
+            noise=case.noise,
+            table=case.table,
+            resection=case.resection,
+            thresholds=self.repair,
+            seed=case.seed,
+        )
+        said = set()
         for view, name in enumerate(case.names):
-            if name in suspects:
-                found += case.repaired(view)
-        return tuple(found)
+            found = repair.find(view) if name in suspects else None
+            if found is not None and (found.code, frozenset(found.cameras)) not in said:
+                said.add((found.code, frozenset(found.cameras)))
+                yield found
 
-    def _recording(self, case: Case) -> Iterator[Diagnosis]:
+    def _frames(self, case: Case) -> Iterator[Finding]:
         count = len(case.frames)
         if count < self.few_frames:
-            yield Diagnosis(
-                "few_frames",
-                "error" if count < 2 else "warning",
-                (),
-                (
-                    f"{count} usable frame{'s' * (count != 1)}, {self.few_frames} or more are needed for a rig to rely on; "
-                    "record longer, with a person that several cameras see at a time"
-                ),
-                float(count),
-            )
-        motion = _motion(case.key_points[case.frames], case.usable[case.frames])
-        if count > 1 and motion < self.motion:
-            yield Diagnosis(
-                "little_motion",
-                "error" if motion < self.motion / 2 else "warning",
-                (),
-                (
-                    f"joints move by {motion:.2g} of the person's size in the image: {count} frames are worth little more "
-                    "than one, and errors larger than the uncertainty says; let the person walk through the whole volume"
-                ),
-                motion,
-            )
-        yield from self._resolution(case)
+            severity = Severity.ERROR if count < 2 else Severity.WARNING
+            plural = "" if count == 1 else "s"
+            yield FEW_FRAMES.finding((), count, self.few_frames, severity, plural=plural)
 
-    def _resolution(self, case: Case) -> Iterator[Diagnosis]:
-        size = case.sizes if case.sizes is not None else (2 * case.K[:, :2, 2] + 1).nan_to_num(0.0)
+    def _motion(self, case: Case) -> Iterator[Finding]:
+        count = len(case.frames)
+        motion = _motion(case.key_points[case.frames], case.valid[case.frames])
+        if count > 1 and motion < self.motion:
+            severity = Severity.ERROR if motion < self.motion / 2 else Severity.WARNING
+            yield LITTLE_MOTION.finding((), motion, self.motion, severity, count=count)
+
+    def _resolution(self, case: Case) -> Iterator[Finding]:
+        """Yield the views whose key points lie outside the image, or leave much of it unused."""
+        size = case.sizes
+        if size is None:
+            size = (2 * case.K[:, :2, 2] + 1).nan_to_num(0.0)
         unused = []
-        for v, name in enumerate(case.names):
-            own = case.key_points[:, v][case.usable[:, v]].double()
+        for view, name in enumerate(case.names):
+            own = case.key_points[:, view][case.valid[:, view]].double()
             if not len(own):
                 continue
-            extent = torch.stack([x.kthvalue(max(round(0.99 * len(x)), 1)).values for x in own.T])
-            limit = size[v].double()
-            # undistorted key points may lie a little outside
-            outside = float(((own < -0.1 * limit) | (own > 1.1 * limit)).any(-1).double().mean())
-            reach = (
-                f"{extent[0]:.0f} x {extent[1]:.0f} in an image of {limit[0]:.0f} x {limit[1]:.0f}"
-            )
+            limit = size[view].double()
+            extent = _extent(own)
+            too_far = (own < -_MARGIN * limit) | (own > (1 + _MARGIN) * limit)
+            outside = float(too_far.any(-1).double().mean())
+            image = f"{limit[0]:.0f} x {limit[1]:.0f}"
+            words = f"{extent[0]:.0f} x {extent[1]:.0f} in an image of {image}"
             if outside > self.outside:
-                yield Diagnosis(
-                    "resolution",
-                    "error",
-                    (name,),
-                    (
-                        f"key points of {name} reach {reach}, {outside:.0%} are outside; give intrinsics and key points of "
-                        "one and the same resolution"
-                    ),
-                    outside,
-                )
+                yield OUTSIDE_IMAGE.finding((name,), outside, self.outside, extent=words)
             elif bool((extent < self.unused * limit).all()):
-                unused.append((name, reach, float((extent / limit).max())))
+                reach = float((extent / limit).max())
+                unused.append(UNUSED_IMAGE.finding((name,), reach, self.unused, extent=words))
         everywhere = len(unused) == len(case.names)
-        for name, reach, share in unused:
-            yield Diagnosis(
-                "resolution",
-                "error" if everywhere else "warning",
-                (name,),
-                (
-                    f"key points of {name} reach no further than {reach}; give intrinsics and key points of one and the "
-                    "same resolution"
-                ),
-                share,
-            )
+        for found in unused:
+            yield replace(found, severity=Severity.ERROR) if everywhere else found
 
-    def _links(self, case: Case) -> Iterator[Diagnosis]:
+    def _links(self, case: Case) -> Iterator[Finding]:
+        table = case.table
         if case.rig is None:
-            most = int(case.table.common.max()) if len(case.table.common) else 0
-            agree = int(case.table.inliers.max()) if len(case.table.inliers) else 0
-            yield Diagnosis(
-                "unlinked",
-                "error",
-                case.names,
-                (
-                    f"no two cameras can be linked: at best {most} common key points, {agree} of which agree with one "
-                    "relative pose; check that the cameras are apart, synchronised, and see the same moving person"
-                ),
-                float(agree),
-            )
+            every = torch.ones(len(table.common), dtype=torch.bool)
+            common, agree = _most_common(table, every)
+            yield NOTHING_LINKED.finding(case.names, agree, common=common)
             return
-        placed = case.rig.placed
-        for v in torch.nonzero(~placed)[:, 0].tolist():
-            own = (case.table.views == v).any(-1)
-            common = int(case.table.common[own].max()) if own.any() else 0
-            agree = int(case.table.inliers[own].max()) if own.any() else 0
-            name = case.names[v]
-            yield Diagnosis(
-                "unlinked",
-                "error",
-                (name,),
-                (
-                    f"{name} cannot be linked to the other cameras: at best {common} common key points with one of them, "
-                    f"{agree} of which agree; check its intrinsics, its synchronisation, and that it sees the same person"
-                ),
-                float(agree),
-            )
+        for view in torch.nonzero(~case.rig.placed)[:, 0].tolist():
+            common, agree = _most_common(table, (table.views == view).any(-1))
+            yield UNLINKED.finding((case.names[view],), agree, common=common)
 
-    def _agreement(self, case: Case, rig: Rig) -> Iterator[Diagnosis]:
+    def _agreement(self, case: Case, rig: PlacedRig) -> Iterator[Finding]:
+        """Yield the views that agree less with the rig than the others or than detectors do."""
         pixels, inliers = case.agreement(rig)
-        size = typical_size(
-            case.key_points[case.frames].double(), case.usable[case.frames]
-        ).nan_to_num(1.0)
-        focal = (case.K[:, 0, 0] * case.K[:, 1, 1]).double().sqrt()
-        noise = (case.seen_by.noise.median(-1).values * focal / size).nan_to_num(0.0)
+        size = typical_size(case.key_points[case.frames].double(), case.valid[case.frames])
+        noise_px = case.observed.noise.median(-1).values * case.focal
+        noise = (noise_px / size.nan_to_num(1.0)).nan_to_num(0.0)
         usual = float(noise[rig.placed].median())
-        for v in torch.nonzero(rig.placed)[:, 0].tolist():
-            name = case.names[v]
-            off = float(noise[v])
-            alone = inliers[v] < self.inliers or off > self.contrast * usual
-            if alone:
-                yield Diagnosis(
-                    "disagreement",
-                    "warning",
-                    (name,),
-                    (
-                        f"{inliers[v]:.0%} of {name}'s key points agree with the other cameras, and those are off by "
-                        f"{off:.1%} of the person's size (median of the cameras: {usual:.1%}); check its intrinsics, its "
-                        "synchronisation and its key points"
-                    ),
-                    float(inliers[v]),
-                )
+        for view in torch.nonzero(rig.placed)[:, 0].tolist():
+            name = (case.names[view],)
+            share = float(inliers[view])
+            off = float(noise[view])
+            if share < self.inliers or off > self.contrast * usual:
+                limit = self.inliers
+                yield DISAGREEMENT.finding(name, share, limit, off=off, usual=usual)
             elif off > self.noise:
-                yield Diagnosis(
-                    "large_residuals",
-                    "warning",
-                    (name,),
-                    (
-                        f"key points of {name} are off by {off:.1%} of the person's size ({pixels[v]:.1f} px), detectors' "
-                        "by 1 to 2 %; check all intrinsics, lens distortion and synchronisation"
-                    ),
-                    off,
-                )
+                px = float(pixels[view])
+                yield LARGE_RESIDUALS.finding(name, off, self.noise, pixels=px)
 
-    def _geometry(self, case: Case, rig: Rig) -> Iterator[Diagnosis]:
-        centre = rig.centre
+    def _geometry(self, case: Case, rig: PlacedRig) -> Iterator[Finding]:
+        """Yield arrangements of cameras and people that leave the rig open."""
+        centre = camera_centre(rig.R, rig.t)
         distance = torch.cdist(centre, centre)
-        near = (distance < self.apart) & (rig.placed & rig.placed[:, None]).triu(1)
+        both_placed = (rig.placed & rig.placed[:, None]).triu(1)
+        near = (distance < self.distance) & both_placed
         for a, b in torch.nonzero(near).tolist():
-            yield Diagnosis(
-                "same_place",
-                "error",
-                (case.names[a], case.names[b]),
-                (
-                    f"{case.names[a]} and {case.names[b]} are {distance[a, b]:.1%} of the rig's size apart; check that "
-                    "they are not one camera given twice"
-                ),
-                float(distance[a, b]),
-            )
+            names = (case.names[a], case.names[b])
+            yield SAME_PLACE.finding(names, float(distance[a, b]), self.distance)
         if int(rig.placed.sum()) == 2:
             angle = float(torch.rad2deg(case.table.angle[case.table.linked].max()))
-            yield Diagnosis(
-                "two_views",
-                "warning",
-                case.named(rig.placed),
-                (
-                    f"two cameras only, whose rays meet at {angle:.0f} degrees: nothing checks them, and depths are weak "
-                    "where the angle is near 0 (side by side, or opposite); add a third camera"
-                ),
-                angle,
-            )
+            yield TWO_VIEWS.finding(case.select_names(rig.placed), angle)
         known = rig.inlier.any(0)
         cloud = rig.points[known] - rig.points[known].mean(0)
         values = torch.linalg.svdvals(cloud) if len(cloud) > 2 else torch.ones(3)
         if values[2] < self.flat * values[0]:
             shape = "a line" if values[1] < self.flat * values[0] else "a plane"
-            yield Diagnosis(
-                "flat",
-                "warning",
-                (),
-                (
-                    f"all points lie near {shape} (thickness {values[2] / values[0]:.1%} of the length), which leaves "
-                    "several rigs possible; let the person move in depth and turn"
-                ),
-                float(values[2] / values[0]),
-            )
-        lengths = torch.tensor(average_lengths(), dtype=torch.float64)
-        parts = part_scales(
-            rig.points.unflatten(0, case.shape), known.unflatten(0, case.shape), lengths
-        )
-        parts = parts[torch.isfinite(parts)]
-        if len(parts) > 1 and parts.max() > self.proportions * parts.min():
-            ratio = float(parts.max() / parts.min())
-            yield Diagnosis(
-                "proportions",
-                "warning",
-                (),
-                (
-                    f"the person's limbs are out of human proportion by a factor {ratio:.2f}; check the joints' order and "
-                    "the intrinsics, and do not scale this rig by a body"
-                ),
-                ratio,
-            )
+            yield FLAT.finding((), float(values[2] / values[0]), self.flat, shape=shape)
 
-    def _determined(self, case: Case, rig: Rig, spread: Uncertainty) -> Iterator[Diagnosis]:
-        assert case.adjusted is not None
-        if not case.adjusted.converged:
-            yield Diagnosis(
-                "not_converged",
-                "error",
-                (),
-                (
-                    f"the bundle adjustment stopped after {case.adjusted.iterations} steps short of a minimum; "
-                    "raise bundle.iterations and bundle.seconds, or look at the other diagnoses"
-                ),
-                case.adjusted.final.gain,
-            )
-        variance = spread.covariance.diagonal(dim1=-2, dim2=-1)
-        turn = torch.rad2deg(variance[:, :3].mean(-1).sqrt())
-        place = variance[:, 3:].mean(-1).sqrt()
-        weak = rig.placed & ((turn > self.rotation_std) | (place > self.centre_std))
+    def _proportions(self, case: Case, rig: PlacedRig) -> Iterator[Finding]:
+        lengths = torch.tensor(average_lengths(), dtype=torch.float64)
+        points = rig.points.unflatten(0, case.shape)
+        known = rig.inlier.any(0).unflatten(0, case.shape)
+        scales = bone_scales(points, known, lengths)
+        scales = scales[torch.isfinite(scales)]
+        if len(scales) > 1 and scales.max() > self.proportions * scales.min():
+            ratio = float(scales.max() / scales.min())
+            yield PROPORTIONS.finding((), ratio, self.proportions)
+
+    def _determined(
+        self, case: Case, rig: PlacedRig, uncertainty: Uncertainty
+    ) -> Iterator[Finding]:
+        """Yield what says that another rig would do as well."""
+        if case.adjusted is not None and not case.adjusted.converged:
+            gain = case.adjusted.final.gain
+            yield NOT_CONVERGED.finding((), gain, iterations=case.adjusted.iterations)
+        variance = uncertainty.covariance.diagonal(dim1=-2, dim2=-1)
+        rotation = torch.rad2deg(variance[:, :3].mean(-1).sqrt())
+        position = variance[:, 3:].mean(-1).sqrt()
+        weak = rig.placed & ((rotation > self.rotation_std) | (position > self.centre_std))
         if weak.any():
-            yield Diagnosis(
-                "ill_conditioned",
-                "warning",
-                case.named(weak),
-                (
-                    f"the recording hardly determines {', '.join(case.named(weak))}: standard deviation up to "
-                    f"{turn.max():.2g} degrees and {place.max():.1%} of the rig's size; record more motion through the "
-                    "whole volume, or place cameras so that they look across one another"
-                ),
-                float(place.max()),
-            )
+            names = case.select_names(weak)
+            most = float(position.max())
+            degrees = float(rotation.max())
+            yield ILL_CONDITIONED.finding(names, most, self.centre_std, degrees=degrees)
+
+
+def _extent(pixels: Float[Tensor, "N 2"]) -> Float[Tensor, " 2"]:
+    rank = max(round(_REACH * len(pixels)), 1)
+    return torch.stack([x.kthvalue(rank).values for x in pixels.T])
+
+
+def _most_common(table: PairTable, pairs: Bool[Tensor, " P"]) -> tuple[int, int]:
+    """Return the most key points that one of the pairs has in common, and the most that agree."""
+    if not pairs.any():
+        return 0, 0
+    return int(table.common[pairs].max()), int(table.inliers[pairs].max())
 
 
 def _motion(key_points: Float[Tensor, "T V J 2"], valid: Bool[Tensor, "T V J"]) -> float:
-    """Median over the joints of the spread (half the range of the middle 80 %) of their place, in
-    persons' sizes, in the view with most.
+    """Return how much the joints move in the view with most motion, in sizes of the person.
+
+    The motion of a view is the median over the joints of half the range of the middle 80 % of
+    their positions.
     """
     size = typical_size(key_points.double(), valid)
-    place = torch.where(valid[..., None], key_points.double(), torch.nan)
-    if not len(place):
+    position = torch.where(valid[..., None], key_points.double(), torch.nan)
+    if not len(position):
         return 0.0
-    low, high = place.nanquantile(torch.tensor([0.1, 0.9], dtype=torch.float64), dim=0)
-    spread = ((high - low).norm(dim=-1) / 2).nanmedian(-1).values / size
-    return float(spread.nan_to_num(0.0).max())
-
-
-_SUSPICIOUS = ("resolution", "unlinked", "disagreement")
-"""Diagnoses that one of the user's mistakes may explain."""
+    middle = torch.tensor([0.1, 0.9], dtype=torch.float64)
+    low, high = position.nanquantile(middle, dim=0)
+    half_range = (high - low).norm(dim=-1) / 2
+    motion = half_range.nanmedian(-1).values / size
+    return float(motion.nan_to_num(0.0).max())

@@ -10,8 +10,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.calibration.observations import Observations
-from ghpt.calibration.resection import Rig
+from ghpt.calibration.observations import Correspondences
+from ghpt.calibration.resection import PlacedRig
 from ghpt.geometry.epipolar import cross_matrix
 
 BEHIND = 1e4
@@ -43,14 +43,14 @@ class Linearised:
 
 
 def linearise(
-    seen_by: Observations, rig: Rig, used: Bool[Tensor, "V N"], scale: float
+    observed: Correspondences, rig: PlacedRig, used: Bool[Tensor, "V N"], scale: float
 ) -> Linearised:
     """``scale``: of the Cauchy loss, units of noise. Not finite numbers give ``finite`` False and
     zeros.
     """
     used = used & rig.placed[:, None]
     views = len(rig.R)
-    frames = int(seen_by.frame[-1]) + 1 if len(seen_by.frame) else 0
+    frames = int(observed.frame[-1]) + 1 if len(observed.frame) else 0
     nothing = (
         torch.zeros(6 * views, 6 * views, dtype=torch.float64),
         torch.zeros(frames, 6 * views, dtype=torch.float64),
@@ -60,21 +60,21 @@ def linearise(
         rig.R[rig.placed],
         rig.t[rig.placed],
         rig.points[chosen],
-        seen_by.xy[:, chosen][used[:, chosen]],
+        observed.xy[:, chosen][used[:, chosen]],
     )
     if not (
         chosen.any() and all(torch.isfinite(x).all() and x.abs().max() < 1e100 for x in inputs)
     ):
         return Linearised(scale, float("inf"), False, False, float("inf"), *nothing)
     used = used[:, chosen]
-    frame = seen_by.frame[chosen]
+    frame = observed.frame[chosen]
     centre = rig.centre
     arm = rig.points[chosen] - centre[:, None]
     x, y, z = (arm @ rig.R.mT).unbind(-1)
     front = used & (z > 0)
     depth = torch.where(front, z, 1.0)
-    f = 1 / seen_by.noise[:, chosen]
-    residual = (torch.stack((x, y), dim=-1) / depth[..., None] - seen_by.xy[:, chosen]) * f[
+    f = 1 / observed.noise[:, chosen]
+    residual = (torch.stack((x, y), dim=-1) / depth[..., None] - observed.xy[:, chosen]) * f[
         ..., None
     ]
     residual = torch.where(front[..., None], residual, 0.0)

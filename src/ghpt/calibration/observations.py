@@ -15,7 +15,7 @@ from ghpt.models.estimators.classical import person_scale
 
 
 @dataclass(frozen=True)
-class Observations:
+class Correspondences:
     """Key points of N = T x J points (joints of a frame side by side) in V views."""
 
     xy: Float[Tensor, "V N 2"]
@@ -47,6 +47,16 @@ class Observations:
             reprojection_error(cameras, self.xy.expand(*points.shape[:-2], -1, -1, -1), points)
             / self.noise
         )
+
+    def with_view(self, view: int, other: Correspondences) -> Correspondences:
+        """Return the same with one view's key points from another set of the same points."""
+        xy = self.xy.clone()
+        noise = self.noise.clone()
+        valid = self.valid.clone()
+        xy[view] = other.xy[view]
+        noise[view] = other.noise[view]
+        valid[view] = other.valid[view]
+        return replace(self, xy=xy, noise=noise, valid=valid)
 
 
 def usable(
@@ -115,7 +125,7 @@ def observe(
     key_points: Float[Tensor, "T V J 2"],
     valid: Bool[Tensor, "T V J"],
     noise: float,
-) -> Observations:
+) -> Correspondences:
     """The chosen frames' key points, with ``noise`` x the median size of the person in the view as
     their noise.
     """
@@ -129,7 +139,7 @@ def observe(
     unit = torch.where(known, noise * size, 1.0) / focal
     frames = key_points.shape[0]
     joints = key_points.shape[2]
-    return Observations(
+    return Correspondences(
         torch.where(mask[..., None], xy, 0.0),
         unit[:, None].expand_as(mask).clone(),
         mask,
@@ -143,8 +153,8 @@ LARGEST = 1e6
 
 
 def reweighted(
-    seen_by: Observations, error: Float[Tensor, "V N"], used: Bool[Tensor, "V N"]
-) -> Observations:
+    observed: Correspondences, error: Float[Tensor, "V N"], used: Bool[Tensor, "V N"]
+) -> Correspondences:
     """The same with the noise of each view, then of each joint, that the errors (in units of the
     noise so far) show: by the median over the used observations, where there are ``LEAST`` of them.
     """
@@ -153,12 +163,12 @@ def reweighted(
     error = error * (2 * count / (2 * count - 3).clamp(min=1)).sqrt()
     masked = torch.where(used, error, torch.nan)
     by_view = _spread(masked, used)
-    noise = seen_by.noise * by_view[:, None]
+    noise = observed.noise * by_view[:, None]
     masked = masked / by_view[:, None]
-    for joint in seen_by.joint.unique():
-        own = seen_by.joint == joint
+    for joint in observed.joint.unique():
+        own = observed.joint == joint
         noise[:, own] *= _spread(masked[:, own].flatten()[None], used[:, own].flatten()[None])
-    return replace(seen_by, noise=noise)
+    return replace(observed, noise=noise)
 
 
 def _spread(error: Float[Tensor, "G N"], used: Bool[Tensor, "G N"]) -> Float[Tensor, " G"]:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.calibration.observations import Observations
+from ghpt.calibration.observations import Correspondences
 from ghpt.errors import check_positive
 from ghpt.geometry.epipolar import cross_matrix, depths, essential, homogeneous
 
@@ -77,22 +77,26 @@ class PairEstimation:
             threshold=self.threshold, iterations=self.iterations, least=self.least, share=self.share
         )
 
-    def __call__(self, seen_by: Observations, seed: int) -> PairTable:
-        count = len(seen_by.valid)
-        found = (self._pair(seen_by, a, b, seed) for a in range(count) for b in range(a + 1, count))
+    def __call__(self, observed: Correspondences, seed: int) -> PairTable:
+        count = len(observed.valid)
+        found = (
+            self._pair(observed, a, b, seed) for a in range(count) for b in range(a + 1, count)
+        )
         rows = [row for row in found if row is not None]
         return (
             PairTable(*map(torch.stack, zip(*rows, strict=True))) if rows else PairTable(*_NOTHING)
         )
 
-    def _pair(self, seen_by: Observations, a: int, b: int, seed: int) -> tuple[Tensor, ...] | None:
-        both = seen_by.valid[a] & seen_by.valid[b]
+    def _pair(
+        self, observed: Correspondences, a: int, b: int, seed: int
+    ) -> tuple[Tensor, ...] | None:
+        both = observed.valid[a] & observed.valid[b]
         common = int(both.sum())
         if common < self.least:
             return None
-        focal = [seen_by.focal(v) for v in (a, b)]
-        na = seen_by.xy[a, both]
-        nb = seen_by.xy[b, both]
+        focal = [observed.focal(v) for v in (a, b)]
+        na = observed.xy[a, both]
+        nb = observed.xy[b, both]
         options = ransac_options(self.threshold, self.iterations, seed, "max_epipolar_error")
         pose, info = poselib.estimate_relative_pose(
             (na * focal[0]).numpy(),

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.calibration.observations import Observations
+from ghpt.calibration.observations import Correspondences
 from ghpt.calibration.pairs import PairTable, camera_dict, ransac_options
 from ghpt.errors import check_positive
 from ghpt.geometry.cameras import Cameras, camera_centre
@@ -21,7 +21,7 @@ from ghpt.randomness import key, uniform
 
 
 @dataclass(frozen=True)
-class Rig:
+class PlacedRig:
     """Extrinsics of the views that are ``placed`` (identity elsewhere) and the people they see, in
     one world.
     """
@@ -31,7 +31,7 @@ class Rig:
     placed: Bool[Tensor, " V"]
     points: Float[Tensor, "N 3"]
     inlier: Bool[Tensor, "V N"]
-    """Observations in placed views that agree with their point; a point has none or at least two.
+    """Correspondences in placed views that agree with their point; a point has none or at least two.
     """
 
     @property
@@ -60,28 +60,30 @@ class Resection:
         )
         check_positive(iterations=self.iterations)
 
-    def begin(self, seen_by: Observations, table: PairTable, edge: int, seed: int) -> Rig:
+    def begin(self, observed: Correspondences, table: PairTable, edge: int, seed: int) -> PlacedRig:
         """The rig of a pair alone, with the first view as the world."""
         a, b = table.views[edge].tolist()
-        views = len(seen_by.valid)
+        views = len(observed.valid)
         R = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
         t = torch.zeros(views, 3, dtype=torch.float64)
         placed = torch.zeros(views, dtype=torch.bool)
         R[b], t[b] = table.R[edge], table.t[edge]
         placed[[a, b]] = True
         nothing = (
-            torch.zeros(len(seen_by.frame), 3, dtype=torch.float64),
-            torch.zeros_like(seen_by.valid),
+            torch.zeros(len(observed.frame), 3, dtype=torch.float64),
+            torch.zeros_like(observed.valid),
         )
-        return self.triangulate(seen_by, Rig(R, t, placed, *nothing), seed)
+        return self.triangulate(observed, PlacedRig(R, t, placed, *nothing), seed)
 
-    def grow(self, seen_by: Observations, table: PairTable, rig: Rig, seed: int) -> Rig:
+    def grow(
+        self, observed: Correspondences, table: PairTable, rig: PlacedRig, seed: int
+    ) -> PlacedRig:
         """Place every view that a chain of linked pairs reaches, the one best bound to the placed
         ones first; a view that fails is tried again when the rig has grown.
         """
         failed: set[int] = set()
         while (view := self._next(table, rig.placed, failed)) is not None:
-            found = self.place(seen_by, rig, view, seed)
+            found = self.place(observed, rig, view, seed)
             if found is None:
                 failed.add(view)
                 continue
@@ -90,7 +92,7 @@ class Resection:
             placed = rig.placed.clone()
             R[view], t[view] = found
             placed[view] = True
-            rig = self.triangulate(seen_by, replace(rig, R=R, t=t, placed=placed), seed)
+            rig = self.triangulate(observed, replace(rig, R=R, t=t, placed=placed), seed)
             failed.clear()
         return rig
 
@@ -103,7 +105,7 @@ class Resection:
                 return int(outside[edge])
         return None
 
-    def supported(self, rig: Rig) -> Rig:
+    def supported(self, rig: PlacedRig) -> PlacedRig:
         """The rig without the views that fewer than ``least`` inliers hold; a pair at least stays."""
         held = rig.placed & (rig.inlier.sum(1) >= self.least)
         return (
@@ -111,16 +113,16 @@ class Resection:
         )
 
     def place(
-        self, seen_by: Observations, rig: Rig, view: int, seed: int
+        self, observed: Correspondences, rig: PlacedRig, view: int, seed: int
     ) -> tuple[Float[Tensor, "3 3"], Float[Tensor, " 3"]] | None:
         """A view's R, t from the rig's points by PnP with LO-RANSAC; None where too few agree."""
-        used = seen_by.valid[view] & rig.inlier.any(0)
+        used = observed.valid[view] & rig.inlier.any(0)
         if used.sum() < self.least:
             return None
         options = ransac_options(self.threshold, self.iterations, seed, "max_reproj_error")
-        focal = seen_by.focal(view)
+        focal = observed.focal(view)
         pose, info = poselib.estimate_absolute_pose(
-            (seen_by.xy[view, used] * focal).numpy(),
+            (observed.xy[view, used] * focal).numpy(),
             rig.points[used].numpy(),
             camera_dict(focal),
             options,
@@ -134,14 +136,14 @@ class Resection:
             (R, t) if enough and bool(torch.isfinite(R).all() & torch.isfinite(t).all()) else None
         )
 
-    def triangulate(self, seen_by: Observations, rig: Rig, seed: int) -> Rig:
+    def triangulate(self, observed: Correspondences, rig: PlacedRig, seed: int) -> PlacedRig:
         """All points anew from the placed views: of each, the pair of views with which most others
         agree, and its inliers together.
         """
-        of = Observations(
-            *(getattr(seen_by, f)[rig.placed] for f in ("xy", "noise", "valid")),
-            seen_by.frame,
-            seen_by.joint,
+        of = Correspondences(
+            *(getattr(observed, f)[rig.placed] for f in ("xy", "noise", "valid")),
+            observed.frame,
+            observed.joint,
         )
         R = rig.R[rig.placed]
         t = rig.t[rig.placed]
@@ -158,14 +160,16 @@ class Resection:
         agree = agree.gather(0, best[None, None].expand(1, len(of.valid), -1))[0]
         result = triangulate(Cameras(K, R, t), of.xy, agree.double())
         return self.inlier_views(
-            seen_by, replace(rig, points=result.points), result.ok & (agree.sum(0) >= 2)
+            observed, replace(rig, points=result.points), result.ok & (agree.sum(0) >= 2)
         )
 
-    def inlier_views(self, seen_by: Observations, rig: Rig, known: Bool[Tensor, " N"]) -> Rig:
+    def inlier_views(
+        self, observed: Correspondences, rig: PlacedRig, known: Bool[Tensor, " N"]
+    ) -> PlacedRig:
         """The rig with the inliers of its points where they are ``known``."""
         inlier = (
-            (seen_by.error(rig.R, rig.t, rig.points) <= self.threshold)
-            & seen_by.valid
+            (observed.error(rig.R, rig.t, rig.points) <= self.threshold)
+            & observed.valid
             & rig.placed[:, None]
             & known
         )

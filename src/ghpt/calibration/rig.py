@@ -12,14 +12,22 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from ghpt.calibration.bundle import Adjusted, BundleAdjustment
-from ghpt.calibration.diagnosis import Case, Diagnosis, of_stature
-from ghpt.calibration.diagnostics import Diagnostics
-from ghpt.calibration.observations import Observations, choose_frames, observe, reweighted, usable
+from ghpt.calibration.diagnostics import Case, Diagnostics
+from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.mistakes import size_finding
+from ghpt.calibration.observations import (
+    Correspondences,
+    choose_frames,
+    observe,
+    reweighted,
+    usable,
+)
 from ghpt.calibration.pairs import PairEstimation, PairTable
-from ghpt.calibration.resection import Resection, Rig
+from ghpt.calibration.resection import PlacedRig, Resection
 from ghpt.calibration.uncertainty import uncertainty
 from ghpt.errors import GhptDataError, check_positive
 from ghpt.geometry.cameras import Cameras
+from ghpt.models.relative_pose.scale import stature
 
 
 @dataclass(frozen=True)
@@ -53,7 +61,7 @@ class RigEstimate:
     estimated: Bool[Tensor, "T J"]
     converged: bool
     iterations: int
-    diagnoses: tuple[Diagnosis, ...]
+    findings: tuple[Finding, ...]
 
     @property
     def rotation_std_deg(self) -> Float64[Tensor, " V"]:
@@ -67,11 +75,11 @@ class RigEstimate:
 
     @property
     def succeeded(self) -> bool:
-        """Converged, every camera calibrated, and no diagnosis is an error."""
+        """Converged, every camera calibrated, and no finding is an error."""
         return (
             self.converged
             and bool(self.calibrated.all())
-            and all(d.severity != "error" for d in self.diagnoses)
+            and all(found.severity != Severity.ERROR for found in self.findings)
         )
 
     def scaled(self, factor: float) -> RigEstimate:
@@ -83,12 +91,14 @@ class RigEstimate:
             raise GhptDataError("rig", "scale", f"{factor} mm per unit of length", hint)
         unit = torch.cat((torch.ones(3), torch.full((3,), factor))).double()
         points = self.points * factor
+        height = float(stature(points, self.estimated))
+        wrong_size = size_finding(height) if height else None
         return replace(
             self,
             cameras=Cameras(self.cameras.K, self.cameras.R, self.cameras.t * factor),
             covariance=self.covariance * unit * unit[:, None],
             points=points,
-            diagnoses=(*self.diagnoses, *of_stature(points, self.estimated)),
+            findings=self.findings if wrong_size is None else (*self.findings, wrong_size),
         )
 
 
@@ -136,18 +146,18 @@ class RigCalibration:
         seed: int,
     ) -> RigEstimate:
         """Calibrate; ``key_points`` are undistorted pixels. Never raises on values: what is wrong
-        is among the diagnoses. Raises GhptDataError for fewer than two cameras, a name that occurs
+        is among the findings. Raises GhptDataError for fewer than two cameras, a name that occurs
         twice, or arrays that do not belong together.
         """
         _check(names, K, key_points)
         mask = usable(K, key_points, valid)
         frames = choose_frames(key_points, confidence, mask, self.frames)
-        seen_by = observe(K, key_points[frames], mask[frames], self.noise)
-        table = self.pairs(seen_by, seed)
-        rig = self.begin(seen_by, table, seed)
+        observed = observe(K, key_points[frames], mask[frames], self.noise)
+        table = self.pairs(observed, seed)
+        rig = self.begin(observed, table, seed)
         adjusted = None
         if rig is not None:
-            seen_by, adjusted = self.refine(seen_by, table, rig, seed)
+            observed, adjusted = self.refine(observed, table, rig, seed)
         case = Case(
             tuple(names),
             K,
@@ -155,7 +165,7 @@ class RigCalibration:
             mask,
             sizes,
             frames,
-            seen_by,
+            observed,
             table,
             adjusted,
             self.resection,
@@ -164,7 +174,7 @@ class RigCalibration:
         )
         return self._estimate(case)
 
-    def begin(self, seen_by: Observations, table: PairTable, seed: int) -> Rig | None:
+    def begin(self, observed: Correspondences, table: PairTable, seed: int) -> PlacedRig | None:
         """The first rig, from the seed with the most views and the largest share of inliers; None
         without a pair.
         """
@@ -173,11 +183,11 @@ class RigCalibration:
         order = torch.sort(
             torch.where(table.linked, table.expected, torch.inf), stable=True
         ).indices
-        linked = int(torch.isin(torch.arange(len(seen_by.valid)), table.views[table.linked]).sum())
+        linked = int(torch.isin(torch.arange(len(observed.valid)), table.views[table.linked]).sum())
         for edge in order[: min(self.seeds, int(table.linked.sum()))].tolist():
-            rig = self.resection.begin(seen_by, table, edge, seed)
-            rig = self.resection.grow(seen_by, table, rig, seed)
-            share = rig.inlier.sum() / (seen_by.valid & rig.placed[:, None]).sum().clamp(min=1)
+            rig = self.resection.begin(observed, table, edge, seed)
+            rig = self.resection.grow(observed, table, rig, seed)
+            share = rig.inlier.sum() / (observed.valid & rig.placed[:, None]).sum().clamp(min=1)
             if (int(rig.placed.sum()), float(share)) > merit:
                 best = rig
                 merit = (int(rig.placed.sum()), float(share))
@@ -186,32 +196,32 @@ class RigCalibration:
         return best
 
     def refine(
-        self, seen_by: Observations, table: PairTable, rig: Rig, seed: int
-    ) -> tuple[Observations, Adjusted]:
+        self, observed: Correspondences, table: PairTable, rig: PlacedRig, seed: int
+    ) -> tuple[Correspondences, Adjusted]:
         """Bundle adjustments in turn with new weights and new points; the last result is not
         touched any more.
         """
-        adjusted = self.bundle(seen_by, rig)
+        adjusted = self.bundle(observed, rig)
         for _ in range(self.rounds - 1):
-            error = seen_by.error(adjusted.rig.R, adjusted.rig.t, adjusted.rig.points)
-            seen_by = reweighted(seen_by, error, adjusted.rig.inlier)
-            rig = self.resection.triangulate(seen_by, unitised(adjusted.rig), seed)
-            rig = self.resection.grow(seen_by, table, self.resection.supported(rig), seed)
-            adjusted = self.bundle(seen_by, rig)
+            error = observed.error(adjusted.rig.R, adjusted.rig.t, adjusted.rig.points)
+            observed = reweighted(observed, error, adjusted.rig.inlier)
+            rig = self.resection.triangulate(observed, unitised(adjusted.rig), seed)
+            rig = self.resection.grow(observed, table, self.resection.supported(rig), seed)
+            adjusted = self.bundle(observed, rig)
         adjusted = replace(adjusted, rig=unitised(adjusted.rig))
-        final = self.bundle.state(seen_by, adjusted.rig)
-        return seen_by, replace(adjusted, final=final)
+        final = self.bundle.state(observed, adjusted.rig)
+        return observed, replace(adjusted, final=final)
 
     def _estimate(self, case: Case) -> RigEstimate:
         views = len(case.names)
         (frames, joints) = case.shape
         eye = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
-        rig = case.rig or Rig(
+        rig = case.rig or PlacedRig(
             eye,
             torch.zeros(views, 3, dtype=torch.float64),
             torch.zeros(views, dtype=torch.bool),
             torch.zeros(frames * joints, 3, dtype=torch.float64),
-            torch.zeros_like(case.seen_by.valid),
+            torch.zeros_like(case.observed.valid),
         )
         placed = rig.placed
         nothing = torch.zeros(views, dtype=torch.float64)
@@ -219,7 +229,7 @@ class RigCalibration:
         spread = (
             None
             if case.adjusted is None
-            else uncertainty(case.seen_by, rig, case.adjusted.final, self.blocks)
+            else uncertainty(case.observed, rig, case.adjusted.final, self.blocks)
         )
         estimated = rig.inlier.any(0)
         return RigEstimate(
@@ -241,11 +251,11 @@ class RigCalibration:
             estimated=estimated.unflatten(0, (frames, joints)),
             converged=case.adjusted is not None and case.adjusted.converged,
             iterations=0 if case.adjusted is None else case.adjusted.iterations,
-            diagnoses=self.diagnostics(case, spread),
+            findings=self.diagnostics(case, spread),
         )
 
 
-def unitised(rig: Rig) -> Rig:
+def unitised(rig: PlacedRig) -> PlacedRig:
     """The rig in the frame of its first placed view, with the size 1."""
     views = torch.nonzero(rig.placed)[:, 0]
     centre = rig.centre

@@ -9,8 +9,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from ghpt.calibration.normal_matrix import BEHIND, Linearised
-from ghpt.calibration.observations import Observations
-from ghpt.calibration.resection import Rig
+from ghpt.calibration.observations import Correspondences
+from ghpt.calibration.resection import PlacedRig
 from ghpt.geometry.epipolar import cross_matrix
 
 
@@ -45,7 +45,9 @@ def gauge(R: Float[Tensor, "V 3 3"], centre: Float[Tensor, "V 3"]) -> Float[Tens
     return torch.cat((rotation, translation, scale), dim=-1).flatten(0, 1)
 
 
-def uncertainty(seen_by: Observations, rig: Rig, state: Linearised, blocks: int) -> Uncertainty:
+def uncertainty(
+    observed: Correspondences, rig: PlacedRig, state: Linearised, blocks: int
+) -> Uncertainty:
     """``state``: of the rig, whose size (root mean square distance of the centres from their mean)
     is 1.
 
@@ -73,7 +75,7 @@ def uncertainty(seen_by: Observations, rig: Rig, state: Linearised, blocks: int)
     )
     scores = scores - scores.mean(0)
     scatter = float((scores @ inverse * scores).sum()) / len(values) * count / max(count - 1, 1)
-    error = seen_by.error(rig.R, rig.t, rig.points)[rig.inlier].clamp(max=BEHIND)
+    error = observed.error(rig.R, rig.t, rig.points)[rig.inlier].clamp(max=BEHIND)
     weight = 1 / (1 + (error / state.scale) ** 2)
     freedom = 2 * len(error) - 3 * int(rig.inlier.any(0).sum()) - len(values)
     model = float((weight * error).square().sum()) / max(freedom, 1) / float(weight.mean())

@@ -68,7 +68,7 @@ class Command(Generic[S, R]):
 
     ``settings`` is the frozen dataclass of all keys of the yaml, derived from `OutputSettings`;
     `run` makes it once, with `ghpt.config.settings`, and gives it to ``files``, ``task`` and
-    ``after``. With ``settings=dict`` they get the plain configuration.
+    ``after``.
     """
 
     name: str
@@ -239,7 +239,7 @@ class _Job:
                     values["resume"] = "auto"
                 command = self.loaded()
                 _quieten()  # not before: the import of Lightning sets its levels anew
-                settings = _settings_of(command, values)
+                settings = typed_settings(command.settings, values)
                 files = command.files(settings)
                 folder = stack.enter_context(_output_folder(output, files, values))
                 before = folder.finished(values) if folder is not None and self.sweep else None
@@ -280,12 +280,6 @@ class _Job:
         return own_command(self.program, more)
 
 
-def _settings_of(command: Command[Any, Any], values: dict[str, Any]) -> Any:
-    if command.settings is dict:
-        return values
-    return typed_settings(command.settings, values)
-
-
 def _output_folder(
     output: Path, files: Files, values: dict[str, Any]
 ) -> AbstractContextManager[OutputFolder | None]:
@@ -323,7 +317,7 @@ def _records(config: Any, output: Path) -> Iterator[None]:
 
 
 def _folder_names(overrides: Sequence[Override]) -> list[str]:
-    """Return the setting by which a job's folder is named by what the sweep changes, and no more."""
+    """Return the setting by which a job's folder is named by what the sweep changes alone."""
     fixed = ",".join(
         str(o.key_or_group)
         for o in overrides

@@ -3,23 +3,33 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, TypedDict
 
+import numpy as np
 import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from ghpt.calibration.diagnosis import Diagnosis
-from ghpt.calibration.millimetres import in_millimetres, of_scale, read_scale
-from ghpt.calibration.rig import RigEstimate
+from ghpt.calibration.check.camera_check import CameraCheck
+from ghpt.calibration.check.evidence import gather
+from ghpt.calibration.check.setup import setup_of
+from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.millimetres import (
+    RigScale,
+    ScaleSettings,
+    ScaleSource,
+    in_millimetres,
+    read_scale,
+    scale_findings,
+)
+from ghpt.calibration.mistakes import SEVERAL_PEOPLE
+from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
-    input_settings,
+    InputSettings,
     own_cameras,
     own_people,
     own_sequence,
@@ -27,8 +37,7 @@ from ghpt.commands.inputs import (
     resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.config import build, check_type, suggest
-from ghpt.data.formats.names import Name
+from ghpt.config import Target, build, suggest
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError, check
@@ -38,38 +47,51 @@ from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.observations import Recording
 from ghpt.provenance import provenance
-from ghpt.report.calibration import differences, explains, print_calibration, spread
-from ghpt.report.rig_comparison import Similarity, align, triangulate_recording, upright
+from ghpt.report.calibration import CalibrationResult, Differences, calibration_summary
+from ghpt.report.rig_comparison import (
+    Similarity,
+    align,
+    explain,
+    rig_difference,
+    triangulate_recording,
+    upright,
+)
+from ghpt.report.rig_figure import DrawnRig
 from ghpt.report.rig_files import (
     RIG_FILES,
-    camera_numbers,
-    write_numbers,
+    calibrated_cameras,
     write_poses,
+    write_result,
     write_rig,
     write_rig_figure,
 )
+from ghpt.report.terminal import print_document
 
+_ESTIMATED = "estimated"
+_UPRIGHT = (
+    "z along the people's upright, x where the first camera looks, the floor at their lowest ankles"
+)
 _log = logging.getLogger(__name__)
 
 
-class Scale(TypedDict):
-    """What gives millimetres."""
+@dataclass(frozen=True, kw_only=True)
+class CalibrateSettings(InputSettings):
+    """The settings of calibrate.py."""
 
-    height: float | None
-    segments: dict[str, Any] | None
-    baseline: list[Name] | None
-    assumed_height: float
-
-
-class Settings(TypedDict):
-    """What `calibrate` needs of the configuration beside the input."""
-
-    scale: Scale
-    calibration: dict[str, Any]
-    baselines: dict[str, Any]
+    scale: ScaleSettings
+    calibration: Target
+    baselines: dict[str, Target]
+    camera_check: Target
     triangulation: str
     evaluated_frames: int
     seed: int
+
+    def __post_init__(self) -> None:
+        frames = self.evaluated_frames
+        check(frames >= 1, "evaluated_frames", f"is {frames}", "Give 1 or more.")
+        name = self.triangulation
+        hint = suggest(name, self.baselines)
+        check(name in self.baselines, "triangulation", f"is {name!r}", hint)
 
 
 @dataclass(frozen=True)
@@ -78,221 +100,308 @@ class Case:
 
     sequence: Sequence
     reference: str
-    """What the extrinsics of ``sequence.cameras``, where there are any, are: never used but for the comparison
-    and the gauge.
+    """What the extrinsics of the sequence's cameras, where there are any, are, in words.
+
+    They are never used but for the comparison and the world.
     """
-    notes: tuple[Diagnosis, ...] = ()
+    is_own: bool
+    """Whether they are the user's, which may be wrong."""
+    notes: tuple[Finding, ...] = ()
+
+    @property
+    def reference_cameras(self) -> Cameras | None:
+        """The calibrated cameras to compare with, if there are any."""
+        cameras = self.sequence.cameras
+        return cameras.cameras if cameras.calibrated else None
+
+    def recording(self, views: list[int], cameras: Cameras) -> Recording:
+        """Return the recording as a calibration of some of its cameras sees it."""
+        sequence = self.sequence.select_views(views)
+        points = sequence.undistorted()
+        return Recording(
+            name=sequence.title,
+            subject=sequence.title,
+            action="unknown",
+            rate_hz=sequence.rate_hz or float("nan"),
+            camera_names=sequence.cameras.names,
+            cameras=cameras.index(views),
+            key_points=points.pixels,
+            confidence=points.confidence,
+            valid=points.valid,
+            frame=sequence.frame,
+        )
 
 
-def files(config: dict[str, Any]) -> Files:
-    """What a calibration reads and writes. Raises GhptConfigError for settings that cannot work."""
-    check_type(config, Settings, "")
-    check_apart(config)
-    names = ("calibration.json", "report.md", "rig.png", "rig.svg")
-    return Files(input_paths(config), (*RIG_FILES, *names))
+@dataclass(frozen=True)
+class RigSolution:
+    """A calibrated rig, in millimetres."""
+
+    estimate: RigEstimate
+    """In a world of its own."""
+    scale: RigScale
+    placed: list[int]
+    """The calibrated views; none if they are fewer than two."""
+    usable: list[int]
+    """Those of them that no error concerns."""
+    world: str
+    """The world that the rig is written in, in words."""
+    change: Similarity
+    """The way there from the estimate's own."""
+
+    @property
+    def rig(self) -> Cameras:
+        """All cameras, in the world that the rig is written in."""
+        return self.change.cameras(self.estimate.cameras)
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What is wrong with the rig and its scale."""
+        return (*self.estimate.findings, *scale_findings(self.scale))
 
 
-def calibrate(config: dict[str, Any], output: Path) -> dict[str, Any]:
-    """Calibrate the cameras of ``config["keypoints"]``, or of a recording of ``config["data"]``.
+def files(settings: CalibrateSettings) -> Files:
+    """Return what a calibration reads and writes."""
+    check_apart(settings.keypoints, settings.output)
+    reads = input_paths(settings.cameras, settings.keypoints, settings.data.get("root"))
+    return Files(reads, (*RIG_FILES, "calibration.json", "report.md", "rig.png", "rig.svg"))
+
+
+def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
+    """Calibrate the cameras of the user's key points, or of a recording of the data set.
 
     Writes calibration.json, report.md and the figure into ``output``, and of a usable rig
-    ``RIG_FILES``; prints the table. Raises GhptDataError after writing if a diagnosis is an error:
-    then only the cameras that it does not concern are in the rig's files, and with fewer than two
-    there are none. Returns what calibration.json holds.
+    `RIG_FILES`; prints the table. Raises GhptDataError after writing if a finding is an error: then
+    only the cameras that it does not concern are in the rig's files, and with fewer than two there
+    are none. Returns what calibration.json holds.
     """
-    check_type(config, Settings, "")
-    check(config["evaluated_frames"] >= 1, "evaluated_frames", "is not positive", "Give 1 or more.")
-    check(
-        config["triangulation"] in config["baselines"],
-        "triangulation",
-        f"is {config['triangulation']!r}",
-        suggest(config["triangulation"], config["baselines"]),
-    )
-    calibration = build(config["calibration"], "calibration")
-    estimator = build(
-        config["baselines"][config["triangulation"]], f"baselines.{config['triangulation']}"
-    )
-    case = in_unit(from_files(config), estimator) if config["keypoints"] else from_data(config)
+    calibration: RigCalibration = build(settings.calibration, "calibration")
+    name = settings.triangulation
+    estimator: Estimator = build(settings.baselines[name], f"baselines.{name}")
+    camera_check: CameraCheck = build(settings.camera_check, "camera_check")
+    case = open_case(settings, estimator)
     cameras = case.sequence.cameras
-    points = case.sequence.undistorted()
-    lengths = read_scale(config["scale"], cameras.names)
+    source = read_scale(settings.scale, cameras.names)
     sweep_temporaries(output)
-    for name in RIG_FILES:  # of an earlier run: they must not pass for this one's
-        remove(output / name)
+    for file in RIG_FILES:  # of an earlier run: they must not pass for this one's
+        remove(output / file)
 
-    estimate: RigEstimate = calibration(
+    solution = solve_rig(case, calibration, estimator, source, settings.seed)
+    estimate = solution.estimate
+    scale = solution.scale
+    placed = solution.placed
+    usable = solution.usable
+    change = solution.change
+    rig = solution.rig
+    reference = case.reference_cameras
+    rigs = {_ESTIMATED: rig} if reference is None else {_ESTIMATED: rig, case.reference: reference}
+    recordings = {
+        name: _spread(case.recording(placed, own), settings.evaluated_frames)
+        for name, own in rigs.items()
+        if placed
+    }
+    result = CalibrationResult(
+        data=case.sequence.title,
+        source=case.sequence.source,
+        cameras_file=cameras.path,
+        frames=len(case.sequence),
+        seed=settings.seed,
+        scale=scale,
+        world=solution.world,
+        reference=None if reference is None else case.reference,
+        triangulation=settings.triangulation,
+        converged=estimate.converged,
+        usable=tuple(cameras.names[view] for view in usable),
+        cameras=calibrated_cameras(estimate, change, cameras),
+        difference=_difference(estimate, rig, reference, placed),
+        explains=explain(recordings, estimator),
+        findings=_findings(case, solution, camera_check),
+        provenance=provenance(settings.seed),
+    )
+    points = change.points(estimate.points)
+    estimated = estimate.estimated
+    if usable:
+        recording = case.recording(usable, rig)
+        points, estimated = triangulate_recording(recording, estimator)
+        write_rig(output, cameras.select(usable).with_cameras(rig.index(usable)), result)
+        write_poses(output / "poses.npz", recording, points, estimated, result)
+    covariance = change.covariance(estimate.covariance)
+    drawn = DrawnRig(cameras.names, rig, covariance, points, estimated)
+    write_rig_figure(output, result, drawn, estimate.calibrated, reference)
+    write_result(output, result)
+    print_document(calibration_summary(result))
+    beside = "the figure and the rig" if usable else "the figure"
+    report = display_path(output / "report.md")
+    _log.info("Report: %s, beside it %s.", report, beside)
+    _raise_errors(result, report)
+    return result
+
+
+def solve_rig(
+    case: Case,
+    calibration: RigCalibration,
+    estimator: Estimator,
+    source: ScaleSource,
+    seed: int,
+) -> RigSolution:
+    """Return the rig that a recording shows, with the length that ``source`` gives it."""
+    estimate = _estimate(calibration, case.sequence, seed)
+    placed = _placed_views(estimate)
+
+    def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
+        used = _indices(usable_cameras(estimate)) or placed
+        recording = _spread(case.recording(used, rig), MEASURED_FRAMES)
+        return triangulate_recording(recording, estimator)
+
+    estimate, scale = in_millimetres(estimate, source, measure)
+    usable = _indices(usable_cameras(estimate))
+    world, change = _choose_world(estimate, placed, case)
+    return RigSolution(estimate, scale, placed, usable, world, change)
+
+
+def _raise_errors(result: CalibrationResult, report: str) -> None:
+    """Raise GhptDataError if a finding is an error."""
+    errors = [found.text for found in result.findings if found.severity == Severity.ERROR]
+    if errors:
+        written = "no rig is written"
+        if result.usable:
+            written = f"only {', '.join(result.usable)} are in the rig's files"
+        problem = f"{errors[0].rstrip('.')}; {written}"
+        raise GhptDataError(result.source, "calibration", problem, f"See {report}.")
+
+
+def summary(result: CalibrationResult) -> str:
+    """Return the result in words."""
+    errors = [
+        camera.reprojection_px for camera in result.cameras if camera.reprojection_px is not None
+    ]
+    return f"{result.data}: {len(errors)} cameras, {max(errors):.1f} px at most"
+
+
+def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
+    """Return the user's own key points and cameras, or without any a recording of the data set,
+    whose true extrinsics serve the comparison alone.
+
+    Extrinsics are in mm where the person tells their unit.
+    """
+    if not settings.keypoints:
+        return Case(recording_sequence(settings), "the truth", is_own=False)
+    cameras = own_cameras(settings, "intrinsics.toml")
+    people = own_people(settings)
+    sequence = own_sequence(settings, people, cameras, person=None)
+    sequence = resolve_unit(sequence, estimator, ask=False)
+    notes = people_findings(people)
+    return Case(sequence, "the file's own calibration", is_own=True, notes=notes)
+
+
+def people_findings(people: Detections) -> tuple[Finding, ...]:
+    """Return a warning where one of several people was followed."""
+    crowded = people.crowded_frames()
+    if not crowded:
+        return ()
+    frames = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
+    most = max(crowded.values())
+    return (SEVERAL_PEOPLE.finding(tuple(crowded), float(most), frames_of_views=frames),)
+
+
+def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
+    """Return the calibrated cameras that no error concerns: two or more, or none.
+
+    An error that names no camera concerns all.
+    """
+    usable = estimate.calibrated.clone()
+    for found in estimate.findings:
+        if found.severity == Severity.ERROR:
+            views = [estimate.names.index(name) for name in found.cameras]
+            usable[views or slice(None)] = False
+    return usable if int(usable.sum()) >= 2 else torch.zeros_like(usable)
+
+
+def _estimate(calibration: RigCalibration, sequence: Sequence, seed: int) -> RigEstimate:
+    points = sequence.undistorted()
+    cameras = sequence.cameras
+    return calibration(
         cameras.names,
         cameras.K,
         torch.from_numpy(points.pixels).double(),
         torch.from_numpy(points.confidence).double(),
         torch.from_numpy(points.valid),
         cameras.size,
-        config["seed"],
-    )
-    placed = (
-        torch.nonzero(estimate.calibrated)[:, 0].tolist()
-        if int(estimate.calibrated.sum()) >= 2
-        else []
+        seed,
     )
 
-    def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
-        used = torch.nonzero(usable_cameras(estimate))[:, 0].tolist() or placed
-        recording = spread(_through(case, used, rig), MEASURED_FRAMES)
-        return triangulate_recording(recording, estimator)
 
-    estimate, scale = in_millimetres(estimate, lengths, measure)
-    chosen = torch.nonzero(usable_cameras(estimate))[:, 0].tolist()
-    world, gauge = _gauge(
-        estimate, placed, cameras.cameras if cameras.calibrated else None, case.reference
-    )
-    moved = gauge.cameras(estimate.cameras)
-    rigs = {"estimated": moved} | ({case.reference: cameras.cameras} if cameras.calibrated else {})
-    seen_by = {name: _through(case, placed, rig) for name, rig in rigs.items() if placed}
-    numbers = {
-        "data": case.sequence.title,
-        "source": case.sequence.source,
-        "cameras_file": cameras.path,
-        "frames": len(case.sequence),
-        "seed": config["seed"],
-        "scale": scale,
-        "world": world,
-        "reference": case.reference if len(rigs) > 1 else None,
-        "triangulation": config["triangulation"],
-        "converged": estimate.converged,
-        "usable": [cameras.names[v] for v in chosen],
-        "cameras": camera_numbers(estimate, moved, gauge, cameras),
-        "difference": differences(*seen_by.values()) if len(seen_by) > 1 else None,
-        "explains": explains(seen_by, estimator, config["evaluated_frames"]),
-        "diagnoses": [
-            vars(found) for found in (*case.notes, *estimate.diagnoses, *of_scale(scale))
-        ],
-        "provenance": provenance(config["seed"]),
-    }
-    joints = gauge.points(estimate.points)
-    estimated = estimate.estimated
-    if chosen:
-        recording = _through(case, chosen, moved)
-        joints, estimated = triangulate_recording(recording, estimator)
-        write_rig(output, cameras.select(chosen), moved.index(chosen), numbers)
-        write_poses(output / "poses.npz", recording, joints, estimated, numbers)
-    reference = (case.reference, cameras.cameras) if cameras.calibrated else None
-    covariance = gauge.covariance(estimate.covariance)
-    write_rig_figure(
-        output, numbers, moved, covariance, joints, estimated, estimate.calibrated, reference
-    )
-    write_numbers(output, numbers)
-    print_calibration(numbers)
-    _log.info(
-        "Report: %s, beside it the figure%s.",
-        display_path(output / "report.md"),
-        " and the rig" * bool(chosen),
-    )
-    errors = [d["text"] for d in numbers["diagnoses"] if d["severity"] == "error"]
-    if errors:
-        written = (
-            f"only {', '.join(numbers['usable'])} are in the rig's files"
-            if chosen
-            else "no rig is written"
-        )
-        raise GhptDataError(
-            case.sequence.source,
-            "calibration",
-            f"{errors[0].rstrip('.')}; {written}",
-            f"See {display_path(output / 'report.md')}.",
-        )
-    return numbers
+def _placed_views(estimate: RigEstimate) -> list[int]:
+    """Return the calibrated views; none if they are fewer than two."""
+    views = _indices(estimate.calibrated)
+    return views if len(views) >= 2 else []
 
 
-def summary(numbers: dict[str, Any]) -> str:
-    """What `calibrate` returned, in words."""
-    errors = [c["reprojection_px"] for c in numbers["cameras"] if c["calibrated"]]
-    return f"{numbers['data']}: {len(errors)} cameras, {max(errors):.1f} px at most"
+def _indices(mask: Bool[Tensor, " V"]) -> list[int]:
+    return torch.nonzero(mask)[:, 0].tolist()
 
 
-def from_files(config: Mapping[str, Any]) -> Case:
-    """Return the user's own key points and cameras."""
-    inputs = input_settings(config)
-    cameras = own_cameras(inputs, "intrinsics.toml")
-    people = own_people(inputs)
-    sequence = own_sequence(inputs, people, cameras, person=None)
-    return Case(sequence, "the file's own calibration", people_note(people))
+def _spread(recording: Recording, frames: int) -> Recording:
+    """Return at most so many frames of a recording, evenly spread."""
+    count = min(frames, len(recording))
+    rows = np.linspace(0, len(recording) - 1, count).astype(int)
+    return recording.frames(np.unique(rows))
 
 
-def in_unit(case: Case, estimator: Estimator) -> Case:
-    """Return the case with extrinsics in mm where the person tells their unit.
-
-    They are what the calibration is compared with.
-    """
-    return replace(case, sequence=resolve_unit(case.sequence, estimator, ask=False))
-
-
-def people_note(people: Detections) -> tuple[Diagnosis, ...]:
-    """Return a warning where one of several people was followed."""
-    crowded = people.crowded_frames()
-    if not crowded:
-        return ()
-    frames = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
-    text = (
-        f"several people in {frames}; "
-        "the one tracked best in each view was followed, and must be the same person in all"
-    )
-    most = float(max(crowded.values()))
-    return (Diagnosis("several_people", "warning", tuple(crowded), text, most),)
-
-
-def from_data(config: Mapping[str, Any]) -> Case:
-    """Return one recording of a data set, whose true extrinsics serve the comparison alone."""
-    return Case(recording_sequence(input_settings(config)), "the truth")
-
-
-def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
-    """Calibrated cameras that no error concerns; an error that names none, or all, concerns all.
-    Two or more.
-    """
-    usable = estimate.calibrated.clone()
-    for found in estimate.diagnoses:
-        if found.severity == "error":
-            of = [estimate.names.index(name) for name in found.cameras if name in estimate.names]
-            usable[of or slice(None)] = False
-    return usable if int(usable.sum()) >= 2 else torch.zeros_like(usable)
-
-
-def _gauge(
-    estimate: RigEstimate, placed: list[int], reference: Cameras | None, name: str
-) -> tuple[str, Similarity]:
-    """The world that the rig is written in, in words, and the way there."""
+def _choose_world(estimate: RigEstimate, placed: list[int], case: Case) -> tuple[str, Similarity]:
+    """Return the world that the rig is written in, in words, and the way there."""
+    reference = case.reference_cameras
     if reference is not None and placed:
-        return f"that of {name}", align(
-            estimate.cameras.index(placed), reference.index(placed), rigid=True
-        )
-    gauge = upright(
-        estimate.points, estimate.estimated, estimate.cameras.index(placed or slice(None))
-    )
-    return (
-        "z along the people's upright, x where the first camera looks, the floor at their lowest ankles",
-        gauge,
-    )
+        own = estimate.cameras.index(placed)
+        return f"that of {case.reference}", align(own, reference.index(placed), rigid=True)
+    cameras = estimate.cameras.index(placed or slice(None))
+    return _UPRIGHT, upright(estimate.points, estimate.estimated, cameras)
 
 
-def _through(case: Case, views: list[int], cameras: Cameras) -> Recording:
-    """Return the recording as a calibration of some of its cameras sees it."""
-    sequence = case.sequence.select_views(views)
-    points = sequence.undistorted()
-    return Recording(
-        name=sequence.title,
-        subject=sequence.title,
-        action="unknown",
-        rate_hz=sequence.rate_hz or float("nan"),
-        camera_names=sequence.cameras.names,
-        cameras=cameras.index(views),
-        key_points=points.pixels,
-        confidence=points.confidence,
-        valid=points.valid,
-        frame=sequence.frame,
-    )
+def _difference(
+    estimate: RigEstimate, rig: Cameras, reference: Cameras | None, placed: list[int]
+) -> Differences | None:
+    """Return how far the reference differs; None where the recording does not determine a rig."""
+    of_all = [f for f in estimate.findings if f.severity == Severity.ERROR and not f.cameras]
+    if reference is None or not placed or of_all:
+        return None
+    found = rig_difference(rig.index(placed), reference.index(placed))
+    names = [estimate.names[view] for view in placed]
+    rotation = dict(zip(names, found.rotation_deg.tolist(), strict=True))
+    centre = dict(zip(names, found.centre_mm.tolist(), strict=True))
+    return Differences(rotation, centre, found.scale)
 
 
-COMMAND = Command(name="calibrate", settings=dict, task=calibrate, summary=summary, files=files)
+def _findings(case: Case, solution: RigSolution, camera_check: CameraCheck) -> tuple[Finding, ...]:
+    """Return what is wrong with the recording, the rig, and the extrinsics in the user's file."""
+    own = (*case.notes, *solution.findings)
+    said = {(found.code, frozenset(found.cameras)) for found in own}
+    of_file = [
+        found
+        for found in check_reference(case, camera_check)
+        if (found.code, frozenset(found.cameras)) not in said
+    ]
+    return (*own, *of_file)
+
+
+def check_reference(case: Case, camera_check: CameraCheck) -> tuple[Finding, ...]:
+    """Return what the camera check finds in the user's own extrinsics.
+
+    They are warnings: the calibrated rig does not rest on these extrinsics.
+    """
+    cameras = case.sequence.cameras
+    if not case.is_own or not cameras.calibrated:
+        return ()
+    try:
+        evidence = gather(case.sequence, camera_check.frames, camera_check.shift)
+    except GhptDataError:  # no frame shows enough: nothing can be told
+        return ()
+    findings = camera_check(evidence, setup_of(cameras)).findings
+    return tuple(replace(found, severity=Severity.WARNING) for found in findings)
+
+
+COMMAND = Command(
+    name="calibrate", settings=CalibrateSettings, task=calibrate, summary=summary, files=files
+)
 
 
 if __name__ == "__main__":

@@ -135,7 +135,7 @@ class OutputFolder:
             self._write()
 
     def finished(self, settings: Mapping[str, Any]) -> str | None:
-        """What a finished run with these settings and inputs said here, if its files are all there."""
+        """Return what a finished run with these settings and inputs said; None without one."""
         try:
             record = json.loads((self.path / STATE / _FINISHED).read_text(encoding="utf-8"))
         except (OSError, ValueError):
@@ -175,7 +175,10 @@ class OutputFolder:
             if not self._owns(name):
                 raise _foreign(path)
             if name in self.files.keeps:
-                hint = "Go on with resume=true, start anew with overwrite=true, or name another output."
+                hint = (
+                    "Go on with resume=true, start anew with overwrite=true, "
+                    "or name another output."
+                )
                 raise GhptDataError(path, "", "is there from an earlier run", hint)
         for name in self.files.growing:
             if (self.path / name).exists() and name not in self._growing and not self.overwrite:
@@ -241,7 +244,7 @@ class OutputFolder:
 
 
 class SweepFolder(Callback):
-    """Hydra's callback that takes a sweep's folder before Hydra writes ``multirun.yaml`` into it."""
+    """Hydra's callback that takes a sweep's folder before Hydra writes into it."""
 
     _taken: ClassVar[list[OutputFolder]] = []
 
@@ -266,21 +269,9 @@ class SweepFolder(Callback):
                 cls._taken.pop().__exit__(None, None, None)
 
 
-def input_paths(*named: str | Mapping[str, Any] | None) -> tuple[Path, ...]:
-    """Return the files and folders that settings name as inputs; None names nothing.
-
-    For a mapping, the plain settings of a command, these are its ckpt, cameras, keypoints and
-    data.root.
-    """
-    values: list[str] = []
-    for one in named:
-        if isinstance(one, Mapping):
-            of_data = one.get("data") or {}
-            inputs = [one.get("ckpt"), one.get("cameras"), one.get("keypoints")]
-            values += [str(value) for value in (*inputs, of_data.get("root")) if value]
-        elif one:
-            values.append(one)
-    paths = [Path(value).expanduser() for value in values]
+def input_paths(*named: str | None) -> tuple[Path, ...]:
+    """Return the files and folders that settings name as inputs; None names nothing."""
+    paths = [Path(value).expanduser() for value in named if value]
     for folder in tuple(paths):
         if folder.is_dir():
             # A folder of cameras may be the output of an earlier calibration: these files are read.
@@ -288,14 +279,8 @@ def input_paths(*named: str | Mapping[str, Any] | None) -> tuple[Path, ...]:
     return tuple(paths)
 
 
-def check_apart(keypoints: str | Mapping[str, Any] | None, output: str = "") -> None:
-    """Raise GhptConfigError if the output folder is the folder of key points itself.
-
-    Both may be given as the plain settings of a command.
-    """
-    if isinstance(keypoints, Mapping):
-        output = str(keypoints.get("output") or "")
-        keypoints = str(keypoints.get("keypoints") or "")
+def check_apart(keypoints: str | None, output: str) -> None:
+    """Raise GhptConfigError if the output folder is the folder of key points itself."""
     if not keypoints or not output or not Path(keypoints).is_dir():
         return
     if Path(output).resolve() == Path(keypoints).resolve():

@@ -3,7 +3,7 @@
 A mistake is named, with what exists, before anything heavy is imported.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -53,22 +53,23 @@ def check_overrides(source: Source, words: Sequence[str]) -> list[Override]:
     overrides = [_parse(word) for word in words]
     with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
-        first = _search_path(source, overrides)
+        search_path = _search_path(source, overrides)
         groups = {}
         for override in overrides:
             group = override.key_or_group
-            choices = _choices(loader, source, group, first)
+            choices = _choices(loader, source, group, search_path)
             if choices and not override.is_delete():
-                chosen = [_check_choice(group, value, choices) for value in _values(override)]
-                groups[group] = f"{override.get_key_element()}={chosen[0]}"
-        composed = hydra.compose(source.name, overrides=[*first, *groups.values()])
+                groups[group] = _first_choice(override, choices)
+        chosen = [*search_path, *groups.values()]
+        composed = hydra.compose(source.name, overrides=chosen)
     config = OmegaConf.to_container(composed)
     for override in overrides:
         key = override.key_or_group
         is_hydras = key.startswith("hydra") or "@" in key
         is_group = key in groups or (source.folder / key).is_dir()
         if not is_hydras and not is_group:
-            _check_key(config, key, added=override.is_add() or override.is_force_add())
+            added = override.is_add() or override.is_force_add()
+            _check_key(config, key, added)
     return overrides
 
 
@@ -98,8 +99,11 @@ def _parse(word: str) -> Override:
 
 def _search_path(source: Source, overrides: Sequence[Override]) -> list[str]:
     """Return the override by which Hydra finds a user's own files too, if there are any."""
-    given = [o.value() for o in overrides if o.get_key_element() == _SEARCH_PATH]
-    places = [str(place) for place in given[-1]] if given else []
+    places: list[str] = []
+    for override in overrides:
+        value = override.value()
+        if override.get_key_element() == _SEARCH_PATH and isinstance(value, list):
+            places = [str(place) for place in value]
     if source.more is not None:
         places.append(f"file://{source.more}")
     quoted = ",".join(f"'{place}'" for place in places)
@@ -121,13 +125,28 @@ def _values(override: Override) -> list[Any]:
     return [override.value()]
 
 
-def _check_choice(group: str, value: Any, existing: Sequence[str]) -> Any:
-    names = value if isinstance(value, list) else [value]
-    for name in names:
-        if name not in existing:
-            text = "null" if name is None else repr(name)
-            raise GhptConfigError(group, f"there is no {text}", suggest(str(name), existing))
-    return f"[{','.join(map(str, value))}]" if isinstance(value, list) else value
+def _first_choice(override: Override, existing: Sequence[str]) -> str:
+    """Return the override with the first of its values.
+
+    Raises GhptConfigError if one of them is no choice of the group.
+    """
+    values = _values(override)
+    for value in values:
+        names = value if isinstance(value, list) else [value]
+        for name in names:
+            _check_choice(override.key_or_group, name, existing)
+    first = values[0]
+    if isinstance(first, list):
+        names = [str(name) for name in first]
+        first = f"[{','.join(names)}]"
+    return f"{override.get_key_element()}={first}"
+
+
+def _check_choice(group: str, name: Any, existing: Sequence[str]) -> None:
+    if name not in existing:
+        text = "null" if name is None else repr(name)
+        hint = suggest(str(name), existing)
+        raise GhptConfigError(group, f"there is no {text}", hint)
 
 
 def _check_key(config: Any, key: str, added: bool) -> None:
@@ -140,13 +159,13 @@ def _check_key(config: Any, key: str, added: bool) -> None:
             continue
         if added and depth:
             return  # whatever is built from it knows its settings
-        existing = node if isinstance(node, Mapping) else []
+        existing: Iterable[object] = node if isinstance(node, Mapping) else []
         above = ".".join(parts[:depth])
         problem = f"no such setting in {above}" if above else "no such setting"
         raise GhptConfigError(key, problem, _suggest_key(config, existing, part, parts[-1]))
 
 
-def _suggest_key(config: Any, existing: Mapping[str, Any] | list[Any], part: str, last: str) -> str:
+def _suggest_key(config: Any, existing: Iterable[object], part: str, last: str) -> str:
     """Suggest a key beside the missing ``part``, or one elsewhere whose last part is ``last``."""
     hint = suggest(part, existing)
     elsewhere = [path for path in _paths(config) if path.endswith(f".{last}")]

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ghpt.calibration.check.examination import Doctor
+from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
@@ -40,7 +40,7 @@ from ghpt.commands.prediction.statistics import (
     measure_coverage,
     pose_estimate,
 )
-from ghpt.commands.prediction.verdict import Judge, Level
+from ghpt.commands.prediction.verdict import Judge, Level, Measures
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
@@ -102,7 +102,7 @@ class PredictSettings(InputSettings):
     estimator: EstimatorSettings
     view_weights: Target
     fitted_frames: int
-    doctor: Target
+    camera_check: Target
     verdict: Target
     strict: bool
     seed: int
@@ -160,9 +160,9 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     compared = {
         name: build(settings.baselines[name], f"baselines.{name}") for name in settings.compare
     }
-    doctor: Doctor = build(settings.doctor, "doctor")
+    camera_check: CameraCheck = build(settings.camera_check, "camera_check")
     judge: Judge = build(settings.verdict, "verdict")
-    sequence = open_sequence(settings, doctor)
+    sequence = open_sequence(settings, camera_check)
     gaps = Gaps(
         longest=gap_frames(settings.fill, sequence.rate_hz),
         interpolation=settings.interpolation,
@@ -216,17 +216,30 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         formats=formats,
         provenance=about.provenance,
     )
-    asked = judge.asks(result.scales.views)
-    checkup = check_cameras(sequence, doctor) if asked else None
+    measures = _measures(result)
+    asked = camera_check.is_worthwhile(measures.view_errors)
+    mistakes = check_cameras(sequence, camera_check) if asked else ()
     commands = commands_on(settings, settings.person, settings.ckpt, output)
-    verdict = judge(result.plain(), checkup, result.unit_mm, commands)
+    verdict = judge(measures, mistakes, result.unit_mm, commands)
     result = replace(result, verdict=verdict)
     _write_report(result, output)
     if settings.strict and verdict.level != Level.GOOD:
-        worst = max(verdict.findings, key=lambda finding: finding.level)
+        worst = verdict.findings[0]
         problem = f"{verdict.level.words}: {worst.text}"
         raise GhptDataError(sequence.source, "verdict", problem, f"Next: {worst.command}")
     return result
+
+
+def _measures(result: PredictionResult) -> Measures:
+    """Return what the verdict rests on."""
+    rejected = result.coverage.share["rejected"]
+    placed = rejected + result.coverage.share["observed"]
+    return Measures(
+        stature_mm=result.coverage.stature_mm,
+        held_out_error=result.scales.all,
+        view_errors=result.scales.views,
+        rejected=rejected / placed if placed else 0.0,
+    )
 
 
 def summary(result: PredictionResult | None) -> str:
@@ -291,13 +304,13 @@ def _with_flips(settings: PredictSettings, group: Target) -> dict[str, Any]:
     return dict(group) if settings.flips else dict(group) | {"flips": None}
 
 
-def open_sequence(settings: PredictSettings, doctor: Doctor) -> Sequence:
+def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Sequence:
     """Return what is predicted: the user's own key points, or a recording of the data set."""
     if not settings.keypoints:
         return recording_sequence(settings)
     sequence = _files_sequence(settings)
     sequence.cameras.check_calibrated(sequence.source)
-    return resolve_unit(sequence, doctor.consensus, ask=True)
+    return resolve_unit(sequence, camera_check.consensus, ask=True)
 
 
 def _files_sequence(settings: PredictSettings) -> Sequence:

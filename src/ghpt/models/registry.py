@@ -22,7 +22,7 @@ from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.models.problem import Problem
 from ghpt.models.relative_pose.problem import RelativePose
-from ghpt.models.relative_pose.scale import BodyHeight, KnownScale, Scale, SegmentLengths
+from ghpt.models.relative_pose.scale import BodyHeight, KnownScale, Scale, BoneLengths
 from ghpt.models.scorer import Scorer
 
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", re.ASCII)
@@ -67,7 +67,7 @@ def register(part: str, *classes: type) -> None:
 
 register("model", StochasticEstimator)
 register("model.problem", PoseTriangulation, RelativePose)
-register("model.problem.scale", KnownScale, BodyHeight, SegmentLengths)
+register("model.problem.scale", KnownScale, BodyHeight, BoneLengths)
 register("model.scorer", Scorer)
 register("model.loss", StochasticLoss)
 for _name, _one in vars(optim).items():

@@ -1,217 +1,214 @@
-"""The numbers of a calibration as plain data, its table in the terminal and its Markdown report."""
+"""A calibration: what calibration.json holds, and the document that shows it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-import torch
-from jaxtyping import Bool, Float
-from rich.console import Console
-from rich.table import Table
-from rich.text import Text
-from torch import Tensor
-
-from ghpt.models.estimators.classical import Estimator
-from ghpt.models.relative_pose.scale import SEGMENTS
-from ghpt.observations import Recording
-from ghpt.report.escape import escaped, plain
-from ghpt.report.rig_comparison import (
-    held_out_errors,
-    rig_difference,
-    segment_variation,
-    triangulate_recording,
+from ghpt.calibration.findings import Finding
+from ghpt.calibration.millimetres import RigScale
+from ghpt.models.relative_pose.scale import BONE_NAMES
+from ghpt.report.document import (
+    Block,
+    Bullets,
+    Document,
+    Heading,
+    Paragraph,
+    Table,
+    Text,
+    prose,
 )
-from ghpt.report.tables import NONE, markdown
+from ghpt.report.findings import finding_bullets, finding_paragraphs
+from ghpt.report.rig_comparison import Explanation, Quantiles
+from ghpt.report.tables import NONE
 
-Numbers = dict[str, Any]
-_COLOURS = {"error": "red", "warning": "yellow"}
-
-
-def explains(recordings: Mapping[str, Recording], estimator: Estimator, frames: int) -> Numbers:
-    """How well each calibration of the same key points explains them: name -> held-out-view errors
-    (pixels) over the joints that all of them estimate, overall and by view, and the variation of
-    the segments' lengths; over at most so many ``frames``, evenly spread.
-    """
-    recordings = {name: spread(recording, frames) for name, recording in recordings.items()}
-    if not recordings:
-        return {}
-    held_out = {
-        name: held_out_errors(recording, estimator) for name, recording in recordings.items()
-    }
-    measured = torch.stack([counted for _, counted in held_out.values()]).all(0)
-    result = {}
-    for name, recording in recordings.items():
-        errors = held_out[name][0]
-        variation, known = segment_variation(*triangulate_recording(recording, estimator))
-        views = {
-            view: _quantiles(errors[:, v][measured[:, v]])
-            for v, view in enumerate(recording.camera_names)
-        }
-        lengths = dict(zip(SEGMENTS, _known(variation, known), strict=True))
-        result[name] = {
-            "held_out": _quantiles(errors[measured]) | {"views": views},
-            "segments": {
-                "median": float(variation[known].median()) if known.any() else None,
-                "each": lengths,
-            },
-        }
-    return result
+Matrix = list[list[float]]
+_CAPTION = "error: median reprojection; ±: standard deviation from the recording itself"
 
 
-def differences(recording: Recording, reference: Recording) -> Numbers:
-    """From the reference's calibration of the same cameras, after the similarity between the
-    worlds.
-    """
-    apart = rig_difference(recording.cameras, reference.cameras)
-    names = recording.camera_names
-    return {
-        "rotation_deg": dict(zip(names, apart.rotation_deg.tolist(), strict=True)),
-        "centre_mm": dict(zip(names, apart.centre_mm.tolist(), strict=True)),
-        "scale": apart.scale,
-    }
+@dataclass(frozen=True)
+class CalibratedCamera:
+    """A camera of a calibration; what is not calibrated has no numbers."""
+
+    name: str
+    calibrated: bool
+    reprojection_px: float | None
+    inliers: float | None
+    """The share of its key points that agree with the rig."""
+    rotation_sd_deg: float | None
+    centre_sd_mm: float | None
+    R: Matrix | None
+    t_mm: list[float] | None
+    centre_mm: list[float] | None
+    covariance: Matrix | None
+    """Of the rotation about the world's axes (radians) and of the centre (mm)."""
+    K: Matrix
+    distortion: list[float]
+    size: list[int] | None
 
 
-def print_calibration(numbers: Numbers, console: Console | None = None) -> None:
-    """The table of the cameras, then what was found, in 80 columns."""
-    console = console or Console()
-    header, rows = camera_rows(numbers)
-    title = plain(f"Calibration of {numbers['data']}", "table.title")
-    caption = plain(_caption(numbers), "table.caption")
-    table = Table(title=title, caption=caption, title_justify="left", caption_justify="left")
-    for i, column in enumerate(header):
-        table.add_column(column, justify="right" if i else "left")
-    for row in rows:
-        table.add_row(*map(plain, row))
-    console.print(table)
-    for line in summary_lines(numbers):
-        console.print(plain(line))
-    for found in numbers["diagnoses"]:
-        severity = found["severity"]
-        line = Text.assemble((severity, _COLOURS.get(severity, "")), ": ", plain(found["text"]))
-        console.print(line, soft_wrap=True)
+@dataclass(frozen=True)
+class Differences:
+    """Of each camera from the reference's calibration, after `align_robustly`."""
+
+    rotation_deg: dict[str, float]
+    centre_mm: dict[str, float]
+    scale: float
+    """Size of the reference over the estimate's."""
 
 
-def camera_rows(numbers: Numbers) -> tuple[list[str], list[list[str]]]:
-    """Header and a row for each camera; what is not known is a dash."""
-    header = ["camera", "error px", "inliers %", "turn ± °", "centre ± mm"]
-    apart = numbers.get("difference")
-    header += ["Δ turn °", "Δ centre mm"] if apart else []
+@dataclass(frozen=True)
+class CalibrationResult:
+    """What calibration.json holds."""
+
+    data: str
+    source: str
+    cameras_file: str
+    frames: int
+    seed: int
+    scale: RigScale
+    world: str
+    """In which the cameras are, in words."""
+    reference: str | None
+    """What the cameras are compared with, in words."""
+    triangulation: str
+    converged: bool
+    usable: tuple[str, ...]
+    """The cameras that are in the rig's files."""
+    cameras: tuple[CalibratedCamera, ...]
+    difference: Differences | None
+    """None where there is no reference, and where the recording does not determine a rig."""
+    explains: dict[str, Explanation]
+    """How well each calibration explains the key points, by its name."""
+    findings: tuple[Finding, ...]
+    provenance: dict[str, Any]
+
+    def plain(self) -> dict[str, Any]:
+        """Return the result as plain data."""
+        return asdict(self) | {"scale": self.scale.plain()}
+
+
+def calibration_summary(result: CalibrationResult) -> Document:
+    """Return what the terminal shows: the table of the cameras, and what was found."""
+    lines: list[Block] = [Paragraph(line) for line in _rig_lines(result)]
+    title = f"Calibration of {result.data}"
+    table = _camera_table(result, title)
+    return Document("", [table, *lines, *finding_paragraphs(result.findings)])
+
+
+def calibration_document(result: CalibrationResult) -> Document:
+    """Return the report."""
+    origin = result.provenance
+    commit = origin["commit"] or NONE
+    about = prose(
+        f"{result.frames} frames, {len(result.cameras)} views, seed {result.seed}, "
+        f"ghpt {origin['ghpt']}, commit `{commit}`."
+    )
+    blocks: list[Block] = [
+        Paragraph(about),
+        Bullets(_rig_lines(result)),
+        Heading("Findings"),
+        finding_bullets(result.findings, "None."),
+        Heading("Cameras"),
+        _camera_table(result),
+    ]
+    if result.explains:
+        blocks += _explanation_blocks(result)
+    return Document(f"Calibration of {result.data}", blocks)
+
+
+def _camera_table(result: CalibrationResult, title: str = "") -> Table:
+    """Return a row for each camera; what is not known is a dash."""
+    header = ["camera", "error px", "inliers %", "rotation ± °", "centre ± mm"]
+    if result.difference is not None:
+        header += ["Δ rotation °", "Δ centre mm"]
     rows = []
-    for camera in numbers["cameras"]:
-        name = camera["name"]
-        row = [name, _number(camera["reprojection_px"], 1), _number(camera["inliers"], 0, 100)]
-        row += [_number(camera["rotation_sd_deg"], 2), _number(camera["centre_sd_mm"], 1)]
-        if apart:
-            row += [
-                _number(apart["rotation_deg"].get(name), 2),
-                _number(apart["centre_mm"].get(name), 1),
-            ]
-        rows.append(row if camera["calibrated"] else [name, *[NONE] * (len(header) - 1)])
-    return header, rows
+    for camera in result.cameras:
+        cells = [NONE] * (len(header) - 1)
+        if camera.calibrated:
+            cells = _camera_cells(camera, result.difference)
+        rows.append([camera.name, *cells])
+    caption: tuple[Text, ...] = (_CAPTION,)
+    if result.difference is not None:
+        caption += (
+            f"Δ: from {result.reference}, after the similarity between the two worlds that most "
+            "cameras agree on",
+        )
+    return Table(header, rows, title=title, caption=caption)
 
 
-def summary_lines(numbers: Numbers) -> list[str]:
-    """What one sentence each says of the rig as a whole."""
-    lines = [f"Scale: {numbers['scale']['text']}."]
-    if numbers.get("difference"):
-        scale = numbers["difference"]["scale"]
-        lines.append(f"Size: {numbers['reference']} is {scale:.4f} times as large.")
-    for name, found in numbers["explains"].items():
-        errors = found["held_out"]
-        if errors["median"] is not None:
+def _camera_cells(camera: CalibratedCamera, difference: Differences | None) -> list[str]:
+    cells = [
+        _number(camera.reprojection_px, 1),
+        _percent(camera.inliers, 0),
+        _number(camera.rotation_sd_deg, 2),
+        _number(camera.centre_sd_mm, 1),
+    ]
+    if difference is not None:
+        cells.append(_number(difference.rotation_deg.get(camera.name), 2))
+        cells.append(_number(difference.centre_mm.get(camera.name), 1))
+    return cells
+
+
+def _rig_lines(result: CalibrationResult) -> list[Text]:
+    """Return sentences on the rig as a whole."""
+    lines: list[Text] = [f"Scale: {result.scale.text}."]
+    if result.difference is not None:
+        scale = result.difference.scale
+        lines.append(f"Size: {result.reference} is {scale:.4f} times as large.")
+    for name, explanation in result.explains.items():
+        errors = explanation.held_out
+        if errors.median is not None:
+            variation = _percent(explanation.segments.median, 1)
             lines.append(
-                f"{name}: held-out view {errors['median']:.1f} px median, {errors['p90']:.1f} px 90 %; "
-                f"segments vary by {_number(found['segments']['median'], 1, 100)} %."
+                f"{name}: held-out view {errors.median:.1f} px median, {errors.p90:.1f} px 90 %; "
+                f"segments vary by {variation} %."
             )
     return lines
 
 
-def calibration_report(numbers: Numbers) -> str:
-    """The Markdown report."""
-    explained = numbers["explains"]
-    parts = [
-        f"# Calibration of {escaped(numbers['data'])}",
-        f"{numbers['frames']} frames, {len(numbers['cameras'])} views, seed {numbers['seed']}, "
-        f"ghpt {numbers['provenance']['ghpt']}, commit `{numbers['provenance']['commit'] or NONE}`.",
-        "\n".join(f"- {escaped(line)}" for line in summary_lines(numbers)),
-        "## Diagnoses",
-        "\n".join(_diagnosis(found) for found in numbers["diagnoses"]) or "None.",
-        "## Cameras",
-        markdown(*camera_rows(numbers)),
-        "\n".join(map(escaped, _caption(numbers).split("\n"))),
-    ]
-    if explained:
-        names = list(explained)
-        views = explained[names[0]]["held_out"]["views"]
-        rows = [
-            [
-                view,
-                *(
-                    _number(explained[n]["held_out"]["views"][view][q], 1)
-                    for n in names
-                    for q in _QUANTILES
-                ),
-            ]
-            for view in views
-        ]
-        rows.append(
-            ["all", *(_number(explained[n]["held_out"][q], 1) for n in names for q in _QUANTILES)]
-        )
-        parts += [
-            "## Held-out views",
-            "Each joint is triangulated from the other views and projected into the one left out, on the same joints "
-            f"for all; pixels. Triangulation: {numbers['triangulation']}.",
-            markdown(["view", *(f"{n}, {q}" for n in names for q in ("median", "90 %"))], rows),
-            "## Segments",
-            "Variation of their lengths over the frames, % (1.4826 x median deviation over median).",
-            markdown(["segment", *names], _segment_rows(explained)),
-        ]
-    return "\n\n".join(parts) + "\n"
+def _explanation_blocks(result: CalibrationResult) -> Iterator[Block]:
+    names = list(result.explains)
+    header = [f"{name}, {quantile}" for name in names for quantile in ("median", "90 %")]
+    yield Heading("Held-out views")
+    yield Paragraph(
+        "Each joint is triangulated from the other views and projected into the one left out, on "
+        f"the same joints for all; pixels. Triangulation: {result.triangulation}."
+    )
+    yield Table(["view", *header], _held_out_rows(result))
+    yield Heading("Segments")
+    yield Paragraph(
+        "Variation of their lengths over the frames, % (1.4826 x median deviation over median)."
+    )
+    yield Table(["segment", *names], _bone_rows(result))
 
 
-def _diagnosis(found: Mapping[str, Any]) -> str:
-    return f"- **{found['severity']}** ({found['code']}): {escaped(found['text'])}"
+def _held_out_rows(result: CalibrationResult) -> list[list[str]]:
+    explanations = list(result.explains.values())
+    rows = []
+    for view in explanations[0].held_out.views:
+        own = [explanation.held_out.views[view] for explanation in explanations]
+        rows.append([view, *_quantile_cells(own)])
+    every: list[Quantiles] = [explanation.held_out for explanation in explanations]
+    return [*rows, ["all", *_quantile_cells(every)]]
 
 
-_QUANTILES = ("median", "p90")
+def _quantile_cells(errors: list[Quantiles]) -> list[str]:
+    return [_number(value, 1) for error in errors for value in (error.median, error.p90)]
 
 
-def _segment_rows(explained: Numbers) -> list[list[str]]:
-    each = [found["segments"]["each"] for found in explained.values()]
-    return [
-        [name.replace("_", " "), *(_number(of[name], 1, 100) for of in each)] for name in SEGMENTS
-    ]
+def _bone_rows(result: CalibrationResult) -> list[list[str]]:
+    rows = []
+    for name in BONE_NAMES:
+        each = [one.segments.each[name] for one in result.explains.values()]
+        rows.append([name.replace("_", " "), *(_percent(value, 1) for value in each)])
+    return rows
 
 
-def spread(recording: Recording, frames: int) -> Recording:
-    """At most so many of its frames, evenly spread."""
-    rows = np.unique(np.linspace(0, len(recording) - 1, min(frames, len(recording))).astype(int))
-    return recording.frames(rows)
+def _number(value: float | None, digits: int) -> str:
+    return NONE if value is None else f"{value:.{digits}f}"
 
 
-def _caption(numbers: Numbers) -> str:
-    caption = "error: median reprojection; ±: standard deviation from the recording itself"
-    if numbers.get("difference"):
-        caption += f"\nΔ: from {numbers['reference']}, after the similarity between the two worlds"
-    return caption
-
-
-def _quantiles(errors: Float[Tensor, " N"]) -> Numbers:
-    if not len(errors):
-        return {"median": None, "p90": None, "count": 0}
-    ordered = errors.sort().values
-    return {
-        "median": float(ordered[(len(errors) - 1) // 2]),
-        "p90": float(ordered[int(0.9 * (len(errors) - 1))]),
-        "count": len(errors),
-    }
-
-
-def _known(values: Float[Tensor, " N"], known: Bool[Tensor, " N"]) -> Sequence[float | None]:
-    return [v if k else None for v, k in zip(values.tolist(), known.tolist(), strict=True)]
-
-
-def _number(value: float | None, digits: int, factor: int = 1) -> str:
-    return NONE if value is None else f"{factor * value:.{digits}f}"
+def _percent(value: float | None, digits: int) -> str:
+    return NONE if value is None else f"{100 * value:.{digits}f}"

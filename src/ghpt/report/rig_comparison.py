@@ -1,7 +1,8 @@
-"""How well a calibration explains a recording, and how far two calibrations of one rig are apart."""
+"""How well a calibration explains a recording, and how far two calibrations of one rig differ."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -12,11 +13,18 @@ from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.rotations import nearest_rotation
 from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.estimators.classical import Estimator
+from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.observations import Observations, Recording
 from ghpt.skeleton import BONES, JOINT, PELVIS, THORAX
 
 _FRAMES = 256
 """Frames that are triangulated at once."""
+_ITERATIONS = 100
+_SMALLEST_ANGLE = 1e-4
+"""Radians; a rotation that differs by less weighs no more in `align_robustly`."""
+_SMALLEST_SHARE = 1e-5
+"""Of the rig's size; a centre that differs by less weighs no more in `align_robustly`."""
+_ANKLES = [JOINT["left_ankle"], JOINT["right_ankle"]]
 
 
 @dataclass(frozen=True)
@@ -28,40 +36,90 @@ class Similarity:
     t: Float[Tensor, " 3"]
 
     def points(self, points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
+        """Return points in the other world."""
         return self.scale * (points @ self.R.mT) + self.t
 
     def cameras(self, cameras: Cameras) -> Cameras:
-        """The same cameras in the other world: what they see stays where it is in their images."""
+        """Return the same cameras in the other world: their images stay as they are."""
         R = cameras.R @ self.R.mT
-        return Cameras(cameras.K, R, self.scale * cameras.t - (R @ self.t[:, None])[..., 0])
+        origin = (R @ self.t[:, None])[..., 0]
+        return Cameras(cameras.K, R, self.scale * cameras.t - origin)
 
     def covariance(self, covariance: Float[Tensor, "V 6 6"]) -> Float[Tensor, "V 6 6"]:
-        """Of turns (radians, about the world's axes) and centres (mm)."""
+        """Return covariances of rotations (radians, about the world's axes) and centres (mm)."""
         change = torch.block_diag(self.R, self.scale * self.R)
         return change @ covariance @ change.T
 
 
 def align(cameras: Cameras, reference: Cameras, rigid: bool = False) -> Similarity:
-    """The similarity (with scale 1 if ``rigid``) that brings a rig onto a reference rig with the
-    same V >= 2 cameras.
+    """Return the similarity (with scale 1 if ``rigid``) that brings a rig onto a reference rig with
+    the same V >= 2 cameras.
 
     Its rotation is the mean (chordal) of the cameras' own; scale and translation then fit the
-    centres in least squares. Scale 1 where the centres of either rig coincide.
+    centres in least squares. The scale is 1 where the centres of either rig coincide.
     """
-    R = nearest_rotation((reference.R.mT @ cameras.R).sum(0))
+    equal = torch.ones(len(cameras.R), dtype=cameras.R.dtype)
+    R = _mean_rotation(cameras, reference, equal)
+    return _fit_centres(cameras, reference, R, equal, rigid)
+
+
+def align_robustly(cameras: Cameras, reference: Cameras) -> Similarity:
+    """Return the similarity that brings a rig onto a reference rig, whatever a minority of cameras
+    says.
+
+    Its rotation has the least sum of chordal distances, not of their squares, to the cameras' own;
+    scale and translation then leave the least sum of distances between the centres. So a camera
+    that differs does not move the others, and its own difference is not shared among them.
+    """
+    equal = torch.ones(len(cameras.R), dtype=cameras.R.dtype)
+    R = _mean_rotation(cameras, reference, equal)
+    for _ in range(_ITERATIONS):
+        chord = (reference.R @ R - cameras.R).flatten(1).norm(dim=-1)
+        R = _mean_rotation(cameras, reference, 1 / chord.clamp(min=_SMALLEST_ANGLE))
+    similarity = _fit_centres(cameras, reference, R, equal)
+    target = reference.centre
+    size = (target - target.mean(0)).norm(dim=-1).mean()
+    smallest = float((_SMALLEST_SHARE * size).clamp(min=1e-9))
+    for _ in range(_ITERATIONS):
+        distance = (similarity.points(cameras.centre) - target).norm(dim=-1)
+        weight = 1 / distance.clamp(min=smallest)
+        similarity = _fit_centres(cameras, reference, R, weight)
+    return similarity
+
+
+def _mean_rotation(
+    cameras: Cameras, reference: Cameras, weight: Float[Tensor, " V"]
+) -> Float[Tensor, "3 3"]:
+    own = reference.R.mT @ cameras.R
+    return nearest_rotation((weight[:, None, None] * own).sum(0))
+
+
+def _fit_centres(
+    cameras: Cameras,
+    reference: Cameras,
+    R: Float[Tensor, "3 3"],
+    weight: Float[Tensor, " V"],
+    rigid: bool = False,
+) -> Similarity:
+    """Return the similarity of this rotation that fits the centres in weighted least squares."""
+    w = weight[:, None]
     source = cameras.centre @ R.mT
     target = reference.centre
-    a = source - source.mean(0)
-    b = target - target.mean(0)
-    variance = float((a * a).sum())
-    product = float((a * b).sum())
-    scale = product / variance if variance > 0 and product > 0 and not rigid else 1.0
-    return Similarity(R, scale, target.mean(0) - scale * source.mean(0))
+    source_mean = (w * source).sum(0) / weight.sum()
+    target_mean = (w * target).sum(0) / weight.sum()
+    a = source - source_mean
+    b = target - target_mean
+    variance = float((w * a * a).sum())
+    product = float((w * a * b).sum())
+    scale = 1.0
+    if variance > 0 and product > 0 and not rigid:
+        scale = product / variance
+    return Similarity(R, scale, target_mean - scale * source_mean)
 
 
 @dataclass(frozen=True)
 class RigDifference:
-    """Of an estimated rig from a reference rig, after ``align``."""
+    """Of an estimated rig from a reference rig, after `align_robustly`."""
 
     rotation_deg: Float[Tensor, " V"]
     centre_mm: Float[Tensor, " V"]
@@ -71,18 +129,98 @@ class RigDifference:
 
 
 def rig_difference(cameras: Cameras, reference: Cameras) -> RigDifference:
-    """What ``align`` leaves between two calibrations of one rig."""
-    gauge = align(cameras, reference)
-    moved = gauge.cameras(cameras)
-    centre = torch.linalg.vector_norm(moved.centre - reference.centre, dim=-1)
-    return RigDifference(rotation_deg(moved.R, reference.R), centre, gauge.scale)
+    """Return what `align_robustly` leaves between two calibrations of one rig."""
+    similarity = align_robustly(cameras, reference)
+    moved = similarity.cameras(cameras)
+    distance = torch.linalg.vector_norm(moved.centre - reference.centre, dim=-1)
+    return RigDifference(rotation_deg(moved.R, reference.R), distance, similarity.scale)
+
+
+@dataclass(frozen=True)
+class Quantiles:
+    """Of errors in pixels; None of no errors."""
+
+    median: float | None
+    p90: float | None
+    count: int
+
+
+@dataclass(frozen=True)
+class ViewErrors(Quantiles):
+    """Errors of all views together, and of each."""
+
+    views: dict[str, Quantiles]
+
+
+@dataclass(frozen=True)
+class BoneVariation:
+    """How much the lengths of bones vary over the frames, as a fraction of them."""
+
+    median: float | None
+    each: dict[str, float | None]
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """How well a calibration explains a recording."""
+
+    held_out: ViewErrors
+    segments: BoneVariation
+
+
+def explain(recordings: Mapping[str, Recording], estimator: Estimator) -> dict[str, Explanation]:
+    """Return how well each calibration of the same key points explains them, by name.
+
+    The errors in held-out views (pixels) are over the joints that all of them estimate.
+    """
+    held_out = {name: held_out_errors(one, estimator) for name, one in recordings.items()}
+    if not held_out:
+        return {}
+    measured = torch.stack([valid for _, valid in held_out.values()]).all(0)
+    result = {}
+    for name, recording in recordings.items():
+        errors = view_errors(held_out[name][0], measured, recording.camera_names)
+        points, estimated = triangulate_recording(recording, estimator)
+        result[name] = Explanation(errors, bone_variations(points, estimated))
+    return result
+
+
+def view_errors(
+    error: Float[Tensor, "T V J"], measured: Bool[Tensor, "T V J"], names: tuple[str, ...]
+) -> ViewErrors:
+    """Return the quantiles of the measured errors, of all views and of each."""
+    each = {name: quantiles(error[:, v][measured[:, v]]) for v, name in enumerate(names)}
+    every = quantiles(error[measured])
+    return ViewErrors(every.median, every.p90, every.count, each)
+
+
+def quantiles(errors: Float[Tensor, " N"]) -> Quantiles:
+    """Return the median and the 90 % quantile, the lower of two values."""
+    count = len(errors)
+    if not count:
+        return Quantiles(None, None, 0)
+    ordered = errors.sort().values
+    median = float(ordered[int(0.5 * (count - 1))])
+    return Quantiles(median, float(ordered[int(0.9 * (count - 1))]), count)
+
+
+def bone_variations(
+    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]
+) -> BoneVariation:
+    """Return the variation of each bone's length by name; None for one that is never measured."""
+    variation, known = bone_variation(points, estimated)
+    pairs = zip(variation.tolist(), known.tolist(), strict=True)
+    each = [value if is_known else None for value, is_known in pairs]
+    median = float(variation[known].median()) if known.any() else None
+    return BoneVariation(median, dict(zip(BONE_NAMES, each, strict=True)))
 
 
 def triangulate_recording(
     recording: Recording, estimator: Estimator, without: int | None = None
 ) -> tuple[Float[Tensor, "T J 3"], Bool[Tensor, "T J"]]:
-    """The recording's joints (world, mm) by ``estimator``, and which are estimated; ``without``
-    leaves out a view.
+    """Return the recording's joints (world, mm) by ``estimator``, and which are estimated.
+
+    ``without``: a view that is left out.
     """
     points = []
     estimated = []
@@ -92,11 +230,10 @@ def triangulate_recording(
         if without is not None:
             valid[:, without] = False
         count = len(valid)
-        rig = recording.cameras
         batch = Observations(
             index=torch.arange(first, first + count),
             recording=torch.zeros(count, dtype=torch.int64),
-            cameras=Cameras(*(x.expand(count, *x.shape) for x in (rig.K, rig.R, rig.t))),
+            cameras=recording.cameras.expand(count),
             key_points=torch.from_numpy(recording.key_points[rows]).double(),
             confidence=torch.from_numpy(recording.confidence[rows]).double(),
             valid=valid,
@@ -110,61 +247,83 @@ def triangulate_recording(
 def held_out_errors(
     recording: Recording, estimator: Estimator
 ) -> tuple[Float[Tensor, "T V J"], Bool[Tensor, "T V J"]]:
-    """For each view the distance (pixels) of its key points from the joints that the *other* views
-    give, and where there is one: seen in the view, estimated without it, and in front of it.
+    """Return for each view the distance (pixels) of its key points from the joints that the *other*
+    views give, and where there is one.
+
+    There is one where the key point is valid in the view, and the joint estimated without it and
+    in front of it.
     """
     errors = []
     measured = []
     key_points = torch.from_numpy(recording.key_points).double()
     for view in range(len(recording.camera_names)):
         points, estimated = triangulate_recording(recording, estimator, without=view)
-        one = recording.cameras.index(slice(view, view + 1))
-        error = reprojection_error(one, key_points[:, view : view + 1], points)[:, 0]
-        counted = estimated & torch.from_numpy(recording.valid[:, view]) & torch.isfinite(error)
+        own = slice(view, view + 1)
+        error = reprojection_error(recording.cameras.index(own), key_points[:, own], points)[:, 0]
+        valid = torch.from_numpy(recording.valid[:, view])
+        counted = estimated & valid & torch.isfinite(error)
         errors.append(torch.where(counted, error, 0.0))
         measured.append(counted)
     return torch.stack(errors, dim=1), torch.stack(measured, dim=1)
 
 
-def segment_variation(
+def bone_variation(
     points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]
 ) -> tuple[Float[Tensor, " L"], Bool[Tensor, " L"]]:
-    """How much each body part's length varies over the frames, 1.4826 x median deviation over the
-    median, and which parts were seen in two frames or more.
+    """Return how much each bone's length varies over the frames, and which bones are known.
+
+    The variation is 1.4826 x the median deviation over the median; a bone is known that two frames
+    or more show.
     """
     a, b = torch.tensor(BONES).unbind(1)
     both = estimated[:, a] & estimated[:, b]
-    length = torch.where(both, (points[:, a] - points[:, b]).norm(dim=-1), torch.nan)
+    length = (points[:, a] - points[:, b]).norm(dim=-1)
+    length = torch.where(both, length, torch.nan)
     median = length.nanmedian(0).values
-    spread = 1.4826 * (length - median).abs().nanmedian(0).values
+    deviation = 1.4826 * (length - median).abs().nanmedian(0).values
     known = (both.sum(0) >= 2) & (median > 0)
-    return torch.where(known, spread / torch.where(known, median, 1.0), 0.0), known
+    safe_median = torch.where(known, median, 1.0)
+    return torch.where(known, deviation / safe_median, 0.0), known
 
 
 def upright(
     points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"], cameras: Cameras
 ) -> Similarity:
-    """To a world with z along the people's mean direction from hips to neck, the floor at their
-    lowest ankles, the origin below where they mostly are, and x where the first camera looks. Only
-    as true as they stood upright.
+    """Return the way to a world with z along the people's mean direction from hips to neck, the
+    floor at their lowest ankles, the origin below where they mostly are, and x where the first
+    camera looks.
+
+    It is only as true as they stood upright.
     """
-    trunk = (points[:, THORAX] - points[:, PELVIS])[estimated[:, THORAX] & estimated[:, PELVIS]]
-    trunk = torch.nn.functional.normalize(trunk, dim=-1).sum(0)
-    z = trunk if float(trunk.norm()) > 0 else -cameras.R[0, 1]
-    z = z / z.norm()
-    x = cameras.R[0, 2] - (cameras.R[0, 2] @ z) * z
-    x = (
-        x if float(x.norm()) > 1e-3 else cameras.R[0, 0] - (cameras.R[0, 0] @ z) * z
-    )  # it looks straight down
-    x = x / x.norm()
+    z = _unit(_upright_direction(points, estimated, cameras))
+    forward = _across(cameras.R[0, 2], z)
+    if float(forward.norm()) <= 1e-3:  # the first camera looks straight down
+        forward = _across(cameras.R[0, 0], z)
+    x = _unit(forward)
     R = torch.stack((x, torch.linalg.cross(z, x), z))
-    there = points[estimated] @ R.mT
-    ankles = points[:, ANKLES][estimated[:, ANKLES]] @ R.mT
-    if not len(there):
+    positions = points[estimated] @ R.mT
+    if not len(positions):
         return Similarity(R, 1.0, torch.zeros(3, dtype=R.dtype))
-    middle = there.median(0).values
-    floor = (ankles if len(ankles) else there)[:, 2].quantile(0.05)
+    ankles = points[:, _ANKLES][estimated[:, _ANKLES]] @ R.mT
+    middle = positions.median(0).values
+    lowest = ankles if len(ankles) else positions
+    floor = lowest[:, 2].quantile(0.05)
     return Similarity(R, 1.0, -torch.stack((middle[0], middle[1], floor)))
 
 
-ANKLES = [JOINT["left_ankle"], JOINT["right_ankle"]]
+def _upright_direction(
+    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"], cameras: Cameras
+) -> Float[Tensor, " 3"]:
+    both = estimated[:, THORAX] & estimated[:, PELVIS]
+    trunk = (points[:, THORAX] - points[:, PELVIS])[both]
+    direction = torch.nn.functional.normalize(trunk, dim=-1).sum(0)
+    return direction if float(direction.norm()) > 0 else -cameras.R[0, 1]
+
+
+def _across(v: Float[Tensor, " 3"], axis: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
+    """Return the part of ``v`` that is perpendicular to the unit vector ``axis``."""
+    return v - (v @ axis) * axis
+
+
+def _unit(v: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
+    return v / v.norm()

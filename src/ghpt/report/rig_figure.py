@@ -4,6 +4,8 @@ cameras.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
@@ -19,115 +21,173 @@ from ghpt.report.figures import MIDDLE, wrapped
 from ghpt.report.rig_comparison import Similarity
 from ghpt.skeleton import BONES
 
-ESTIMATED, REFERENCE, PEOPLE = "#0072B2", "#D55E00", "#999999"
-_PANELS = (("from above", (0, 1)), ("from the side", (0, 2)))
+ESTIMATED = "#0072B2"
+REFERENCE = "#D55E00"
+PEOPLE = "#999999"
+_PANELS = {"from above": (0, 1), "from the side": (0, 2)}
 _SKELETONS = 6
 _DEVIATIONS = 2.0
 """Standard deviations that an ellipse shows."""
+_MAGNIFICATIONS = (1, 10, 100)
+_FRUSTUM = 0.14
+"""The length of a frustum's rays, in the largest distance of a camera from the middle."""
+_VISIBLE = 0.15
+"""The size of an ellipse that is magnified enough, in the length of a frustum."""
+
+
+@dataclass(frozen=True)
+class DrawnRig:
+    """Cameras and the people they see, in one world; mm."""
+
+    names: tuple[str, ...]
+    cameras: Cameras
+    covariance: Float[Tensor, "V 6 6"]
+    """Of rotation and centre."""
+    points: Float[Tensor, "T J 3"]
+    estimated: Bool[Tensor, "T J"]
+
+    def select(self, views: Bool[Tensor, " V"]) -> DrawnRig:
+        """Return the rig of some of the cameras."""
+        chosen = zip(self.names, views.tolist(), strict=True)
+        names = tuple(name for name, is_chosen in chosen if is_chosen)
+        cameras = self.cameras.index(views)
+        covariance = self.covariance[views]
+        return DrawnRig(names, cameras, covariance, self.points, self.estimated)
 
 
 def rig_figure(
     heading: str,
-    names: tuple[str, ...],
-    cameras: Cameras,
-    covariance: Float[Tensor, "V 6 6"],
-    points: Float[Tensor, "T J 3"],
-    estimated: Bool[Tensor, "T J"],
+    rig: DrawnRig,
     upright: Similarity,
     reference: Cameras | None = None,
     reference_name: str = "",
 ) -> Figure:
-    """Metres. ``cameras``, ``covariance`` (of turn and centre), ``points`` and ``reference`` are in
-    one world, and ``upright`` leads to one whose z is up.
+    """Return the figure, in metres.
+
+    ``upright`` leads from the world of the rig and of ``reference`` to one whose z is up.
     """
     figure = Figure(figsize=(11, 5.6), layout="constrained")
-    panels = figure.subplots(1, 2)
-    spread = upright.R @ covariance[:, 3:, 3:] @ upright.R.T / 1e6
-    shown = upright.cameras(cameras)
+    cameras = upright.cameras(rig.cameras)
     other = None if reference is None else upright.cameras(reference)
-    people = (upright.points(points) / 1000).numpy()
-    far = torch.cat([c.centre for c in (shown, other) if c is not None]) / 1000
-    length = 0.07 * float((far - far.mean(0)).norm(dim=-1).max().clamp(min=0.1)) * 2
-    deviation = float(spread.diagonal(dim1=-2, dim2=-1).max().clamp(min=0).sqrt())
-    magnified = next((m for m in (1, 10, 100) if _DEVIATIONS * deviation * m > 0.15 * length), 100)
-    for axes, (view, (i, j)) in zip(panels, _PANELS, strict=True):
-        _people(axes, people[..., [i, j]], estimated.numpy())
+    people = (upright.points(rig.points) / 1000).numpy()
+    covariance = upright.R @ rig.covariance[:, 3:, 3:] @ upright.R.T / 1e6
+    length = _frustum_length(cameras, other)
+    magnification = _magnification(covariance, length)
+    panels = figure.subplots(1, 2)
+    for axes, (view, (i, j)) in zip(panels, _PANELS.items(), strict=True):
+        plane = (i, j)
+        _draw_people(axes, people[..., [i, j]], rig.estimated.numpy())
         if other is not None:
-            _frustums(axes, other, length, (i, j), REFERENCE, "--")
-        _frustums(axes, shown, length, (i, j), ESTIMATED, "-")
-        centre = (shown.centre / 1000).numpy()[:, [i, j]]
-        for v, name in enumerate(names):
-            _ellipse(axes, centre[v], spread[v][[i, j]][:, [i, j]].numpy(), magnified)
-            # a dollar in a name begins no formula
-            label = {"xytext": (5, 5), "textcoords": "offset points", "fontsize": 8}
-            axes.annotate(name, centre[v], parse_math=False, **label)
-        axes.set(xlabel="xyz"[i] + ", m", ylabel="xyz"[j] + ", m", aspect="equal")
-        axes.set_title(view, fontsize=10)
-        axes.grid(color="#E5E5E5", linewidth=0.6)
-        axes.set_axisbelow(True)
-        axes.margins(0.12)
-        axes.spines[["top", "right"]].set_visible(False)
-    times = f", {magnified} x" if magnified > 1 else ""
-    handles = [
-        Line2D(
-            [],
-            [],
-            color=ESTIMATED,
-            label=f"calibrated; ellipse: {_DEVIATIONS:g} standard deviations{times}",
-        )
-    ]
-    if other is not None:
-        handles.append(Line2D([], [], color=REFERENCE, linestyle="--", label=reference_name))
-    handles.append(Line2D([], [], color=PEOPLE, marker=".", label="people"))
+            _draw_frustums(axes, other, length, plane, REFERENCE, "--")
+        _draw_frustums(axes, cameras, length, plane, ESTIMATED, "-")
+        centres = (cameras.centre / 1000).numpy()[:, [i, j]]
+        in_plane = covariance[:, [i, j]][:, :, [i, j]].numpy()
+        for name, centre, own in zip(rig.names, centres, in_plane, strict=True):
+            _draw_ellipse(axes, centre, own, magnification)
+            _write_name(axes, centre, name)
+        _lay_out(axes, view, plane)
+    handles = _legend(magnification, None if other is None else reference_name)
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
     figure.suptitle(wrapped(heading, 110), fontsize=10, parse_math=False)
     return figure
 
 
-def _frustums(
+def _frustum_length(cameras: Cameras, other: Cameras | None) -> float:
+    """Return the length (metres) of the rays that are drawn of an image's corners."""
+    centres = cameras.centre if other is None else torch.cat((cameras.centre, other.centre))
+    centres = centres / 1000
+    largest = (centres - centres.mean(0)).norm(dim=-1).max()
+    return _FRUSTUM * float(largest.clamp(min=0.1))
+
+
+def _magnification(covariance: Float[Tensor, "V 3 3"], length: float) -> int:
+    """Return by how much the ellipses are magnified, so that the largest can be seen."""
+    variance = covariance.diagonal(dim1=-2, dim2=-1).max()
+    size = _DEVIATIONS * float(variance.clamp(min=0).sqrt())
+    enough = (m for m in _MAGNIFICATIONS if size * m > _VISIBLE * length)
+    return next(enough, _MAGNIFICATIONS[-1])
+
+
+def _write_name(axes: Axes, centre: Float[np.ndarray, " 2"], name: str) -> None:
+    axes.annotate(
+        name,
+        (float(centre[0]), float(centre[1])),
+        xytext=(5, 5),
+        textcoords="offset points",
+        fontsize=8,
+        parse_math=False,  # a dollar in a name begins no formula
+    )
+
+
+def _lay_out(axes: Axes, view: str, plane: tuple[int, int]) -> None:
+    horizontal, vertical = plane
+    axes.set(xlabel="xyz"[horizontal] + ", m", ylabel="xyz"[vertical] + ", m", aspect="equal")
+    axes.set_title(view, fontsize=10)
+    axes.grid(color="#E5E5E5", linewidth=0.6)
+    axes.set_axisbelow(True)
+    axes.margins(0.12)
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def _legend(magnification: int, reference_name: str | None) -> list[Line2D]:
+    times = f", {magnification} x" if magnification > 1 else ""
+    label = f"calibrated; ellipse: {_DEVIATIONS:g} standard deviations{times}"
+    handles = [Line2D([], [], color=ESTIMATED, label=label)]
+    if reference_name is not None:
+        handles.append(Line2D([], [], color=REFERENCE, linestyle="--", label=reference_name))
+    handles.append(Line2D([], [], color=PEOPLE, marker=".", label="people"))
+    return handles
+
+
+def _draw_frustums(
     axes: Axes, cameras: Cameras, length: float, plane: tuple[int, int], colour: str, style: str
 ) -> None:
-    """Pyramids of the images (as large as twice the principal point), their tops at the centres."""
+    """Draw pyramids of the images (as large as twice the principal point), their tops at the
+    centres.
+    """
     corners = torch.tensor([[0.0, 0], [2, 0], [2, 2], [0, 2]], dtype=torch.float64)
     pixels = corners * cameras.K[:, None, :2, 2]
-    rays = (
-        torch.cat((pixels, torch.ones_like(pixels[..., :1])), -1) @ torch.linalg.inv(cameras.K).mT
-    )
+    homogeneous = torch.nn.functional.pad(pixels, (0, 1), value=1.0)
+    rays = homogeneous @ torch.linalg.inv(cameras.K).mT
     centre = cameras.centre / 1000
-    ends = (centre[:, None] + length * rays @ cameras.R).numpy()[..., list(plane)]
+    in_world = centre[:, None] + length * rays @ cameras.R
+    ends = in_world.numpy()[..., list(plane)]
     tops = np.broadcast_to(centre.numpy()[:, None, list(plane)], ends.shape)
-    segments = np.concatenate(
-        [np.stack([tops, ends], -2), np.stack([ends, np.roll(ends, 1, axis=1)], -2)], 1
-    )
+    edges = np.stack([tops, ends], -2)
+    sides = np.stack([ends, np.roll(ends, 1, axis=1)], -2)
+    lines = np.concatenate([edges, sides], 1).reshape(-1, 2, 2)
     axes.add_collection(
-        LineCollection(segments.reshape(-1, 2, 2), colors=colour, linestyles=style, linewidths=1.2)
+        LineCollection(list(lines), colors=colour, linestyles=style, linewidths=1.2)
     )
     axes.plot(*tops[:, 0].T, "o", color=colour, markersize=3)
 
 
-def _ellipse(
+def _draw_ellipse(
     axes: Axes,
     centre: Float[np.ndarray, " 2"],
     covariance: Float[np.ndarray, "2 2"],
-    magnified: int,
+    magnification: int,
 ) -> None:
     values, vectors = np.linalg.eigh(covariance)
-    width, height = 2 * magnified * _DEVIATIONS * np.sqrt(values.clip(0))[::-1]
-    angle = np.degrees(np.arctan2(*vectors[::-1, 1]))
-    axes.add_patch(
-        Ellipse(tuple(centre), width, height, angle=angle, color=ESTIMATED, alpha=0.25, linewidth=0)
+    height, width = 2 * magnification * _DEVIATIONS * np.sqrt(values.clip(0))
+    angle = np.degrees(np.arctan2(vectors[1, 1], vectors[0, 1]))
+    position = (float(centre[0]), float(centre[1]))
+    ellipse = Ellipse(
+        position, width, height, angle=angle, color=ESTIMATED, alpha=0.25, linewidth=0
     )
+    axes.add_patch(ellipse)
 
 
-def _people(
+def _draw_people(
     axes: Axes, points: Float[np.ndarray, "T J 2"], estimated: Bool[np.ndarray, "T J"]
 ) -> None:
-    """The middle of the person in every frame, and some skeletons."""
+    """Draw the middle of the person in every frame, and some skeletons."""
     frames = np.flatnonzero(estimated.any(1))
     if not len(frames):
         return
     middle = np.stack([np.median(points[t][estimated[t]], axis=0) for t in frames])
     axes.plot(*middle.T, ".", color=PEOPLE, markersize=1.5)
-    for t in frames[np.linspace(0, len(frames) - 1, min(_SKELETONS, len(frames))).astype(int)]:
-        segments = [points[t][list(bone)] for bone in BONES if estimated[t][list(bone)].all()]
-        axes.add_collection(LineCollection(segments, colors=MIDDLE, linewidths=0.7, alpha=0.6))
+    spread = np.linspace(0, len(frames) - 1, min(_SKELETONS, len(frames)))
+    for t in frames[spread.astype(int)]:
+        bones = [points[t][list(bone)] for bone in BONES if estimated[t][list(bone)].all()]
+        axes.add_collection(LineCollection(bones, colors=MIDDLE, linewidths=0.7, alpha=0.6))

@@ -19,68 +19,77 @@ from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, wri
 from ghpt.files import atomic_write, finite, remove, write_json
 from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.observations import Recording
-from ghpt.report.calibration import calibration_report
-from ghpt.report.rig_comparison import Similarity, align, upright
-from ghpt.report.rig_figure import rig_figure
+from ghpt.report.calibration import (
+    CalibratedCamera,
+    CalibrationResult,
+    calibration_document,
+)
+from ghpt.report.markdown import write_markdown
+from ghpt.report.rig_comparison import Similarity, align_robustly, upright
+from ghpt.report.rig_figure import DrawnRig, rig_figure
 from ghpt.skeleton import JOINTS
 
 RIG_FILES = ("rig.toml", "rig_anipose.toml", "intri.yml", "extri.yml", "poses.npz")
 """What is written of a usable rig alone."""
+_FIGURES = {"rig.png": FigureCanvasAgg, "rig.svg": FigureCanvasSVG}
 
 
-def camera_numbers(
-    estimate: RigEstimate, moved: Cameras, gauge: Similarity, file: CameraSet
-) -> list[dict[str, Any]]:
-    """For each camera what calibration.json holds; ``moved``: the cameras after ``gauge``, in the
-    files' world.
+def calibrated_cameras(
+    estimate: RigEstimate, world: Similarity, file: CameraSet
+) -> tuple[CalibratedCamera, ...]:
+    """Return the cameras of an estimate in another world.
+
+    ``file``: the cameras whose intrinsics were calibrated with.
     """
-    covariance = gauge.covariance(estimate.covariance)
-    turn = estimate.rotation_std_deg
-    centre = gauge.scale * estimate.centre_std
-    numbers = []
-    for v, name in enumerate(estimate.names):
-        camera: dict[str, Any] = {"name": name, "calibrated": bool(estimate.calibrated[v])}
-        values = {
-            "reprojection_px": estimate.reprojection[v],
-            "inliers": estimate.inliers[v],
-            "rotation_sd_deg": turn[v],
-            "centre_sd_mm": centre[v],
-            "R": moved.R[v],
-            "t_mm": moved.t[v],
-            "centre_mm": moved.centre[v],
-            "covariance": covariance[v],
-        }
-        camera |= {
-            key: value.tolist() if camera["calibrated"] else None for key, value in values.items()
-        }
-        size = None if file.size is None else file.size[v].tolist()
-        numbers.append(
-            camera
-            | {"K": file.K[v].tolist(), "distortion": file.distortion[v].tolist(), "size": size}
-        )
-    return numbers
+    return tuple(_camera(estimate, world, file, view) for view in range(len(estimate.names)))
 
 
-def write_rig(output: Path, file: CameraSet, cameras: Cameras, numbers: dict[str, Any]) -> None:
-    """The calibrated cameras for Pose2Sim, aniposelib, OpenCV and EasyMocap.
+def _camera(
+    estimate: RigEstimate, world: Similarity, file: CameraSet, view: int
+) -> CalibratedCamera:
+    rig = world.cameras(estimate.cameras)
+    calibrated = bool(estimate.calibrated[view])
+
+    def number(values: Tensor) -> Any:
+        return values[view].tolist() if calibrated else None
+
+    return CalibratedCamera(
+        name=estimate.names[view],
+        calibrated=calibrated,
+        reprojection_px=number(estimate.reprojection),
+        inliers=number(estimate.inliers),
+        rotation_sd_deg=number(estimate.rotation_std_deg),
+        centre_sd_mm=number(world.scale * estimate.centre_std),
+        R=number(rig.R),
+        t_mm=number(rig.t),
+        centre_mm=number(rig.centre),
+        covariance=number(world.covariance(estimate.covariance)),
+        K=file.K[view].tolist(),
+        distortion=file.distortion[view].tolist(),
+        size=None if file.size is None else file.size[view].tolist(),
+    )
+
+
+def write_rig(output: Path, cameras: CameraSet, result: CalibrationResult) -> None:
+    """Write calibrated cameras for Pose2Sim, aniposelib, OpenCV and EasyMocap.
 
     An image size that the user's file does not give is left out of the yml files; in the TOML
     files, which must have one, it is twice the principal point, and the metadata say so.
     """
+    errors = [camera.reprojection_px or 0.0 for camera in result.cameras]
     metadata = {
         "adjusted": False,
-        "error": max(c["reprojection_px"] or 0.0 for c in numbers["cameras"]),
-        "data": numbers["data"],
-        "scale": numbers["scale"]["text"],
-        "world": numbers["world"],
-        "software": f"ghpt {numbers['provenance']['ghpt']}",
+        "error": max(errors),
+        "data": result.data,
+        "scale": result.scale.text,
+        "world": result.world,
+        "software": f"ghpt {result.provenance['ghpt']}",
     }
-    if file.size is None:
+    if cameras.size is None:
         metadata["size"] = "not known: twice the principal point"
-    rig = file.with_cameras(cameras)
-    write_pose2sim(output / "rig.toml", rig, metadata)
-    write_aniposelib(output / "rig_anipose.toml", rig, metadata)
-    write_opencv(output, rig)
+    write_pose2sim(output / "rig.toml", cameras, metadata)
+    write_aniposelib(output / "rig_anipose.toml", cameras, metadata)
+    write_opencv(output, cameras)
 
 
 def write_poses(
@@ -88,15 +97,19 @@ def write_poses(
     recording: Recording,
     points: Float[Tensor, "T J 3"],
     estimated: Bool[Tensor, "T J"],
-    numbers: dict[str, Any],
+    result: CalibrationResult,
 ) -> None:
-    """The recording's 3D joints: mm, NaN where not estimated."""
-    values = torch.where(estimated[..., None], points, torch.nan).double().numpy()
+    """Write the recording's 3D joints: mm, NaN where not estimated."""
     meta = {
-        key: numbers[key]
-        for key in ("data", "source", "scale", "world", "triangulation", "usable", "provenance")
+        "data": result.data,
+        "source": result.source,
+        "scale": result.scale.plain(),
+        "world": result.world,
+        "triangulation": result.triangulation,
+        "usable": result.usable,
+        "provenance": result.provenance,
     }
-    text = json.dumps(finite(meta), allow_nan=False)
+    values = torch.where(estimated[..., None], points, torch.nan).double().numpy()
     with atomic_write(path) as handle:
         np.savez_compressed(
             handle,
@@ -106,49 +119,40 @@ def write_poses(
             joints=np.array(JOINTS),
             rate_hz=np.array(recording.rate_hz),
             unit=np.array("mm"),
-            meta=np.array(text),
+            meta=np.array(json.dumps(finite(meta), allow_nan=False)),
         )
 
 
 def write_rig_figure(
     output: Path,
-    numbers: dict[str, Any],
-    cameras: Cameras,
-    covariance: Float[Tensor, "V 6 6"],
-    points: Float[Tensor, "T J 3"],
-    estimated: Bool[Tensor, "T J"],
+    result: CalibrationResult,
+    rig: DrawnRig,
     calibrated: Bool[Tensor, " V"],
-    reference: tuple[str, Cameras] | None,
+    reference: Cameras | None,
 ) -> None:
-    """rig.png and rig.svg of the calibrated cameras, and of a reference's brought onto them by
-    ``align``.
+    """Write rig.png and rig.svg of the calibrated cameras, and of a reference's brought onto them
+    by `align_robustly`; remove them where no camera is calibrated.
     """
     if not bool(calibrated.any()):
-        for name in ("rig.png", "rig.svg"):
+        for name in _FIGURES:
             remove(output / name)
         return
-    shown = cameras.index(calibrated)
-    names = tuple(camera["name"] for camera in numbers["cameras"] if camera["calibrated"])
-    heading = f"Calibration of {numbers['data']}\nscale {numbers['scale']['text']}"
+    shown = rig.select(calibrated)
+    heading = f"Calibration of {result.data}\nscale {result.scale.text}"
     other = None
-    name = ""
     if reference is not None and int(calibrated.sum()) >= 2:
-        own = reference[1].index(calibrated)
-        other = align(own, shown).cameras(own)
-        name = f"{reference[0]}, at this scale"
-    up = upright(points, estimated, shown)
-    figure = rig_figure(
-        heading, names, shown, covariance[calibrated], points, estimated, up, other, name
-    )
-    for suffix, canvas in (("png", FigureCanvasAgg), ("svg", FigureCanvasSVG)):
+        own = reference.index(calibrated)
+        other = align_robustly(own, shown.cameras).cameras(own)
+    up = upright(shown.points, shown.estimated, shown.cameras)
+    figure = rig_figure(heading, shown, up, other, f"{result.reference}, at this scale")
+    for name, canvas in _FIGURES.items():
         data = io.BytesIO()
-        canvas(figure).print_figure(data, dpi=150, format=suffix)
-        with atomic_write(output / f"rig.{suffix}") as handle:
+        canvas(figure).print_figure(data, dpi=150, format=name.rpartition(".")[2])
+        with atomic_write(output / name) as handle:
             handle.write(data.getvalue())
 
 
-def write_numbers(output: Path, numbers: dict[str, Any]) -> None:
-    """calibration.json and report.md."""
-    write_json(output / "calibration.json", numbers)
-    with atomic_write(output / "report.md", "w") as handle:
-        handle.write(calibration_report(numbers))
+def write_result(output: Path, result: CalibrationResult) -> None:
+    """Write calibration.json and report.md."""
+    write_json(output / "calibration.json", result.plain())
+    write_markdown(output / "report.md", calibration_document(result))

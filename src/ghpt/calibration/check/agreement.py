@@ -1,4 +1,4 @@
-"""How well views agree: each view's key points against the people that the other views triangulate."""
+"""How well views agree: each view's key points against the people that the other views give."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.calibration.check.setup import Look, Rays, Setup
+from ghpt.calibration.check.setup import RayCache, Rays, Setup
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.triangulation import triangulate_subsets
-from ghpt.models.estimators.classical import Estimator, MEstimator
+from ghpt.models.estimators.classical import Estimator
 from ghpt.observations import Observations
 
 LARGEST = 0.1
@@ -22,21 +22,21 @@ _LEAST = 20
 
 @dataclass(frozen=True)
 class Agreement:
-    """Of one setup. Errors are medians, in sizes of the person in the view's image."""
+    """How well the views of one setup agree. Errors are medians, in sizes of the person."""
 
     core: Bool[Tensor, " V"]
     """The views that agree with each other."""
     error: Float[Tensor, " V"]
-    """Held out: against the points of the core's other views; at most LARGEST."""
+    """Held out: from the points of the core's other views; at most LARGEST."""
     points: Float[Tensor, "V F J 3"]
-    """For each view what the core's other views give (all of the core where they are fewer than
-    two).
+    """For each view what the core's other views give; all of the core where fewer than two are
+    left.
     """
     known: Bool[Tensor, "V F J"]
 
     @property
     def cost(self) -> float:
-        """Mean error."""
+        """The mean error of all views."""
         return float(self.error.mean())
 
 
@@ -47,45 +47,47 @@ def errors(
     points: Float[Tensor, "F J 3"],
     known: Bool[Tensor, "F J"],
 ) -> Float[Tensor, "*B F J"]:
-    """Of views' rays from given points, in sizes of the person; NaN where there is nothing to
-    compare, at most LARGEST (behind the camera as well).
+    """Return the errors of views' rays from points, in sizes of the person.
+
+    At most LARGEST, as behind the camera; NaN where there is nothing to compare.
     """
     in_camera = points @ R[..., None, :, :].mT + t[..., None, None, :]
     depth = in_camera[..., 2]
     front = depth > 0
-    offset = in_camera[..., :2] / torch.where(front, depth, 1.0)[..., None] - rays.xy
+    safe_depth = torch.where(front, depth, 1.0)[..., None]
+    offset = in_camera[..., :2] / safe_depth - rays.xy
     error = offset.norm(dim=-1) / rays.size[..., None].clamp(min=1e-12)
     error = torch.where(front, error, LARGEST).clamp(max=LARGEST)
-    return torch.where(known & rays.valid & (rays.size > 0)[..., None], error, torch.nan)
+    comparable = known & rays.valid & (rays.size > 0)[..., None]
+    return torch.where(comparable, error, torch.nan)
 
 
 def median(error: Float[Tensor, "*B F J"]) -> Float[Tensor, "*B"]:
-    """LARGEST where too few are known."""
+    """Return the median of the errors; LARGEST where too few are known."""
     flat = error.flatten(-2)
     enough = (~flat.isnan()).sum(-1) >= _LEAST
-    return torch.where(enough, flat.nanmedian(-1).values.nan_to_num(LARGEST), LARGEST)
+    middle = flat.nanmedian(-1).values.nan_to_num(LARGEST)
+    return torch.where(enough, middle, LARGEST)
 
 
 def pair_errors(
     rays: Rays, setup: Setup, pairs: Int[Tensor, "P 2"], step: int
 ) -> Float[Tensor, "P V"]:
-    """Median error of every view from the points that a pair of views triangulates, over every
-    ``step``-th frame.
+    """Return the median error of every view from the points that each pair of views triangulates,
+    over every ``step``-th frame.
     """
     xy = rays.xy[:, ::step]
     valid = rays.valid[:, ::step]
     size = rays.size[:, ::step]
+    joints = xy.shape[2]
     frames = xy.shape[1]
-    views = len(setup)
-    eye = torch.eye(views, dtype=torch.bool)
-    chosen = (eye[pairs[:, 0]] | eye[pairs[:, 1]])[None, :, None].expand(
-        frames, -1, xy.shape[2], -1
-    )
-    K = torch.eye(3, dtype=torch.float64).expand(frames, views, 3, 3)
-    rig = Cameras(K, setup.R.expand(frames, -1, -1, -1), setup.t.expand(frames, -1, -1))
+    is_view = torch.eye(len(setup), dtype=torch.bool)
+    in_pair = is_view[pairs[:, 0]] | is_view[pairs[:, 1]]
+    chosen = in_pair[None, :, None].expand(frames, -1, joints, -1)
+    rig = _normalised_cameras(setup).expand(frames)
     points, ok = triangulate_subsets(rig, xy.transpose(0, 1), valid.transpose(0, 1), chosen)
     both = valid[pairs].all(1)
-    result = torch.zeros(len(pairs), views, dtype=torch.float64)
+    result = torch.zeros(len(pairs), len(setup), dtype=torch.float64)
     for p in range(len(pairs)):  # the memory of all at once is V times that of the points
         error = errors(Rays(xy, valid, size), setup.R, setup.t, points[:, p], ok[:, p])
         lost = both[p] & ~ok[:, p] & valid  # rays that meet behind a camera agree with nothing
@@ -94,17 +96,18 @@ def pair_errors(
 
 
 def all_pairs(views: int, most: int) -> Int[Tensor, "P 2"]:
-    """The pairs of views, evenly thinned to at most ``most``."""
+    """Return the pairs of views, evenly thinned to at most ``most``."""
     pairs = torch.combinations(torch.arange(views), 2)
-    return pairs[torch.linspace(0, len(pairs) - 1, min(most, len(pairs))).round().long()]
+    count = min(most, len(pairs))
+    return pairs[torch.linspace(0, len(pairs) - 1, count).round().long()]
 
 
 def core_of(pair_error: Float[Tensor, "P V"], level: float) -> Bool[Tensor, " V"]:
-    """The views within ``level`` of the points of the pair that most agree with, or if none do that
-    pair's.
+    """Return the views within ``level`` of the points of the pair that most views agree with; the
+    two best of it where fewer are.
     """
-    best = pair_error.clamp(max=level).sum(-1) + 1e-3 * pair_error.sum(-1)
-    row = pair_error[best.argmin()]
+    cost = pair_error.clamp(max=level).sum(-1) + 1e-3 * pair_error.sum(-1)
+    row = pair_error[cost.argmin()]
     core = row <= level
     if core.sum() < 2:
         core[row.topk(2, largest=False).indices] = True
@@ -112,51 +115,56 @@ def core_of(pair_error: Float[Tensor, "P V"], level: float) -> Bool[Tensor, " V"
 
 
 def agreement(
-    look: Look, setup: Setup, estimator: MEstimator, level: float, most_pairs: int
+    cache: RayCache, setup: Setup, estimator: Estimator, level: float, most_pairs: int
 ) -> Agreement:
-    """Whose rays meet, and each view's held-out error."""
-    rays = look.all(setup)
+    """Return the views whose rays meet, and each view's held-out error."""
+    rays = cache.all(setup)
+    views = len(setup)
     step = max(1, rays.xy.shape[1] // 32)
-    core = core_of(pair_errors(rays, setup, all_pairs(len(setup), most_pairs), step), level)
-    points, known = triangulated(rays, setup, _without(core), estimator)
+    pair_error = pair_errors(rays, setup, all_pairs(views, most_pairs), step)
+    core = core_of(pair_error, level)
+    points, known = triangulated(rays, setup, _without_each(core), estimator)
     each = [
-        errors(_at(rays, v), setup.R[v], setup.t[v], points[v], known[v]) for v in range(len(setup))
+        errors(_rays_of_view(rays, v), setup.R[v], setup.t[v], points[v], known[v])
+        for v in range(views)
     ]
     return Agreement(core, median(torch.stack(each)), points, known)
-
-
-def _without(core: Bool[Tensor, " V"]) -> Bool[Tensor, "V V"]:
-    """For each view the core's others; the core itself where fewer than two are left."""
-    others = core & ~torch.eye(len(core), dtype=torch.bool)
-    return torch.where((others.sum(-1) >= 2)[:, None], others, core)
 
 
 def triangulated(
     rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: Estimator
 ) -> tuple[Float[Tensor, "G F J 3"], Bool[Tensor, "G F J"]]:
-    """Points from G choices of views by an estimator, in normalised image coordinates."""
+    """Return the points of G choices of views by an estimator, in the cameras' unit."""
     groups = len(used)
     frames = rays.valid.shape[1]
-    valid = (rays.valid.transpose(0, 1) & used[:, None, :, None]).flatten(0, 1)
+    valid_by_frame = rays.valid.transpose(0, 1)
+    valid = (valid_by_frame & used[:, None, :, None]).flatten(0, 1)
     count = groups * frames
     batch = Observations(
         index=torch.arange(count),
         recording=torch.zeros(count, dtype=torch.int64),
-        cameras=Cameras(
-            *(
-                x.expand(count, *x.shape)
-                for x in (torch.eye(3, dtype=torch.float64).expand_as(setup.R), setup.R, setup.t)
-            )
-        ),
+        cameras=_normalised_cameras(setup).expand(count),
         key_points=rays.xy.transpose(0, 1).repeat(groups, 1, 1, 1),
         confidence=valid.double(),
         valid=valid,
     )
     found = estimator(batch)
-    return found.points.unflatten(0, (groups, frames)), found.estimated.unflatten(
-        0, (groups, frames)
-    )
+    shape = (groups, frames)
+    return found.points.unflatten(0, shape), found.estimated.unflatten(0, shape)
 
 
-def _at(rays: Rays, view: int) -> Rays:
+def _normalised_cameras(setup: Setup) -> Cameras:
+    """Return the cameras whose pixels are normalised image coordinates."""
+    K = torch.eye(3, dtype=torch.float64).expand_as(setup.R)
+    return Cameras(K, setup.R, setup.t)
+
+
+def _without_each(core: Bool[Tensor, " V"]) -> Bool[Tensor, "V V"]:
+    """Return for each view the core's others; the core itself where fewer than two are left."""
+    others = core & ~torch.eye(len(core), dtype=torch.bool)
+    enough = others.sum(-1) >= 2
+    return torch.where(enough[:, None], others, core)
+
+
+def _rays_of_view(rays: Rays, view: int) -> Rays:
     return Rays(rays.xy[view], rays.valid[view], rays.size[view])

@@ -1,161 +1,195 @@
-"""Good recordings spoilt on purpose, one mistake at a time: to demonstrate the doctor and to test
-it.
+"""Good recordings spoilt on purpose, one mistake at a time, to demonstrate the camera check and to
+test it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 
 import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from ghpt.calibration.check.candidates import POSES
 from ghpt.calibration.check.evidence import Evidence
 from ghpt.calibration.check.setup import Setup, ideal
+from ghpt.calibration.mistakes import flip_axes, invert, radial_lens, transpose
 from ghpt.geometry.cameras import camera_centre
 from ghpt.geometry.lens import distort
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.skeleton import MIRROR
 
-Case = tuple[Evidence, Setup]
-_LENS = (-0.25, 0.0, 0.0, 0.0, 0.0)
+Views = tuple[int, ...]
+Pose = tuple[Float[Tensor, "*B 3 3"], Float[Tensor, "*B 3"]]
+_K1 = -0.25
+_ROTATION_AXIS = (0.6, 0.8, 0.0)
+_DIRECTION = (0.48, 0.6, 0.64)
 
 
-def _pose(case: Case, views: Sequence[int], code: str) -> Case:
-    """The inverse of the mend of ``code``."""
-    evidence, setup = case
+@dataclass(frozen=True)
+class Case:
+    """What the camera check is given."""
+
+    evidence: Evidence
+    setup: Setup
+
+
+def _centre_for_translation(R: Tensor, t: Tensor) -> Pose:
+    return R, camera_centre(R, t)
+
+
+def _camera_to_world_flipped(R: Tensor, t: Tensor) -> Pose:
+    return invert(*flip_axes(R, t))
+
+
+POSE_BREAKAGES: Mapping[str, Callable[[Tensor, Tensor], Pose]] = {
+    "rotation_transposed": transpose,
+    "centre_for_translation": _centre_for_translation,
+    "camera_to_world": invert,
+    "axes_flipped": flip_axes,
+    "camera_to_world_flipped": _camera_to_world_flipped,
+}
+"""How a true pose becomes a wrong one, by the code of the mistake."""
+
+
+def _spoil_pose(case: Case, views: Views, code: str) -> Case:
     at = list(views)
-    R = setup.R.clone()
-    t = setup.t.clone()
-    if code == "centre_for_translation":
-        t[at] = camera_centre(R[at], t[at])
-    elif code == "camera_to_world_flipped":
-        R[at], t[at] = POSES["camera_to_world"][0](*POSES["axes_flipped"][0](R[at], t[at]))
-    else:  # these undo themselves
-        R[at], t[at] = POSES[code][0](R[at], t[at])
-    return evidence, replace(setup, R=R, t=t)
+    R = case.setup.R.clone()
+    t = case.setup.t.clone()
+    R[at], t[at] = POSE_BREAKAGES[code](R[at], t[at])
+    return replace(case, setup=replace(case.setup, R=R, t=t))
 
 
-def _unit(case: Case, views: Sequence[int], factor: float) -> Case:
-    t = case[1].t.clone()
+def _divide_translation(case: Case, views: Views, factor: float) -> Case:
+    t = case.setup.t.clone()
     t[list(views)] /= factor
-    return case[0], replace(case[1], t=t)
+    return replace(case, setup=replace(case.setup, t=t))
 
 
-def _resolution(case: Case, views: Sequence[int], ratio: float) -> Case:
-    pixels = case[0].pixels.clone()
+def _scale_key_points(case: Case, views: Views, ratio: float) -> Case:
+    pixels = case.evidence.pixels.clone()
     pixels[list(views)] *= ratio
-    return replace(case[0], pixels=pixels), case[1]
+    return replace(case, evidence=replace(case.evidence, pixels=pixels))
 
 
-def _undistorted(case: Case, views: Sequence[int]) -> Case:
-    evidence, setup = case
-    pixels = evidence.pixels.clone()
-    valid = evidence.valid.clone()
-    for v in views:
-        pixels[v], valid[v] = ideal(pixels[v], valid[v], setup.K[v], setup.lens[v])
-    return replace(evidence, pixels=pixels, valid=valid), setup
-
-
-def _lens_missing(case: Case, views: Sequence[int]) -> Case:
-    """Images through a lens that the file does not have."""
-    evidence, setup = _undistorted(case, views)
-    pixels = evidence.pixels.clone()
-    lens = setup.lens.clone()
-    for v in views:
-        flat = pixels[v].flatten(0, -2)
-        pixels[v] = distort(flat, setup.K[v], torch.tensor(_LENS, dtype=torch.float64)).reshape(
-            pixels[v].shape
+def _undistort(case: Case, views: Views) -> Case:
+    setup = case.setup
+    pixels = case.evidence.pixels.clone()
+    valid = case.evidence.valid.clone()
+    for view in views:
+        pixels[view], valid[view] = ideal(
+            pixels[view], valid[view], setup.K[view], setup.lens[view]
         )
-        lens[v] = 0.0
-    return replace(evidence, pixels=pixels), replace(setup, lens=lens)
+    return replace(case, evidence=replace(case.evidence, pixels=pixels, valid=valid))
 
 
-def _moved(case: Case, views: Sequence[int], degrees: float, millimetres: float) -> Case:
-    evidence, setup = case
-    turn = vector_to_matrix(
-        torch.tensor([0.6, 0.8, 0.0], dtype=torch.float64) * torch.pi / 180 * degrees
+def _use_unknown_lens(case: Case, views: Views) -> Case:
+    """Return the images through a lens that the file does not have."""
+    ideal_case = _undistort(case, views)
+    pixels = ideal_case.evidence.pixels.clone()
+    lens = case.setup.lens.clone()
+    for view in views:
+        flat = pixels[view].flatten(0, -2)
+        distorted = distort(flat, case.setup.K[view], radial_lens(_K1))
+        pixels[view] = distorted.reshape(pixels[view].shape)
+        lens[view] = 0.0
+    evidence = replace(ideal_case.evidence, pixels=pixels)
+    return Case(evidence, replace(case.setup, lens=lens))
+
+
+def _move(case: Case, views: Views, degrees: float, millimetres: float) -> Case:
+    axis = torch.tensor(_ROTATION_AXIS, dtype=torch.float64)
+    rotation = vector_to_matrix(axis * torch.pi / 180 * degrees)
+    displacement = millimetres * torch.tensor(_DIRECTION, dtype=torch.float64)
+    setup = case.setup
+    for view in views:
+        centre = camera_centre(setup.R[view], setup.t[view]) + displacement
+        R = rotation @ setup.R[view]
+        setup = setup.changed(view, R=R, t=-R @ centre)
+    return replace(case, setup=setup)
+
+
+def _delay(case: Case, views: Views, by: int) -> Case:
+    """Return views whose frame n + by shows what the others' frame n shows."""
+    pixels = case.evidence.pixels.clone()
+    valid = case.evidence.valid.clone()
+    empty = slice(0, by) if by > 0 else slice(by, None)
+    for view in views:
+        pixels[view] = pixels[view].roll(by, 0)
+        valid[view] = valid[view].roll(by, 0)
+        valid[view, empty] = False
+    return replace(case, evidence=replace(case.evidence, pixels=pixels, valid=valid))
+
+
+def _exchange_with_first(case: Case, views: Views) -> Case:
+    order = list(range(len(case.setup)))
+    order[0] = views[0]
+    order[views[0]] = 0
+    evidence = case.evidence
+    return replace(
+        case,
+        evidence=replace(evidence, pixels=evidence.pixels[order], valid=evidence.valid[order]),
     )
-    way = millimetres * torch.tensor([0.48, 0.6, 0.64], dtype=torch.float64)
-    for v in views:
-        R = turn @ setup.R[v]
-        setup = setup.changed(v, R=R, t=-R @ (way + camera_centre(setup.R[v], setup.t[v])))
-    return evidence, setup
 
 
-def _late(case: Case, views: Sequence[int], by: int) -> Case:
-    """Their frame n + by shows what the others' frame n shows."""
-    evidence, setup = case
-    pixels = evidence.pixels.clone()
-    valid = evidence.valid.clone()
-    for v in views:
-        pixels[v], valid[v] = pixels[v].roll(by, 0), valid[v].roll(by, 0)
-        valid[v, slice(0, by) if by > 0 else slice(by, None)] = False
-    return replace(evidence, pixels=pixels, valid=valid), setup
-
-
-def _exchanged(case: Case, views: Sequence[int]) -> Case:
-    """With the first view."""
-    evidence, setup = case
-    order = list(range(len(setup)))
-    order[0], order[views[0]] = order[views[0]], order[0]
-    return replace(evidence, pixels=evidence.pixels[order], valid=evidence.valid[order]), setup
-
-
-def _mirrored(case: Case, views: Sequence[int], image: bool, sides: bool) -> Case:
-    evidence, setup = case
-    pixels = evidence.pixels.clone()
-    valid = evidence.valid.clone()
-    for v in views:
+def _mirror(case: Case, views: Views, image: bool, sides: bool) -> Case:
+    pixels = case.evidence.pixels.clone()
+    valid: Bool[Tensor, "V S F J"] = case.evidence.valid.clone()
+    for view in views:
         if image:
-            pixels[v, ..., 0] = setup.width[v] - 1 - pixels[v, ..., 0]
+            pixels[view, ..., 0] = case.setup.width[view] - 1 - pixels[view, ..., 0]
         if sides:
-            pixels[v], valid[v] = pixels[v][..., list(MIRROR), :], valid[v][..., list(MIRROR)]
-    return replace(evidence, pixels=pixels, valid=valid), setup
+            pixels[view] = pixels[view][..., list(MIRROR), :]
+            valid[view] = valid[view][..., list(MIRROR)]
+    return replace(case, evidence=replace(case.evidence, pixels=pixels, valid=valid))
+
+
+Spoil = Callable[[Case, Views], Case]
 
 
 @dataclass(frozen=True)
 class Breakage:
-    """One way to spoil a recording; ``said``: the code of the finding that names it; ``every``:
-    whether it is of all views or of the last alone.
-    """
+    """One way to spoil a recording."""
 
-    said: str
-    every: bool
-    how: Callable[[Case, Sequence[int]], Case]
+    code: str
+    """The code of the finding that names it."""
+    of_all: bool
+    """Whether it is of all views, or of the last one alone."""
+    spoil_views: Spoil
 
     def spoil(self, case: Case) -> Case:
-        views = len(case[1])
-        evidence = replace(case[0], at_rate=None)  # the recording itself is not spoilt
-        return self.how((evidence, case[1]), range(views) if self.every else [views - 1])
+        """Return the spoilt case; the recording that other frame rates are read from is dropped."""
+        views = tuple(range(len(case.setup))) if self.of_all else (len(case.setup) - 1,)
+        evidence = replace(case.evidence, at_rate=None)
+        return self.spoil_views(replace(case, evidence=evidence), views)
 
 
-def _of_one_or_all() -> dict[str, Breakage]:
-    ways: dict[str, tuple[str, Callable[[Case, Sequence[int]], Case]]] = {
-        **{code: (code, partial(_pose, code=code)) for code in POSES},
-        "metres": ("unit", partial(_unit, factor=1e3)),
-        "centimetres": ("unit", partial(_unit, factor=10.0)),
-        "resolution": ("resolution", partial(_resolution, ratio=0.5)),
-        "already_undistorted": ("already_undistorted", _undistorted),
-        "lens_missing": ("lens", _lens_missing),
+def _of_all_or_one() -> dict[str, Breakage]:
+    poses = {code: (code, partial(_spoil_pose, code=code)) for code in POSE_BREAKAGES}
+    kinds: dict[str, tuple[str, Spoil]] = {
+        **poses,
+        "metres": ("unit", partial(_divide_translation, factor=1e3)),
+        "centimetres": ("unit", partial(_divide_translation, factor=10.0)),
+        "resolution": ("resolution", partial(_scale_key_points, ratio=0.5)),
+        "already_undistorted": ("already_undistorted", _undistort),
+        "lens_missing": ("lens", _use_unknown_lens),
     }
-    return {
-        **{kind: Breakage(said, True, how) for kind, (said, how) in ways.items()},
-        **{f"one_{kind}": Breakage(said, False, how) for kind, (said, how) in ways.items()},
-    }
+    of_all = {kind: Breakage(code, True, spoil) for kind, (code, spoil) in kinds.items()}
+    of_one = {f"one_{kind}": Breakage(code, False, spoil) for kind, (code, spoil) in kinds.items()}
+    return of_all | of_one
 
 
-BREAKAGES: dict[str, Breakage] = {
-    **_of_one_or_all(),
-    "moved": Breakage("moved", False, partial(_moved, degrees=3.0, millimetres=100.0)),
-    "late": Breakage("out_of_sync", False, partial(_late, by=5)),
-    "early": Breakage("out_of_sync", False, partial(_late, by=-10)),
-    "exchanged": Breakage("views_swapped", False, _exchanged),
-    "mirrored_image": Breakage("mirrored_image", False, partial(_mirrored, image=True, sides=True)),
+BREAKAGES: Mapping[str, Breakage] = {
+    **_of_all_or_one(),
+    "moved": Breakage("moved", False, partial(_move, degrees=3.0, millimetres=100.0)),
+    "late": Breakage("out_of_sync", False, partial(_delay, by=5)),
+    "early": Breakage("out_of_sync", False, partial(_delay, by=-10)),
+    "exchanged": Breakage("views_swapped", False, _exchange_with_first),
+    "mirrored_image": Breakage("mirrored_image", False, partial(_mirror, image=True, sides=True)),
     "mirrored_key_points": Breakage(
-        "mirrored_key_points", False, partial(_mirrored, image=True, sides=False)
+        "mirrored_key_points", False, partial(_mirror, image=True, sides=False)
     ),
-    "sides_swapped": Breakage("sides_swapped", False, partial(_mirrored, image=False, sides=True)),
+    "sides_swapped": Breakage("sides_swapped", False, partial(_mirror, image=False, sides=True)),
 }
 """By kind."""

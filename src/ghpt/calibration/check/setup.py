@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.calibration.check.evidence import Evidence
@@ -16,21 +16,21 @@ from ghpt.models.estimators.classical import person_scale
 from ghpt.skeleton import MIRROR
 
 _FAR = 1e5
-"""Pixels."""
+"""Pixels; a key point beyond is none."""
 
 
 @dataclass(frozen=True)
 class Setup:
-    """V cameras and what each is shown."""
+    """V cameras, and which key points each of them is given, and how."""
 
     K: Float[Tensor, "V 3 3"]
     lens: Float[Tensor, "V 5"]
     R: Float[Tensor, "V 3 3"]
     t: Float[Tensor, "V 3"]
     source: tuple[int, ...]
-    """Whose key points each camera gets."""
+    """The view whose key points each camera is given."""
     shift: tuple[int, ...]
-    """By how many frames these are taken later."""
+    """The number of frames by which these are taken later."""
     mirrored: tuple[bool, ...]
     """Whether u is counted from the image's right edge."""
     sides: tuple[bool, ...]
@@ -40,13 +40,13 @@ class Setup:
     rate: tuple[float, ...]
     """How many times as fast as the others' the numbers of its frames count."""
     unit_mm: float | None
-    """mm: what the file's unit was taken for, where it does not say; else None."""
+    """The length (mm) that the file's unit was taken for, where it does not say it; else None."""
 
     def __len__(self) -> int:
         return len(self.shift)
 
     def changed(self, view: int, **values: Any) -> Setup:
-        """With other values for one camera."""
+        """Return the setup with other values for one camera."""
         new: dict[str, Any] = {}
         for name, value in values.items():
             old = getattr(self, name)
@@ -57,25 +57,52 @@ class Setup:
                 new[name] = (*old[:view], value, *old[view + 1 :])
         return replace(self, **new)
 
+    def given_to(
+        self,
+        view: int,
+        pixels: Float[Tensor, "*B J 2"],
+        valid: Bool[Tensor, "*B J"],
+    ) -> tuple[Float[Tensor, "*B J 2"], Bool[Tensor, "*B J"]]:
+        """Return the key points of its source as a camera is given them: mirrored, or with left
+        and right joints exchanged, where the setup says so.
+        """
+        if self.mirrored[view]:
+            u = self.width[view] - 1 - pixels[..., 0]
+            pixels = torch.stack((u, pixels[..., 1]), dim=-1)
+        if self.sides[view]:
+            pixels = pixels[..., list(MIRROR), :]
+            valid = valid[..., list(MIRROR)]
+        return pixels, valid
 
-def as_filed(cameras: CameraSet) -> Setup:
-    """What the files say."""
+
+def setup_of(cameras: CameraSet) -> Setup:
+    """Return what a camera file says. Raises GhptDataError where it has no extrinsics."""
+    setup = setup_of_intrinsics(cameras.K, cameras.size)
     rig = cameras.cameras
-    views = len(cameras)
-    width = 2 * cameras.K[:, 0, 2] + 1 if cameras.size is None else cameras.size[:, 0].double()
-    off = (False,) * views
+    unit = None if cameras.unit_known else cameras.unit_mm
+    return replace(setup, lens=cameras.distortion, R=rig.R, t=rig.t, unit_mm=unit)
+
+
+def setup_of_intrinsics(K: Float[Tensor, "V 3 3"], size: Int[Tensor, "V 2"] | None) -> Setup:
+    """Return cameras without lenses that all stand at the world's zero.
+
+    ``size``: of the images; None where it is not known, and twice the principal point then.
+    """
+    views = len(K)
+    width = 2 * K[:, 0, 2] + 1 if size is None else size[:, 0].double()
+    no = (False,) * views
     return Setup(
-        cameras.K,
-        cameras.distortion,
-        rig.R,
-        rig.t,
-        tuple(range(views)),
-        (0,) * views,
-        off,
-        off,
-        tuple(width.tolist()),
-        (1.0,) * views,
-        None if cameras.unit_known else cameras.unit_mm,
+        K=K,
+        lens=torch.zeros(views, 5, dtype=torch.float64),
+        R=torch.eye(3, dtype=torch.float64).repeat(views, 1, 1),
+        t=torch.zeros(views, 3, dtype=torch.float64),
+        source=tuple(range(views)),
+        shift=(0,) * views,
+        mirrored=no,
+        sides=no,
+        width=tuple(width.tolist()),
+        rate=(1.0,) * views,
+        unit_mm=None,
     )
 
 
@@ -90,72 +117,83 @@ class Rays:
 
 
 @dataclass
-class Look:
-    """Rays of the evidence, each view's kept, because a search asks for the same ones again."""
+class RayCache:
+    """The rays of the evidence. Each view's are kept: a search asks for the same ones again.
+
+    Raises ValueError for a shift that is larger than the evidence's largest.
+    """
 
     evidence: Evidence
-    _kept: dict[tuple, Rays] = field(default_factory=dict)
+    _kept: dict[tuple[object, ...], Rays] = field(default_factory=dict)
 
     def view(self, setup: Setup, view: int) -> Rays:
-        """One view of a setup."""
-        return self._one(setup, view, setup.shift[view])
+        """Return the rays of one view."""
+        shift = setup.shift[view]
+        largest = self.evidence.max_shift
+        if abs(shift) > largest:
+            raise ValueError(f"a shift of {shift} frames is beyond the evidence's {largest}")
+        key = self._key(setup, view, shift)
+        if key not in self._kept:
+            pixels, valid = self._pixels(setup, view, largest + shift)
+            self._kept[key] = rays_of(pixels, valid, setup.K[view], setup.lens[view])
+        return self._kept[key]
 
     def all(self, setup: Setup) -> Rays:
-        """All views of a setup: leading dimension V."""
-        return _stack([self.view(setup, view) for view in range(len(setup))])
+        """Return the rays of all views, with leading dimension V."""
+        each = [self.view(setup, view) for view in range(len(setup))]
+        xy = torch.stack([rays.xy for rays in each])
+        valid = torch.stack([rays.valid for rays in each])
+        size = torch.stack([rays.size for rays in each])
+        return Rays(xy, valid, size)
 
     def prepare(self, setup: Setup, view: int) -> None:
-        """Look at one view at all shifts at once, which is many times faster than one by one."""
+        """Compute one view's rays at all shifts at once, many times faster than one by one."""
         shifts = range(-self.evidence.max_shift, self.evidence.max_shift + 1)
         if all(self._key(setup, view, shift) in self._kept for shift in shifts):
             return
         pixels, valid = self._pixels(setup, view, slice(None))
-        whole = rays(pixels.flatten(0, 1), valid.flatten(0, 1), setup.K[view], setup.lens[view])
-        parts = (x.unflatten(0, valid.shape[:2]) for x in (whole.xy, whole.valid, whole.size))
-        for shift, part in zip(shifts, zip(*parts, strict=True), strict=True):
-            self._kept[self._key(setup, view, shift)] = Rays(*part)
-
-    def _one(self, setup: Setup, view: int, shift: int) -> Rays:
-        if abs(shift) > self.evidence.max_shift:
-            raise ValueError(
-                f"a shift of {shift} frames is beyond the evidence's {self.evidence.max_shift}"
-            )
-        key = self._key(setup, view, shift)
-        if key not in self._kept:
-            pixels, valid = self._pixels(setup, view, self.evidence.max_shift + shift)
-            self._kept[key] = rays(pixels, valid, setup.K[view], setup.lens[view])
-        return self._kept[key]
+        shape = valid.shape[:2]
+        flat = rays_of(pixels.flatten(0, 1), valid.flatten(0, 1), setup.K[view], setup.lens[view])
+        xy = flat.xy.unflatten(0, shape)
+        seen = flat.valid.unflatten(0, shape)
+        size = flat.size.unflatten(0, shape)
+        for number, shift in enumerate(shifts):
+            key = self._key(setup, view, shift)
+            self._kept[key] = Rays(xy[number], seen[number], size[number])
 
     @staticmethod
-    def _key(setup: Setup, view: int, shift: int) -> tuple:
-        how = setup.source[view], shift, setup.mirrored[view], setup.sides[view], setup.rate[view]
-        return (*how, *setup.K[view].flatten().tolist(), *setup.lens[view].tolist())
+    def _key(setup: Setup, view: int, shift: int) -> tuple[object, ...]:
+        return (
+            setup.source[view],
+            shift,
+            setup.mirrored[view],
+            setup.sides[view],
+            setup.rate[view],
+            *setup.K[view].flatten().tolist(),
+            *setup.lens[view].tolist(),
+        )
 
     def _pixels(self, setup: Setup, view: int, at: int | slice) -> tuple[Tensor, Tensor]:
         source = setup.source[view]
         evidence = self.evidence
         if setup.rate[view] == 1 or evidence.at_rate is None:
-            pixels = evidence.pixels[source][at]
-            valid = evidence.valid[source][at]
+            pixels = evidence.pixels[source]
+            valid = evidence.valid[source]
         else:
-            pixels, valid = (values[at] for values in evidence.at_rate(source, setup.rate[view]))
-        if setup.mirrored[view]:
-            pixels = torch.stack((setup.width[view] - 1 - pixels[..., 0], pixels[..., 1]), dim=-1)
-        if setup.sides[view]:
-            pixels = pixels[..., list(MIRROR), :]
-            valid = valid[..., list(MIRROR)]
-        return pixels, valid
+            pixels, valid = evidence.at_rate(source, setup.rate[view])
+        return setup.given_to(view, pixels[at], valid[at])
 
 
-def rays(
+def rays_of(
     pixels: Float[Tensor, "F J 2"],
     valid: Bool[Tensor, "F J"],
     K: Float[Tensor, "3 3"],
     lens: Float[Tensor, " 5"],
 ) -> Rays:
-    """Pixels out of the lens; those that no ray reaches are not seen."""
+    """Return the rays of pixels through a lens; a pixel that no ray reaches is not valid."""
     straight, valid = ideal(pixels, valid, K, lens)
-    xy = torch.linalg.solve(K, torch.nn.functional.pad(straight, (0, 1), value=1.0).mT).mT[..., :2]
+    homogeneous = torch.nn.functional.pad(straight, (0, 1), value=1.0)
+    xy = torch.linalg.solve(K, homogeneous.mT).mT[..., :2]
     xy = torch.where(valid[..., None], xy, 0.0)
     return Rays(xy, valid, person_scale(xy, valid))
 
@@ -166,16 +204,10 @@ def ideal(
     K: Float[Tensor, "3 3"],
     lens: Float[Tensor, " 5"],
 ) -> tuple[Float[Tensor, "*B J 2"], Bool[Tensor, "*B J"]]:
-    """Pinhole pixels of pixels seen through a lens, and which of them are seen and exist."""
+    """Return the pinhole pixels of pixels through a lens, and which of them exist."""
     valid = valid & (pixels.abs() < _FAR).all(-1)
     if not lens.any():
         return pixels, valid
     safe = torch.where(valid[..., None], pixels, K[:2, 2])
     straight, exists = undistort(safe.flatten(0, -2), K, lens)
     return straight.reshape(pixels.shape), valid & exists.reshape(valid.shape)
-
-
-def _stack(each: list[Rays]) -> Rays:
-    return Rays(
-        *(torch.stack([getattr(one, name) for one in each]) for name in ("xy", "valid", "size"))
-    )

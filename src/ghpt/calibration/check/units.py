@@ -22,57 +22,70 @@ _log = logging.getLogger(__name__)
 
 
 def unit_of(height: float) -> float | None:
-    """The unit (mm) in which a stature is a person's; None where there is none. It is never more
-    than one: human statures span less than a factor of ten.
+    """Return the unit (mm) in which a stature is a person's; None where there is none.
+
+    It is never more than one: human statures span less than a factor of ten.
     """
-    fits = (mm for mm in UNITS_MM if HUMAN[0] <= mm * height <= HUMAN[1])
+    low, high = HUMAN
+    fits = (mm for mm in UNITS_MM if low <= mm * height <= high)
     return next(fits, None)
 
 
 def unit_for(height: float) -> float:
-    """The unit (mm) to suggest for a person of this height in it: one that rulers have, or that of
-    an adult.
+    """Return the unit (mm) to suggest for a person of this height in it: one that rulers have, or
+    that of an adult.
     """
+    low, high = STATURES
     rulers = (*UNITS_MM, 100.0, 25.4, 304.8)
-    fits = (mm for mm in rulers if STATURES[0] <= mm * height <= STATURES[1])
+    fits = (mm for mm in rulers if low <= mm * height <= high)
     return next(fits, float(f"{_ADULT / height:.4g}"))
 
 
 def decide_unit(
     cameras: CameraSet, batch: Observations, estimator: Estimator, ask: bool
 ) -> CameraSet:
-    """The cameras in mm, by the size of the person whom they show in these frames; as they are
-    where the file says its unit, and where the views do not agree on a person, which is another
-    mistake.
+    """Return the cameras in mm, by the size of the person whom they show in these frames.
 
-    Raises GhptDataError where no limb is seen or no unit fits, unless ``ask`` is false.
+    They stay as they are where the file says its unit, and where the views do not agree on a
+    person, which is another mistake. Raises GhptDataError where no bone is seen or no unit fits,
+    unless ``ask`` is false.
     """
     if cameras.unit_known or cameras.t is None:
         return cameras
     found = estimator.triangulate(batch)
-    placed = found.has_position
     explained = _EXPLAINS.explained(batch, found.points, found.has_position)
-    if float(explained.sum()) < _AGREE * float(placed.sum()):
+    if float(explained.sum()) < _AGREE * float(found.has_position.sum()):
         return cameras
     height = float(stature(found.points, explained)) / cameras.unit_mm
     unit = unit_of(height)
     if unit is not None:
-        where = cameras.path
-        words = UNITS_MM[unit]
         metres = height * unit / 1000
-        text = f"the file does not say its unit: {words}, by the person, who then measures {metres:.2f} m"
-        _log.info("%s: %s (unit_mm=%g).", where, text, unit)
-        return replace(
-            cameras, t=cameras.t * (unit / cameras.unit_mm), unit_known=True, unit_mm=unit
+        text = (
+            f"the file does not say its unit: {UNITS_MM[unit]}, by the person, "
+            f"who then measures {metres:.2f} m"
         )
-    if not ask:
-        return cameras
-    problem = "the file does not say its unit of length, and the person's size, of whom no limb is seen, does not tell"
-    hint = "Give the length of the unit in mm: unit_mm=1000 for metres, unit_mm=1 for millimetres."
+        _log.info("%s: %s (unit_mm=%g).", cameras.path, text, unit)
+        t = cameras.t * (unit / cameras.unit_mm)
+        return replace(cameras, t=t, unit_known=True, unit_mm=unit)
+    if ask:
+        raise _unknown_unit(cameras.path, height)
+    return cameras
+
+
+def _unknown_unit(path: str, height: float) -> GhptDataError:
     if height:
+        adult = f"{_ADULT / height:.4g}"
         problem = (
-            f"the file does not say its unit of length, and the person measures {height:.3g} of it, "
-            "which is nobody's size in mm, cm or m"
+            f"the file does not say its unit of length, and the person measures {height:.3g} "
+            "of it, which is nobody's size in mm, cm or m"
         )
-        hint = f"Give the length of the unit in mm: unit_mm={_ADULT / height:.4g} makes the person 1.73 m tall."
-    raise GhptDataError(cameras.path, "unit_mm", problem, hint)
+        hint = f"Give the length of the unit in mm: unit_mm={adult} makes the person 1.73 m tall."
+    else:
+        problem = (
+            "the file does not say its unit of length, and the person's size, of whom no limb "
+            "is seen, does not tell"
+        )
+        hint = (
+            "Give the length of the unit in mm: unit_mm=1000 for metres, unit_mm=1 for millimetres."
+        )
+    return GhptDataError(path, "unit_mm", problem, hint)

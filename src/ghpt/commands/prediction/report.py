@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import Any
 
 from ghpt.commands.prediction.result import PredictionResult
-from ghpt.commands.prediction.statistics import EstimatorErrors, Quantiles
+from ghpt.commands.prediction.statistics import EstimatorErrors
 from ghpt.commands.prediction.verdict import verdict_lines
-from ghpt.models.relative_pose.scale import SEGMENTS
+from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.report.document import (
     Block,
     Bullets,
@@ -21,6 +21,7 @@ from ghpt.report.document import (
     Text,
     prose,
 )
+from ghpt.report.rig_comparison import Quantiles
 from ghpt.report.tables import NAMES, NONE
 
 
@@ -169,7 +170,7 @@ def _joint_table(result: PredictionResult) -> Table:
 def _segment_table(result: PredictionResult) -> Table:
     estimators = _estimators(result)
     rows = []
-    for name in SEGMENTS:
+    for name in BONE_NAMES:
         variations = [errors.segments.each[name] for errors in estimators.values()]
         cells = [format_number(variation, 1, 100) for variation in variations]
         rows.append([name.replace("_", " "), *cells])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.trainer import make_trainer
 from ghpt.data.people.sequence import Sequence
 from ghpt.observations import Observations
-from ghpt.reconstruction import Reconstruction
+from ghpt.reconstruction import Reconstruction, concatenate, move_to_cpu
 
 Predictor = Callable[[Observations], Reconstruction]
 _log = logging.getLogger(__name__)
@@ -143,20 +143,6 @@ def _report_stop(shards: Shards, first: bool) -> Iterator[None]:
             _log.warning("Stopped. %d of %d shards are in %s.", done, total, folder)
             _log.warning("The same command goes on with them.")
         raise
-
-
-def move_to_cpu(part: Reconstruction) -> Reconstruction:
-    """Return the reconstruction in the memory of the CPU."""
-    values = {field.name: getattr(part, field.name).cpu() for field in fields(Reconstruction)}
-    return Reconstruction(**values)
-
-
-def concatenate(parts: list[Reconstruction]) -> Reconstruction:
-    """Return successive parts as one."""
-    values = {}
-    for field in fields(Reconstruction):
-        values[field.name] = torch.cat([getattr(part, field.name) for part in parts])
-    return Reconstruction(**values)
 
 
 @contextmanager

@@ -17,10 +17,10 @@ from ghpt.data.people.sequence import Sequence
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
-from ghpt.models.relative_pose.scale import MEASURED_FRAMES, SEGMENTS, stature
+from ghpt.models.relative_pose.scale import MEASURED_FRAMES, stature
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import FILE_STATES, Reconstruction, State
-from ghpt.report.rig_comparison import segment_variation
+from ghpt.report.rig_comparison import BoneVariation, ViewErrors, bone_variations, view_errors
 
 Estimate = Callable[[Observations], PoseEstimate]
 _LEAST = 20
@@ -40,30 +40,6 @@ class Coverage:
     """Number of the frames in which each view had left and right exchanged."""
     stature_mm: float | None
     """The person's height; None where no bone is observed."""
-
-
-@dataclass(frozen=True)
-class Quantiles:
-    """Of errors in pixels; None of no errors."""
-
-    median: float | None
-    p90: float | None
-    count: int
-
-
-@dataclass(frozen=True)
-class ViewErrors(Quantiles):
-    """Errors of all views together, and of each."""
-
-    views: dict[str, Quantiles]
-
-
-@dataclass(frozen=True)
-class BoneVariation:
-    """How much the lengths of bones vary over the frames, as a fraction of them."""
-
-    median: float | None
-    each: dict[str, float | None]
 
 
 @dataclass(frozen=True)
@@ -191,9 +167,9 @@ def _estimator_errors(
     valid = torch.cat([batch.valid for batch in batches])
     own = _Errors(error, valid & estimated[:, None] & error.isfinite())
     return EstimatorErrors(
-        reprojection=_errors_by_view(own.error, own.valid, names),
-        held_out=_errors_by_view(held_out.error, common, names),
-        segments=_bone_variation(points, estimated),
+        reprojection=view_errors(own.error, own.valid, names),
+        held_out=view_errors(held_out.error, common, names),
+        segments=bone_variations(points, estimated),
         placed=float(estimated.double().mean()),
         scales=_scaled_errors(batches, own, held_out, names),
     )
@@ -223,16 +199,6 @@ def _hold_out_in_batch(batch: Observations, estimate: Estimate) -> _Errors:
     return _Errors(torch.stack(errors, dim=1), torch.stack(measured, dim=1))
 
 
-def _bone_variation(
-    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]
-) -> BoneVariation:
-    variation, known = segment_variation(points, estimated)
-    pairs = zip(variation.tolist(), known.tolist(), strict=True)
-    each = [value if is_known else None for value, is_known in pairs]
-    median = float(variation[known].median()) if known.any() else None
-    return BoneVariation(median, dict(zip(SEGMENTS, each, strict=True)))
-
-
 def _scaled_errors(
     batches: Items[Observations], own: _Errors, held_out: _Errors, names: tuple[str, ...]
 ) -> ScaledErrors:
@@ -251,21 +217,3 @@ def _scaled_errors(
 
 def _median(values: Float[Tensor, " N"]) -> float | None:
     return float(values.median()) if len(values) >= _LEAST else None
-
-
-def _errors_by_view(
-    error: Float[Tensor, "T V J"], measured: Bool[Tensor, "T V J"], names: tuple[str, ...]
-) -> ViewErrors:
-    views = {name: quantiles(error[:, view][measured[:, view]]) for view, name in enumerate(names)}
-    whole = quantiles(error[measured])
-    return ViewErrors(whole.median, whole.p90, whole.count, views)
-
-
-def quantiles(errors: Float[Tensor, " N"]) -> Quantiles:
-    """Return the median and the 90 % quantile, the lower of two values."""
-    count = len(errors)
-    if not count:
-        return Quantiles(None, None, 0)
-    ordered = errors.sort().values
-    median = float(ordered[int(0.5 * (count - 1))])
-    return Quantiles(median, float(ordered[int(0.9 * (count - 1))]), count)

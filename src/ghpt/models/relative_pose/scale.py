@@ -39,7 +39,7 @@ def _name(bone: tuple[int, int]) -> str:
     return side + next((part for part, ends in _PARTS.items() if ends == kinds), "_".join(kinds))
 
 
-SEGMENTS = tuple(map(_name, BONES))
+BONE_NAMES = tuple(map(_name, BONES))
 """Names of the parts in the order of ``ghpt.skeleton.BONES``: right_shank, right_thigh, right_hip
 (to the pelvis), the same of the left, lumbar, thorax, neck (to the head's top), head_top_nose,
 right_clavicle, right_upper_arm, right_forearm, and of the left.
@@ -77,11 +77,11 @@ def typical_lengths() -> tuple[float, ...]:
 @cache
 def average_lengths() -> tuple[float, ...]:
     """The same of the limbs alone; 0 for other parts, whose ends each detector puts elsewhere."""
-    lengths = zip(SEGMENTS, typical_lengths(), strict=True)
+    lengths = zip(BONE_NAMES, typical_lengths(), strict=True)
     return tuple(length if name.split("_", 1)[-1] in LIMBS else 0.0 for name, length in lengths)
 
 
-def part_scales(
+def bone_scales(
     points: Float[Tensor, "*B M J 3"],
     estimated: Bool[Tensor, "*B M J"],
     lengths: Float[Tensor, " L"],
@@ -106,7 +106,7 @@ def body_scale(
     BONES; NaN or 0 where unknown) of that length over the median measured one; 0 where no known
     part was measured.
     """
-    return part_scales(points, estimated, lengths).nanmedian(-1).values.nan_to_num(0.0)
+    return bone_scales(points, estimated, lengths).nanmedian(-1).values.nan_to_num(0.0)
 
 
 def stature(
@@ -212,20 +212,20 @@ class BodyHeight(BodyScale):
         self.lengths = tuple(mm * length for length in average_lengths())
 
 
-class SegmentLengths(BodyScale):
-    """Measured lengths (mm) by name: ``SEGMENTS``, or without the side for both (``thigh: 430``)."""
+class BoneLengths(BodyScale):
+    """Measured lengths (mm) by name: ``BONE_NAMES``, or without the side for both (``thigh: 430``)."""
 
     def __init__(self, lengths: Mapping[str, float]) -> None:
-        hint = f"Choose from {', '.join(SEGMENTS)}, or leave out right_ or left_ for both."
+        hint = f"Choose from {', '.join(BONE_NAMES)}, or leave out right_ or left_ for both."
         check(len(lengths) > 0, "lengths", "is empty", hint)
-        found = dict.fromkeys(SEGMENTS, 0.0)
+        found = dict.fromkeys(BONE_NAMES, 0.0)
         for name, mm in lengths.items():
             own = [
                 s
-                for s in SEGMENTS
+                for s in BONE_NAMES
                 if s == name or s.removeprefix("right_").removeprefix("left_") == name
             ]
             check(bool(own), "lengths", f"names {name!r}, which is no part of the body", hint)
             check(mm > 0, "lengths", f"says {name} is {mm}", "Give lengths in millimetres.")
             found |= dict.fromkeys(own, float(mm))
-        self.lengths = tuple(found[name] for name in SEGMENTS)
+        self.lengths = tuple(found[name] for name in BONE_NAMES)

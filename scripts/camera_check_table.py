@@ -1,7 +1,6 @@
-"""The camera doctor's confusion table: good rigs, each spoilt in each way; what was broken against
-what was said.
+"""The camera check's confusion table: how good rigs were spoilt, and what was said of them.
 
-``python scripts/doctor_table.py`` takes the synthetic recordings; ``--real FOLDER`` adds Pose2Sim's
+``python scripts/camera_check_table.py`` takes the synthetic recordings; ``--real FOLDER`` adds Pose2Sim's
 example and caliscope's recording from a folder with ``pose2sim_single`` and ``caliscope``.
 """
 
@@ -18,10 +17,10 @@ import hydra
 import torch
 
 from ghpt.calibration.check.breakages import BREAKAGES, Case
+from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.calibration.check.evidence import gather
-from ghpt.calibration.check.examination import Doctor
-from ghpt.calibration.check.setup import as_filed
-from ghpt.commands.cameras import from_recording
+from ghpt.calibration.check.setup import setup_of
+from ghpt.commands.cameras import synthetic_evidence
 from ghpt.config import build, plain
 from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
@@ -38,7 +37,7 @@ def compose(overrides: list[str]) -> dict:
 
 
 def synthetic(
-    doctor: Doctor, names: list[str], frames: int, take: int
+    camera_check: CameraCheck, names: list[str], frames: int, take: int
 ) -> Iterator[tuple[str, Case]]:
     """The middle ``frames`` frames of ``take`` recordings of each arrangement, over all of its
     subjects.
@@ -58,11 +57,11 @@ def synthetic(
                 subjects[recording.subject].append(recording)
             for number, of in enumerate(subjects.values()):
                 for recording in of[number % 7 :: max(1, len(of) // take)][:take]:
-                    evidence, file = from_recording(recording, data, doctor, frames)
-                    yield f"{name} {recording.name}", (evidence, as_filed(file))
+                    evidence, file = synthetic_evidence(recording, data, camera_check, frames)
+                    yield f"{name} {recording.name}", Case(evidence, setup_of(file))
 
 
-def real(doctor: Doctor, folder: Path) -> Iterator[tuple[str, Case]]:
+def real(camera_check: CameraCheck, folder: Path) -> Iterator[tuple[str, Case]]:
     for name, points, cameras in (
         ("pose2sim", "pose2sim_single/pose", "pose2sim_single/Calib_qualisys.toml"),
         ("caliscope", "caliscope/xy_HOLISTIC.csv", "caliscope/camera_array.toml"),
@@ -70,8 +69,8 @@ def real(doctor: Doctor, folder: Path) -> Iterator[tuple[str, Case]]:
         people = read_key_points(folder / points)
         file = read_cameras(folder / cameras)
         sequence = person_sequence(people, file, person=None, check_sizes=False)
-        evidence = gather(sequence, doctor.frames, doctor.shift)
-        yield name, (evidence, as_filed(sequence.cameras))
+        evidence = gather(sequence, camera_check.frames, camera_check.shift)
+        yield name, Case(evidence, setup_of(sequence.cameras))
 
 
 def main() -> None:
@@ -86,39 +85,43 @@ def main() -> None:
     parser.add_argument("--views", type=int, help="the first so many views alone")
     parser.add_argument("--real", type=Path, help="folder with pose2sim_single and caliscope")
     options = parser.parse_args()
-    doctor = build(compose([])["doctor"], "doctor")
-    cases = list(synthetic(doctor, options.data, options.frames, options.take))[: options.limit]
+    camera_check = build(compose([])["camera_check"], "camera_check")
+    cases = list(synthetic(camera_check, options.data, options.frames, options.take))[
+        : options.limit
+    ]
     if options.real:
-        cases += real(doctor, options.real)
+        cases += real(camera_check, options.real)
     table: dict[str, Counter] = defaultdict(Counter)
     seconds = []
     for name, case in cases:
         if options.views:
             case = first_views(case, options.views)
         for kind in ("nothing", *options.kinds):
-            expected = "nothing" if kind == "nothing" else BREAKAGES[kind].said
+            expected = "nothing" if kind == "nothing" else BREAKAGES[kind].code
             start = time.perf_counter()
-            evidence, setup = case if kind == "nothing" else BREAKAGES[kind].spoil(case)
-            checkup = doctor(evidence, setup)
+            spoilt = case if kind == "nothing" else BREAKAGES[kind].spoil(case)
+            result = camera_check(spoilt.evidence, spoilt.setup)
             seconds.append(time.perf_counter() - start)
-            words = said(checkup.findings)
+            words = said(result.findings)
             table[kind][words] += 1
             if words != expected:
                 before, after = (
                     " ".join(f"{x:.1f}" for x in e.tolist())
-                    for e in (checkup.given_px, checkup.error_px)
+                    for e in (result.given_px, result.error_px)
                 )
                 print(f"{name}, {kind}: {words} [{before} -> {after} px]", flush=True)
     print_table(table)
-    print(
-        f"\n{len(cases)} recordings; seconds: median {torch.tensor(seconds).median():.1f}, most {max(seconds):.1f}"
-    )
+    median = torch.tensor(seconds).median()
+    times = f"seconds: median {median:.1f}, most {max(seconds):.1f}"
+    print(f"\n{len(cases)} recordings; {times}")
 
 
 def first_views(case: Case, count: int) -> Case:
-    evidence, setup = case
-    tensors = {name: getattr(setup, name)[:count] for name in vars(setup)}
-    return (
+    evidence = case.evidence
+    setup = case.setup
+    of_views = {name: value for name, value in vars(setup).items() if name != "unit_mm"}
+    tensors = {name: value[:count] for name, value in of_views.items()}
+    return Case(
         replace(
             evidence,
             names=evidence.names[:count],
@@ -138,7 +141,7 @@ def print_table(table: dict[str, Counter]) -> None:
     rows = [
         [
             kind,
-            "nothing" if kind == "nothing" else BREAKAGES[kind].said,
+            "nothing" if kind == "nothing" else BREAKAGES[kind].code,
             ", ".join(f"{words} {count}" for words, count in row.most_common()),
         ]
         for kind, row in table.items()

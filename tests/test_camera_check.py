@@ -1,4 +1,4 @@
-"""The camera doctor: every breakage is named, a good rig is left alone, and what is mended is right
+"""The camera check: every breakage is named, a good rig is left alone, and what is mended is right
 again.
 """
 
@@ -13,12 +13,13 @@ import torch
 
 import sizes
 from ghpt.calibration.check.agreement import agreement, errors, median
-from ghpt.calibration.check.breakages import BREAKAGES
-from ghpt.calibration.check.candidates import POSES, exchanged
-from ghpt.calibration.check.evidence import Evidence, choose, gather
-from ghpt.calibration.check.examination import Finding, merged
+from ghpt.calibration.check.breakages import BREAKAGES, POSE_BREAKAGES, Case
+from ghpt.calibration.check.camera_check import merge_steps
+from ghpt.calibration.check.evidence import choose, gather
 from ghpt.calibration.check.resection import resect
-from ghpt.calibration.check.setup import Look, Setup, as_filed
+from ghpt.calibration.check.setup import RayCache, setup_of
+from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.mistakes import exchanged
 from ghpt.config import build, plain
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points
@@ -36,16 +37,19 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @cache
-def doctor(**changed):
+def camera_check(**changed):
     with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = plain(hydra.compose("cameras", ["output=unused"]))["doctor"]
-    return build(config | {"frames": 24, "shift": 12} | changed, "doctor")
+        config = plain(hydra.compose("cameras", ["output=unused"]))["camera_check"]
+    return build(config | {"frames": 24, "shift": 12} | changed, "camera_check")
+
+
+def check(spoilt: Case):
+    """What the camera check says of a case."""
+    return camera_check()(spoilt.evidence, spoilt.setup)
 
 
 @cache
-def case(
-    views: int = 4, max_shift: int = 2, noise: float = 0.006, frames: int = 90
-) -> tuple[Evidence, Setup]:
+def case(views: int = 4, max_shift: int = 2, noise: float = 0.006, frames: int = 90) -> Case:
     """A person walking before Panoptic's cameras, through their lenses; noise in sizes of the
     person, about.
     """
@@ -69,20 +73,20 @@ def case(
         max_shift,
         "",
     )
-    return found, as_filed(file)
+    return Case(found, setup_of(file))
 
 
 @pytest.mark.parametrize("views", [2, 3, 4, 6] if sizes.NIGHTLY else [2, 4])
 def test_a_good_rig_has_nothing_wrong(views):
-    checkup = doctor()(*case(views))
-    assert checkup.findings == ()
-    assert 1500 < checkup.stature < 2000
-    assert float(checkup.error_px.max()) < 10
+    result = check(case(views))
+    assert result.findings == ()
+    assert 1500 < result.stature < 2000
+    assert float(result.error_px.max()) < 10
 
 
 @cache
 def checked(kind):
-    return doctor()(*BREAKAGES[kind].spoil(case(max_shift=12 if kind in ("late", "early") else 2)))
+    return check(BREAKAGES[kind].spoil(case(max_shift=12 if kind in ("late", "early") else 2)))
 
 
 PUSHED = (
@@ -107,17 +111,17 @@ def tried(kinds):
     "kind", tried(sorted(set(BREAKAGES) - {"one_axes_flipped", "one_camera_to_world_flipped"}))
 )
 def test_every_breakage_is_found_and_nothing_else(kind):
-    names = case()[0].names
-    assert [finding.code for finding in checked(kind).findings] == [BREAKAGES[kind].said]
+    names = case().evidence.names
+    assert [finding.code for finding in checked(kind).findings] == [BREAKAGES[kind].code]
     finding = checked(kind).findings[0]
-    assert finding.cameras == () if BREAKAGES[kind].every else names[-1] in finding.cameras
+    assert finding.cameras == () if BREAKAGES[kind].of_all else names[-1] in finding.cameras
     assert finding.mended
     assert float(checked(kind).error_px.max()) < 10
 
 
 def test_numbers_of_the_mistakes_are_those_that_were_made():
     numbers = {
-        "moved": pytest.approx(3.0, abs=0.5),
+        "moved": pytest.approx(3.0, abs=1.0),  # 100 mm look like a rotation too
         "late": 5,
         "early": -10,
         "metres": 1000,
@@ -130,8 +134,8 @@ def test_numbers_of_the_mistakes_are_those_that_were_made():
 
 
 def test_mended_poses_are_the_true_ones():
-    _, setup = case()
-    for kind in tried((*POSES, "metres", "one_metres")):
+    setup = case().setup
+    for kind in tried((*POSE_BREAKAGES, "metres", "one_metres")):
         mended = checked(kind).setup
         torch.testing.assert_close(mended.R, setup.R, rtol=0, atol=1e-9)
         torch.testing.assert_close(mended.t, setup.t, rtol=0, atol=1e-6)
@@ -139,49 +143,53 @@ def test_mended_poses_are_the_true_ones():
 
 def test_two_mistakes_in_one_recording_are_both_found():
     spoilt = BREAKAGES["late"].spoil(BREAKAGES["camera_to_world"].spoil(case(max_shift=12)))
-    checkup = doctor()(*spoilt)
-    assert [finding.code for finding in checkup.findings] == ["camera_to_world", "out_of_sync"]
+    result = check(spoilt)
+    assert [finding.code for finding in result.findings] == ["camera_to_world", "out_of_sync"]
 
 
 def test_the_unit_of_the_world_does_not_change_who_agrees():
-    evidence, setup = case()
-    estimator = doctor().estimator
-    one = agreement(Look(evidence), setup, estimator, 0.05, 100)
-    other = agreement(Look(evidence), replace(setup, t=setup.t * 1e-3), estimator, 0.05, 100)
+    good = case()
+    evidence, setup = good.evidence, good.setup
+    estimator = camera_check().thresholds.estimator
+    one = agreement(RayCache(evidence), setup, estimator, 0.05, 100)
+    other = agreement(RayCache(evidence), replace(setup, t=setup.t * 1e-3), estimator, 0.05, 100)
     torch.testing.assert_close(one.error, other.error, rtol=1e-3, atol=1e-6)
     assert bool((one.core == other.core).all())
 
 
 def test_errors_are_in_sizes_of_the_person_and_bounded():
-    evidence, setup = case(noise=0.0)
-    now = agreement(Look(evidence), setup, doctor().estimator, 0.05, 100)
+    good = case(noise=0.0)
+    evidence, setup = good.evidence, good.setup
+    now = agreement(RayCache(evidence), setup, camera_check().thresholds.estimator, 0.05, 100)
     assert float(now.error.max()) < 1e-4
-    rays = Look(evidence).view(setup, 0)
+    rays = RayCache(evidence).view(setup, 0)
     far = errors(rays, setup.R[0], setup.t[0], now.points[0] + 1e5, now.known[0])
     assert float(far[~far.isnan()].max()) <= 0.1
     assert float(median(torch.full((2, 3), torch.nan, dtype=torch.float64))) == pytest.approx(0.1)
 
 
 def test_resection_gives_the_camera_back():
-    evidence, setup = case(noise=0.0)
-    now = agreement(Look(evidence), setup, doctor().estimator, 0.05, 100)
-    R, t = resect(Look(evidence).view(setup, 2), now.points[2], now.known[2], 0.1, 0)
+    good = case(noise=0.0)
+    evidence, setup = good.evidence, good.setup
+    now = agreement(RayCache(evidence), setup, camera_check().thresholds.estimator, 0.05, 100)
+    R, t = resect(RayCache(evidence).view(setup, 2), now.points[2], now.known[2], 0.1, 0)
     torch.testing.assert_close(R, setup.R[2], rtol=0, atol=1e-4)
     torch.testing.assert_close(t, setup.t[2], rtol=0, atol=2.0)
     nothing = torch.zeros_like(now.known[2])
-    assert resect(Look(evidence).view(setup, 2), now.points[2], nothing, 0.1, 0) is None
+    assert resect(RayCache(evidence).view(setup, 2), now.points[2], nothing, 0.1, 0) is None
 
 
 def test_an_exchange_is_its_own_inverse():
-    _, setup = case()
+    setup = case().setup
     assert exchanged(exchanged(setup, 0, 2).setup, 2, 0).setup.source == setup.source
     assert exchanged(setup, 0, 2).setup.source == (2, 1, 0, 3)
 
 
 def test_a_shift_beyond_the_evidence_is_refused():
-    evidence, setup = case()
+    good = case()
+    evidence, setup = good.evidence, good.setup
     with pytest.raises(ValueError, match="beyond"):
-        Look(evidence).view(setup.changed(1, shift=3), 1)
+        RayCache(evidence).view(setup.changed(1, shift=3), 1)
 
 
 def test_frames_that_are_left_out_are_gaps():
@@ -194,61 +202,65 @@ def test_frames_that_are_left_out_are_gaps():
 
 
 def test_a_person_of_no_human_size_is_said_without_inventing_a_unit():
-    evidence, setup = case()
-    checkup = doctor()(evidence, replace(setup, t=3 * setup.t))
-    assert [(finding.code, finding.mended) for finding in checkup.findings] == [("scale", False)]
+    good = case()
+    evidence, setup = good.evidence, good.setup
+    result = camera_check()(evidence, replace(setup, t=3 * setup.t))
+    assert [(finding.code, finding.mended) for finding in result.findings] == [("scale", False)]
 
 
 def test_views_that_nothing_explains_are_said_to_be_off():
-    evidence, setup = case()
+    good = case()
+    evidence, setup = good.evidence, good.setup
     pixels = evidence.pixels.clone()
     pixels[3] += 300 * torch.randn(
         pixels[3].shape, dtype=torch.float64, generator=torch.Generator().manual_seed(1)
     )
-    found = doctor()(replace(evidence, pixels=pixels, at_rate=None), setup).findings
+    found = camera_check()(replace(evidence, pixels=pixels, at_rate=None), setup).findings
     assert [(finding.code, finding.cameras, finding.mended) for finding in found] == [
         ("off", (evidence.names[3],), False)
     ]
 
 
 def test_steps_of_one_kind_are_one_finding():
-    first = Finding("out_of_sync", ("a",), "3 late", 3.0, 20.0, 8.0, True)
+    first = Finding("out_of_sync", Severity.ERROR, "3 late", ("a",), 3.0)
+    first = replace(first, before_px=20.0, after_px=8.0, mended=True)
     second = replace(first, text="4 late", value=4.0, before_px=8.0, after_px=5.0)
-    assert merged([first, second]) == [replace(second, before_px=20.0)]
+    assert merge_steps([first, second]) == [replace(second, before_px=20.0)]
 
 
 @pytest.mark.parametrize(
     ("changed", "key"),
     [
-        ({"fitted": 1.0}, "fitted"),
+        ({"astray": 0.0}, "astray"),
         ({"frames": 0}, "frames"),
         ({"shift": -1}, "shift"),
     ],
 )
 def test_bad_settings_are_named(changed, key):
     with pytest.raises(GhptConfigError, match=key):
-        replace(doctor(), **changed)
+        replace(camera_check(), **changed)
 
 
 def test_real_rigs(shared_data):
     """Pose2Sim's third camera is off, and not in time; caliscope's rig is good."""
-    folder, whole = shared_data / "pose2sim_single", doctor(frames=64, shift=20)
-    checkup = recording_check(whole, folder / "pose", folder / "Calib_qualisys.toml")
-    assert [(finding.code, finding.cameras) for finding in checkup.findings] == [
+    folder, whole = shared_data / "pose2sim_single", camera_check(frames=64, shift=20)
+    result = recording_check(whole, folder / "pose", folder / "Calib_qualisys.toml")
+    assert [(finding.code, finding.cameras) for finding in result.findings] == [
         ("moved", ("cam03",))
     ]
-    assert checkup.findings[0].before_px > 35
-    assert checkup.findings[0].after_px < 20
+    assert result.findings[0].before_px > 35
+    assert result.findings[0].after_px < 20
     folder = shared_data / "caliscope"
-    checkup = recording_check(whole, folder / "xy_HOLISTIC.csv", folder / "camera_array.toml")
-    assert checkup.findings == ()
+    result = recording_check(whole, folder / "xy_HOLISTIC.csv", folder / "camera_array.toml")
+    assert result.findings == ()
 
 
-def recording_check(doctor, points, cameras):
-    """What the doctor says of real key points and cameras."""
+def recording_check(camera_check, points, cameras):
+    """What the camera check says of real key points and cameras."""
     people, file = read_key_points(points), read_cameras(cameras)
     sequence = person_sequence(people, file, person=None, check_sizes=False)
-    return doctor(gather(sequence, doctor.frames, doctor.shift), as_filed(sequence.cameras))
+    evidence = gather(sequence, camera_check.frames, camera_check.shift)
+    return camera_check(evidence, setup_of(sequence.cameras))
 
 
 def test_cameras_without_extrinsics_are_refused():

@@ -1,0 +1,204 @@
+"""The camera check: undoes each mistake, keeps what clearly brings the views together, and looks
+again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghpt.calibration.check.agreement import Agreement, triangulated
+from ghpt.calibration.check.evidence import Evidence
+from ghpt.calibration.check.search import Search, Thresholds
+from ghpt.calibration.check.setup import RayCache, Setup
+from ghpt.calibration.check.units import unit_of
+from ghpt.calibration.findings import Finding
+from ghpt.calibration.mistakes import (
+    LENS,
+    MOVED,
+    NOTHING_AGREES,
+    OFF,
+    OUT_OF_SYNC,
+    UNIT,
+    Candidate,
+    size_finding,
+)
+from ghpt.errors import check, check_positive
+from ghpt.models.estimators.classical import Estimator
+from ghpt.models.relative_pose.scale import stature
+
+
+@dataclass(frozen=True)
+class CameraCheckResult:
+    """What the camera check found."""
+
+    findings: tuple[Finding, ...]
+    """In the order in which the mistakes were undone."""
+    setup: Setup
+    """With every mistake undone that can be."""
+    error_px: Float[Tensor, " V"]
+    """The held-out error of each view after that: median, pixels."""
+    given_px: Float[Tensor, " V"]
+    """The same as the files have it."""
+    stature: float
+    """Of the person, mm; 0 where it was not measured."""
+    unit_mm: float | None = None
+    """The unit of the file, mm, where the file does not say it and the person tells."""
+
+
+@dataclass(frozen=True)
+class CameraCheck:
+    """The settings of the camera check; errors are held-out medians in sizes of the person.
+
+    ``frames``: most frames looked at. ``shift``: largest shift in time that is tried, frames.
+    ``rounds``: most mistakes in one recording. ``astray``: a view with a larger error, which
+    nothing mends, is off. ``clean``: where the error of every view is smaller, predict.py does not
+    ask. ``many``: of more views it asks only if a view's error exceeds ``suspicious``, because the
+    time grows with their square. ``consensus``: estimator that the person is measured with.
+    """
+
+    frames: int
+    shift: int
+    rounds: int
+    astray: float
+    clean: float
+    many: int
+    suspicious: float
+    thresholds: Thresholds
+    consensus: Estimator
+
+    def __post_init__(self) -> None:
+        check_positive(
+            frames=self.frames,
+            rounds=self.rounds,
+            astray=self.astray,
+            clean=self.clean,
+            many=self.many,
+            suspicious=self.suspicious,
+        )
+        check(self.shift >= 0, "shift", f"is {self.shift}", "It must not be negative.")
+
+    def is_worthwhile(self, errors: Mapping[str, float | None]) -> bool:
+        """Return whether the check is worth its time.
+
+        ``errors``: of each view, sizes of the person; None where nothing tells it.
+        """
+        limit = self.clean if len(errors) <= self.many else self.suspicious
+        return any(error is None or error > limit for error in errors.values())
+
+    @torch.no_grad()
+    def __call__(self, evidence: Evidence, setup: Setup) -> CameraCheckResult:
+        """Return what is wrong with the cameras, and the setup with it undone."""
+        cache = RayCache(evidence)
+        search = Search(cache, setup, self.thresholds)
+        given_px = pixels_of(cache, setup, search.now.error)
+        findings: list[Finding] = []
+        for _ in range(self.rounds):
+            best = search.best()
+            if best is None:
+                break
+            candidate, after = best
+            findings.append(_undone(search, candidate, after))
+            search = search.after(candidate, after)
+        findings += self._left(search)
+        height = self._stature(search)
+        setup, height, unit_mm = _file_unit(search.setup, height)
+        wrong_size = size_finding(height) if height else None
+        result = list(merge_steps(findings))
+        if wrong_size is not None:
+            mended = wrong_size.code == UNIT.code
+            result.append(replace(wrong_size, mended=mended))
+            if mended:
+                setup = replace(setup, t=wrong_size.value * setup.t)
+                height *= wrong_size.value
+        error_px = pixels_of(cache, setup, search.now.error)
+        return CameraCheckResult(tuple(result), setup, error_px, given_px, height, unit_mm)
+
+    def _left(self, search: Search) -> list[Finding]:
+        """Return the views that nothing that was tried brings to the others."""
+        error = search.now.error
+        pixels = pixels_of(search.cache, search.setup, error)
+        off = error > self.astray
+        if bool(off.all()):
+            mean = float(pixels.mean())
+            found = NOTHING_AGREES.finding()
+            return [replace(found, before_px=mean, after_px=mean)]
+        findings = []
+        for view in torch.nonzero(off)[:, 0].tolist():
+            name = search.cache.evidence.names[view]
+            found = OFF.finding((name,), float(error[view]), self.astray)
+            own = float(pixels[view])
+            findings.append(replace(found, before_px=own, after_px=own))
+        return findings
+
+    def _stature(self, search: Search) -> float:
+        """Return the stature (mm) of the person that the agreeing views show together, measured as
+        every command measures it; 0 where no views agree.
+        """
+        agrees = search.now.error < self.thresholds.level
+        if not bool(agrees.any()):
+            return 0.0
+        rays = search.cache.all(search.setup)
+        core = search.now.core[None]
+        points, known = triangulated(rays, search.setup, core, self.consensus)
+        return float(stature(points[0], known[0]))
+
+
+def pixels_of(cache: RayCache, setup: Setup, error: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
+    """Return the errors of the views, in sizes of the person, as pixels."""
+    size = cache.all(setup).size
+    typical = torch.where(size > 0, size, torch.nan).nanmedian(-1).values.nan_to_num(0.0)
+    focal = (setup.K[:, 0, 0] * setup.K[:, 1, 1]).sqrt()
+    return error * typical * focal
+
+
+def merge_steps(findings: list[Finding]) -> list[Finding]:
+    """Merge the findings of a camera that was put right in two steps of one kind.
+
+    The last word counts, and of two rotations the larger; the error before is the first one's.
+    """
+    result: list[Finding] = []
+    for found in findings:
+        earlier = [
+            number
+            for number, old in enumerate(result)
+            if (old.code, old.cameras) == (found.code, found.cameras)
+        ]
+        if not earlier or found.code not in (OUT_OF_SYNC.code, MOVED.code, LENS.code):
+            result.append(found)
+            continue
+        old = result[earlier[0]]
+        told = old if found.code == MOVED.code and old.value > found.value else found
+        result[earlier[0]] = replace(told, before_px=old.before_px, after_px=found.after_px)
+    return result
+
+
+def _undone(search: Search, candidate: Candidate, after: Agreement) -> Finding:
+    """Return the finding of a mistake that was undone, with the errors before and after."""
+    names = tuple(search.cache.evidence.names[view] for view in candidate.views)
+    views = list(candidate.views) or slice(None)
+    before = pixels_of(search.cache, search.setup, search.now.error)[views]
+    then = pixels_of(search.cache, candidate.setup, after.error)[views]
+    return replace(
+        candidate.mistake.finding(names, candidate.value),
+        before_px=float(before.mean()),
+        after_px=float(then.mean()),
+        mended=True,
+    )
+
+
+def _file_unit(setup: Setup, height: float) -> tuple[Setup, float, float | None]:
+    """Return the setup and the person's height in mm, and the file's unit where the person tells
+    it because the file does not.
+    """
+    if not height or setup.unit_mm is None:
+        return setup, height, None
+    unit = unit_of(height / setup.unit_mm)
+    if unit is None:
+        return setup, height, None
+    factor = unit / setup.unit_mm
+    return replace(setup, t=factor * setup.t, unit_mm=None), factor * height, unit
