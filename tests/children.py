@@ -107,10 +107,10 @@ class Child(Fork):
     """A fork whose standard output is a pipe, its standard error a file, its standard input empty."""
 
     def __init__(self, words: Sequence[str], env: Mapping[str, str], cwd: Path) -> None:
-        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")
+        self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 (open as long as the child)
         reading, writing = os.pipe()
-        self.stdout: IO[str] = open(reading, encoding="utf-8")
-        with open(os.devnull) as nothing:
+        self.stdout: IO[str] = open(reading, encoding="utf-8")  # noqa: SIM115
+        with open(os.devnull, "rb") as nothing:
             super().__init__(words, env, cwd, (nothing.fileno(), writing, self._errors.fileno()))
         os.close(writing)
         _CHILDREN.append(self)
@@ -158,8 +158,8 @@ def start(
 ) -> Child | subprocess.Popen[str]:
     """Start Python with these words: a script or ``-c`` and its text, and their arguments.
 
-    ``env`` is added to the environment of the tests; scripts find the modules of ``tests/``. A child
-    whose start is the point is not forked.
+    ``env`` is added to the environment of the tests; scripts find the modules of ``tests/``. A
+    child whose start is the point is not forked.
     """
     paths = [str(TESTS.parent / "src"), str(TESTS), os.environ.get("PYTHONPATH", "")]
     ours = {"PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}

@@ -24,7 +24,8 @@ from reconstructions import about, in_parts, random_reconstruction, rig
 
 LOGIC = """
 const fs = require("fs"), p = require(process.argv[2]);
-const data = p.load(/application\\/json">(.*?)<\\/script>/s.exec(fs.readFileSync(process.argv[3], "utf8"))[1]);
+const page = fs.readFileSync(process.argv[3], "utf8");
+const data = p.load(/application\\/json">(.*?)<\\/script>/s.exec(page)[1]);
 const { view } = p.overview(data, 800, 600);
 view.focal = 960;
 const frames = Float64Array.of(3, 4, 8, 9);

@@ -33,7 +33,8 @@ import mutants
 mutants.ROOT = Path({root!r})
 mutants.TESTS = {{"src/ghpt/toy.py": ["test_toy.py"]}}
 toy = (mutants.ROOT / "src/ghpt/toy.py").read_bytes()
-chosen = [mutant for mutant in mutants.mutants("src/ghpt/toy.py") if mutant.change(toy)[1] in {chosen!r}]
+every = mutants.mutants("src/ghpt/toy.py")
+chosen = [mutant for mutant in every if mutant.change(toy)[1] in {chosen!r}]
 for row in mutants.share(chosen, Path({work!r}), {same!r}):
     print(row["result"] + ": " + row["after"])
 """

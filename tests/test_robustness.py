@@ -184,20 +184,20 @@ def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
 
     found = section("robustness-outliers", errors, tmp_path, seeds=2)
     assert (
-        "At 0 % the paper's selection (20.5 mm) beats the best classical estimator, LO-RANSAC (25.0 mm) by 18.0 %"
-        in (markdown(found))
+        "At 0 % the paper's selection (20.5 mm) beats the best classical estimator, "
+        "LO-RANSAC (25.0 mm) by 18.0 %" in (markdown(found))
     )
     assert (
-        "At 40 % the paper's selection (102.5 mm) loses to the best classical estimator, LO-RANSAC (50.0 mm) by"
-        in (markdown(found))
+        "At 40 % the paper's selection (102.5 mm) loses to the best classical estimator, "
+        "LO-RANSAC (50.0 mm) by" in (markdown(found))
     )
     assert "It is ahead of all classical estimators at 0 %, of LO-RANSAC at 0 %." in markdown(found)
     assert "20.5 ± 0.7" in markdown(found)
     assert "**25.0 ± 0.0**" not in markdown(found)
     assert (
-        "Against the best classical estimator of each of 3 levels the view weights win 1, tie 0 and lose 2: "
-        "from -140.0 % (120.0 mm, LO-RANSAC 50.0) at 10 % to +4.0 % (24.0 mm, LO-RANSAC 25.0) at 0 %."
-        in markdown(found)
+        "Against the best classical estimator of each of 3 levels the view weights "
+        "win 1, tie 0 and lose 2: from -140.0 % (120.0 mm, LO-RANSAC 50.0) at 10 % "
+        "to +4.0 % (24.0 mm, LO-RANSAC 25.0) at 0 %." in markdown(found)
     )
     papers, ours = found.claims
     assert not papers.holds

@@ -1,5 +1,5 @@
-"""Tasks are computed once, in the order of their dependencies, on several processes, and kept whatever
-happens.
+"""Tasks are computed once, in the order of their dependencies, on several processes, and kept
+whatever happens.
 """
 
 import os

@@ -99,7 +99,8 @@ def payloads(sentinel: Path) -> dict[str, bytes]:
         "NEWOBJ": b"\x80\x02cnumpy\nndarray\n(K\x01t\x81.",
         "persistent id": b"P" + shell.encode() + b"\n.",
         "extension code": b"\x80\x02\x82\x01.",
-        "attributes of a stand-in": b"\x80\x02cnumpy\ndtype\nN}X\x08\x00\x00\x00__code__K\x01s\x86b.",
+        "attributes of a stand-in": b"\x80\x02cnumpy\ndtype\nN}X\x08\x00\x00\x00"
+        b"__code__K\x01s\x86b.",
         "global by memo": b"\x80\x04\x8c\x02os\x94\x8c\x06system\x94h\x00h\x01\x93"
         + text(shell)
         + b"\x85R.",

@@ -108,7 +108,8 @@ def test_c4_batch_size_threads_and_workers_do_not_matter(
                 )
             else:
                 differing += value.tobytes() != found[name].tobytes()
-    figure = f"{len(runs)} ways to batch: {differing} masks or learning-free arrays differ, learned ones by {worst:.2g} mm"
+    unlearned = f"{differing} masks or learning-free arrays differ"
+    figure = f"{len(runs)} ways to batch: {unlearned}, learned ones by {worst:.2g} mm"
     record_row("C4", figure, len(runs) if worst < 1e-2 and not differing else 0, len(runs))
     assert differing == 0
     assert worst < 1e-2  # the scorer is float32, and matrix products round by their shape

@@ -66,8 +66,9 @@ def test_our_own_key_points_never_come_back_different(record_row):
 
 @pytest.mark.parametrize("formats", [FORMATS[:4], FORMATS[4:]], ids="-".join)
 def test_a_file_that_ends_early_is_named(formats, record_row):
-    """Cut at bytes all over the file, every one at night. Tables and texts that end between two lines are shorter recordings or rigs
-    without poses; nothing that is read is any other than in the whole file.
+    """Cut at bytes all over the file, every one at night. Tables and texts that end between two
+    lines are shorter recordings or rigs without poses; nothing that is read is any other than in
+    the whole file.
     """
     found = measured("A3", formats, sizes.CUT_FILES, 0)
     for name, form in found.items():

@@ -96,5 +96,6 @@ def test_b3_killed_predictions_end_in_the_same_bytes(tmp_path, record_row, monke
     assert digests(output) == expected
     assert redone <= 1
     assert not list(output.rglob("*.tmp"))
-    figure = f"{kills} kills, {rounds} of them past the last shard, at most {redone} shard unlisted; bytes equal"
+    late = f"{rounds} of them past the last shard"
+    figure = f"{kills} kills, {late}, at most {redone} shard unlisted; bytes equal"
     record_row("B3", figure, kills, kills)

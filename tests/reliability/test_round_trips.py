@@ -53,7 +53,10 @@ def opensim_table(path):
         return found[:-1] if found[-1] == "" else found  # nothing after the last tab is no cell
 
     assert lines[0].split("\t")[:3] == ["PathFileType", "4", "(X/Y/Z)"]
-    keys = "DataRate CameraRate NumFrames NumMarkers Units OrigDataRate OrigDataStartFrame OrigNumFrames"
+    keys = (
+        "DataRate CameraRate NumFrames NumMarkers Units"
+        " OrigDataRate OrigDataStartFrame OrigNumFrames"
+    )
     assert lines[1].split("\t") == keys.split()
     header = dict(zip(keys.split(), lines[2].split("\t"), strict=True))
     markers = int(header["NumMarkers"])

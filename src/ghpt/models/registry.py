@@ -22,7 +22,7 @@ from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.models.problem import Problem
 from ghpt.models.relative_pose.problem import RelativePose
-from ghpt.models.relative_pose.scale import BodyHeight, KnownScale, Scale, BoneLengths
+from ghpt.models.relative_pose.scale import BodyHeight, BoneLengths, KnownScale, Scale
 from ghpt.models.scorer import Scorer
 
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*", re.ASCII)
