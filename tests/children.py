@@ -104,7 +104,8 @@ class Fork:
 
 
 class Child(Fork):
-    """A fork whose standard output is a pipe, its standard error a file, its standard input empty."""
+    """A fork whose standard output is a pipe, its standard error a file, its standard input
+    empty."""
 
     def __init__(self, words: Sequence[str], env: Mapping[str, str], cwd: Path) -> None:
         self._errors = tempfile.TemporaryFile("w+", encoding="utf-8")  # noqa: SIM115 (open as long as the child)

@@ -146,7 +146,8 @@ def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def typed(
     monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> Callable[..., tuple[int, str, str]]:
-    """``typed(conf, command, words)`` runs train.py in this process: (exit status, stdout, stderr)."""
+    """``typed(conf, command, words)`` runs train.py in this process: (exit status, stdout,
+    stderr)."""
     handlers, level = list(logging.root.handlers), logging.root.level
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
 

@@ -1,4 +1,5 @@
-"""A synthetic recording of any length, and predict.py's configuration, for the tests of prediction."""
+"""A synthetic recording of any length, and predict.py's configuration, for the tests of
+prediction."""
 
 from __future__ import annotations
 
@@ -95,7 +96,8 @@ def cameras_file(folder: Path) -> Path:
 
 
 def openpose_folders(folder: Path, frames: list[int], cameras: Cameras | None = None) -> Path:
-    """A JSON file for each camera and frame number: the walk's pose of that number, seen exactly."""
+    """A JSON file for each camera and frame number: the walk's pose of that number, seen
+    exactly."""
     pixels = project(cameras or human36m_rig("S9").cameras, walk())[0]
     for view in range(pixels.shape[1]):
         (folder / f"cam{view}_json").mkdir(parents=True)

@@ -104,7 +104,8 @@ def write_pickle(path: Path, content: object, protocol: int = 4) -> None:
 def write_human36m_layout(
     root: Path, takes: Sequence[tuple[str, str, np.ndarray]], chunk: int
 ) -> None:
-    """Labels, and perfect detections in pixels of a 384-high crop, in chunks of ``chunk`` frames."""
+    """Labels, and perfect detections in pixels of a 384-high crop, in chunks of ``chunk``
+    frames."""
     root.mkdir(parents=True, exist_ok=True)
     write_pickle(root / LABELS_FILE, human36m_labels(takes))
     for subject in {subject for subject, *_ in takes}:

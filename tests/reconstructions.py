@@ -22,7 +22,8 @@ def about(joints=JOINTS, cameras=("cam_1", "cam_2", "cam_3"), rate_hz=29.97):
 
 
 def random_reconstruction(frames, joints=17, views=3, seed=0, missing=0.3, first=0):
-    """``missing`` of the joints in a missing state, others observed or filled; all numbers finite."""
+    """``missing`` of the joints in a missing state, others observed or filled; all numbers
+    finite."""
     g = torch.Generator().manual_seed(seed)
     state = torch.randint(2, max(State) + 1, (frames, joints), generator=g, dtype=torch.int8)
     there = torch.rand(frames, joints, generator=g) >= missing

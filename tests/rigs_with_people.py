@@ -68,7 +68,8 @@ def _walk(frames: int, seed: int) -> np.ndarray:
 
 
 def people(rig: str = "h36m", frames: int = 80, noise: float = 0.01, seed: int = 0) -> Detections:
-    """``noise``: standard deviation of a pixel coordinate in persons' sizes; ``rig``: h36m or cmu3."""
+    """``noise``: standard deviation of a pixel coordinate in persons' sizes; ``rig``: h36m or
+    cmu3."""
     found: CameraSet = human36m_rig("S8") if rig == "h36m" else panoptic_rig((10, 12, 16, 18))
     points = torch.from_numpy(_walk(frames, seed))
     if rig != "h36m":  # Panoptic's y points down

@@ -96,7 +96,8 @@ def person_of(people: Detections, cameras: CameraSet, at, person: int = 0) -> np
 
 @pytest.mark.parametrize(("views", "seed"), [(4, 1), (4, 2), (3, 1)])
 def test_each_of_two_people_is_followed_in_all_views(views, seed, detector):
-    """In more than 99 % of the frames in which two views see them, and never mixed with the other."""
+    """In more than 99 % of the frames in which two views see them, and never mixed with the
+    other."""
     rig = rig_of(views)
     people, owner = scene(detector, rig, seed)
     assert ((people.counts() > 1).sum(1) >= 2).mean() > 0.5

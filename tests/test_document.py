@@ -1,4 +1,5 @@
-"""A document shows a name as it is, whatever it is made of: as Markdown, HTML and in the terminal."""
+"""A document shows a name as it is, whatever it is made of: as Markdown, HTML and in the
+terminal."""
 
 import io
 from html.parser import HTMLParser

@@ -211,7 +211,8 @@ def test_zeros_inside_a_number_stay():
 
 
 def test_the_lens_is_undone_before_means_are_taken():
-    """A body of 17 exact points through a strong lens: thorax is the mean of the ideal shoulders."""
+    """A body of 17 exact points through a strong lens: thorax is the mean of the ideal
+    shoulders."""
     scene = random_scene(4, frames=1, views=2)
     cameras = camera_file(["a", "b"], lens=-0.2)
     cameras = replace(cameras, K=scene.cameras.K[0])

@@ -71,7 +71,8 @@ def movement_s(read):
 
 
 def test_what_movement_reads_is_taken_by_name(tmp_path, monkeypatch):
-    """Two individuals, one of whom is not there in a frame; scores that are not there count as 1."""
+    """Two individuals, one of whom is not there in a frame; scores that are not there count as
+    1."""
     position = np.stack([POINTS, POINTS + 600], axis=-1).transpose(0, 2, 1, 3).copy()
     position[3, :, :, 1] = np.nan
     confidence = np.full(position[:, 0].shape, 0.7)

@@ -1,4 +1,5 @@
-"""Perturbations: what they change is what was asked, nothing else, and the same for whoever looks."""
+"""Perturbations: what they change is what was asked, nothing else, and the same for whoever
+looks."""
 
 from dataclasses import fields, replace
 

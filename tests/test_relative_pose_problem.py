@@ -24,7 +24,8 @@ FRAMES = 20
 
 
 def batch_of(seeds: list[int], noise: float = 0.0, views: int = 3) -> Labelled:
-    """For each seed a rig before which 20 people stand; pairs (0, 1), (0, 2), (1, 2), ... in turn."""
+    """For each seed a rig before which 20 people stand; pairs (0, 1), (0, 2), (1, 2), ... in
+    turn."""
     rng = np.random.default_rng(seeds)
     K, R, t, key_points, points = [], [], [], [], []
     for seed in seeds:

@@ -26,7 +26,8 @@ def ones(scene):
 
 
 def least_squares(cameras, key_points, weights):
-    """The reference: one numpy least-squares problem for each joint, from 3x4 projection matrices."""
+    """The reference: one numpy least-squares problem for each joint, from 3x4 projection
+    matrices."""
     K, R, t, x, w = (a.numpy() for a in (cameras.K, cameras.R, cameras.t, key_points, weights))
     points = np.zeros((x.shape[0], x.shape[2], 3))
     for b, j in np.ndindex(points.shape[:2]):

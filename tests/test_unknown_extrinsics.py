@@ -26,7 +26,8 @@ TRUTH = human36m_rig("S9").cameras
 
 
 def wrong() -> tuple[torch.Tensor, torch.Tensor]:
-    """True relative poses turned by some degrees and moved by some centimetres, but for the first."""
+    """True relative poses turned by some degrees and moved by some centimetres, but for the
+    first."""
     R, t = relative_poses(TRUTH)
     turn = torch.from_numpy(
         Rotation.from_euler("xyz", [[0, 0, 0], [3, 0, 1], [0, 2, 0], [1, 1, 1]], True).as_matrix()

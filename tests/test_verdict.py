@@ -66,7 +66,8 @@ def points_file(path: Path, values: np.ndarray, joints: list[int] | None = None)
 
 
 def rig_file(path: Path, unit_mm: float, write=write_aniposelib) -> Path:
-    """The rig with a translation in this unit, in a format whose writer takes mm and writes metres."""
+    """The rig with a translation in this unit, in a format whose writer takes mm and writes
+    metres."""
     cameras = Cameras(RIG.cameras.K, RIG.cameras.R, RIG.cameras.t * 1000 / unit_mm)
     write(path, CameraSet.from_cameras(NAMES, cameras, 0 * RIG.distortion, RIG.size), {})
     if write is write_aniposelib:  # which writes no such line itself, and says no unit

@@ -1,4 +1,5 @@
-"""A small data set of random people seen by a random rig, for tests of everything above the data."""
+"""A small data set of random people seen by a random rig, for tests of everything above the
+data."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import fields

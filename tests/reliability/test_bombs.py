@@ -85,7 +85,8 @@ def archive(path: Path, name: str, packed: bytes, size: int, members: int = 1) -
 
 
 def zeros(mebibytes: int) -> bytes:
-    """So many MiB of zeros, packed, after an npy header of 4-dimensional key points that they fill."""
+    """So many MiB of zeros, packed, after an npy header of 4-dimensional key points that they
+    fill."""
     frames = (mebibytes << 20) // (2 * 17 * 2 * 8)
     header = npy_header((frames, 2, 17, 2))
     packer = zlib.compressobj(9, zlib.DEFLATED, -15)

@@ -1,4 +1,5 @@
-"""C1 and C4: the same command gives the same bytes; a frame's result does not depend on its batch."""
+"""C1 and C4: the same command gives the same bytes; a frame's result does not depend on its
+batch."""
 
 import copy
 import json

@@ -1,4 +1,5 @@
-"""C2 and C3: one process and several give the same numbers, with missing joints and uneven shares."""
+"""C2 and C3: one process and several give the same numbers, with missing joints and uneven
+shares."""
 
 import json
 from pathlib import Path
