@@ -1,7 +1,8 @@
 """The camera check's confusion table: how good rigs were spoilt, and what was said of them.
 
-``python scripts/camera_check_table.py`` takes the synthetic recordings; ``--real FOLDER`` adds Pose2Sim's
-example and caliscope's recording from a folder with ``pose2sim_single`` and ``caliscope``.
+``python scripts/camera_check_table.py`` takes the synthetic recordings; ``--real FOLDER`` adds
+Pose2Sim's example and caliscope's recording from a folder with ``pose2sim_single`` and
+``caliscope``.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ from ghpt.commands.cameras import own_subject
 from ghpt.commands.predict import predict
 from ghpt.config import build
 from ghpt.data.formats.camera_writers import write_pose2sim
-from ghpt.geometry.cameras import CameraSet, Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.skeleton import MIRROR
 from predicting import config
