@@ -27,7 +27,8 @@ from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.people.persons import person_sequence
-from ghpt.report.tables import markdown
+from ghpt.report.document import Document, Table
+from ghpt.report.markdown import render_markdown
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -147,7 +148,7 @@ def print_table(table: dict[str, Counter]) -> None:
         ]
         for kind, row in table.items()
     ]
-    print(markdown(["broken", "to be said", "said, times"], rows))
+    print(render_markdown(Document("", [Table(["broken", "to be said", "said, times"], rows)])))
 
 
 if __name__ == "__main__":

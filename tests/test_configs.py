@@ -64,7 +64,7 @@ def test_the_camera_problem_builds_on_every_arrangement(data):
     served = build(config["data"], "data")
     problem = build(config["model"], "model").problem
     served.bind(problem)
-    assert served.pairs == problem.pairs
+    assert served.draw == problem.dataset
     assert problem.feature_size == config["model"]["problem"]["features"]
 
 

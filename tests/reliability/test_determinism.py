@@ -2,6 +2,7 @@
 
 import copy
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -9,11 +10,16 @@ import pytest
 import torch
 
 import children
+import sizes
 import toys
 from ghpt.models.checkpoint import read_checkpoint
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+import run_toy
+
 from toys import train
 
-SCRIPT = Path(__file__).with_name("run_toy.py")
 BASELINES = {
     "linear": {"_target_": "ghpt.models.estimators.classical.Linear"},
     "ransac": {
@@ -30,17 +36,25 @@ def arrays(folder):
         return {name: file[name] for name in file.files if name != "meta"}
 
 
-def test_c1_the_same_command_twice(tmp_path, record_row):
-    """Other processes, working folders, caches and hash seeds, one of them forked."""
-    results = []
-    for number, is_forked in enumerate((True, False)):
-        folder, cwd = tmp_path / f"run{number}", tmp_path / f"cwd{number}"
-        cwd.mkdir()
-        environment = {"PYTHONHASHSEED": "12345", "GHPT_CACHE": str(tmp_path / f"cache{number}")}
-        words = (SCRIPT, folder, json.dumps({"test": True}))
-        children.output_of(*words, env=environment, cwd=cwd, is_forked=is_forked)
-        results.append((read_checkpoint(folder / "last.ckpt")["state_dict"], arrays(folder)))
-    (weights, first), (again, second) = results
+@pytest.fixture(scope="module")
+def here(tmp_path_factory):
+    """The folder of a training and its test in this process."""
+    folder = tmp_path_factory.mktemp("here")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("GHPT_CACHE", str(folder / "cache"))
+        run_toy.main(str(folder / "run"), json.dumps({"test": True}))
+    return folder / "run"
+
+
+@pytest.mark.parametrize("is_forked", [True] if not sizes.NIGHTLY else [True, False])
+def test_c1_the_same_command_twice(tmp_path, here, record_row, is_forked):
+    """In another process, working folder and cache, with another hash seed."""
+    folder = tmp_path / "run"
+    environment = {"GHPT_CACHE": str(tmp_path / "cache"), "PYTHONHASHSEED": "12345"}
+    words = (run_toy.__file__, folder, json.dumps({"test": True}))
+    children.output_of(*words, env=environment, cwd=tmp_path, is_forked=is_forked)
+    weights, again = (read_checkpoint(f / "last.ckpt")["state_dict"] for f in (here, folder))
+    first, second = arrays(here), arrays(folder)
     same = sum(torch.equal(v, again[k]) for k, v in weights.items())
     same += sum(v.tobytes() == second[k].tobytes() for k, v in first.items())
     total = len(weights) + len(first)

@@ -120,7 +120,7 @@ def awaited(ended: list[Job[Any, Any]]) -> Iterator[None]:
         return submitted
 
     # Hydra's launcher makes the executor itself: its class is the only place to get in between.
-    submitit.AutoExecutor.map_array = map_array  # type: ignore[method-assign,assignment]  # see above
+    submitit.AutoExecutor.map_array = map_array  # type: ignore[method-assign,assignment]  # above
     try:
         yield
     except (FailedJobError, ValueError) as error:  # sbatch refuses, or the executor

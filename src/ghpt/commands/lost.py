@@ -122,4 +122,4 @@ def _say_and_end(observer: Any) -> None:
 
 
 # Lightning makes the observer itself, so its class is the only place to get in between.
-_ChildProcessObserver._terminate_all = _say_and_end  # type: ignore[method-assign,assignment]
+_ChildProcessObserver._terminate_all = _say_and_end  # type: ignore[method-assign,assignment]  # above

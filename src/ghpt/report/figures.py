@@ -90,7 +90,7 @@ def skeletons(
     _draw_scale(panels[0], low)
     handles = _side_handles(with_truth=bool(poses))
     figure.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False)
-    figure.suptitle(wrapped(heading, 55 * len(drawn) // 2), fontsize=10)
+    figure.suptitle(wrap_lines(heading, 55 * len(drawn) // 2), fontsize=10)
     return figure
 
 
@@ -133,7 +133,7 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
     axes.set_xticks(range(len(PARTS)), [part.replace("_", " ") for part in PARTS])
     axes.set_ylabel("S²: variance of left / right length")
     heading = f"Pose prior of {subject} (lower is better)\n{title(metrics)}"
-    axes.set_title(wrapped(heading, 110), fontsize=10)
+    axes.set_title(wrap_lines(heading, 110), fontsize=10)
     axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -157,7 +157,7 @@ def up_axis(truth: Float[np.ndarray, "N 17 3"]) -> Float[np.ndarray, 3]:
     return np.sign(mean[axis]) * np.eye(3)[axis]
 
 
-def wrapped(text: str, width: int) -> str:
+def wrap_lines(text: str, width: int) -> str:
     """Return the text in lines of at most ``width`` letters: paths in a title may be long."""
     return "\n".join(textwrap.fill(line, width) for line in text.splitlines())
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.evaluation import camera_after
 from ghpt.observations import RelativePoseEstimate
-from ghpt.report.figures import TRUTH, LineStyle, wrapped
+from ghpt.report.figures import TRUTH, LineStyle, wrap_lines
 from ghpt.report.pair_tables import NAMES
 
 
@@ -110,7 +110,7 @@ def rig_figure(
     handles = [Line2D([], [], color=TRUTH, linewidth=4.5, label="true cameras")]
     handles += [_handle(name, own, enlargement) for name, own in offsets.items()]
     figure.legend(handles=handles, loc="outside lower center", ncols=1, frameon=False, fontsize=9)
-    figure.suptitle(wrapped(heading, 110), fontsize=10)
+    figure.suptitle(wrap_lines(heading, 110), fontsize=10)
     return figure
 
 

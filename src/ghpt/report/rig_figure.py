@@ -17,7 +17,7 @@ from matplotlib.patches import Ellipse
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
-from ghpt.report.figures import MIDDLE, wrapped
+from ghpt.report.figures import MIDDLE, wrap_lines
 from ghpt.report.rig_comparison import Similarity
 from ghpt.skeleton import BONES
 
@@ -88,7 +88,7 @@ def rig_figure(
         _lay_out(axes, view, plane)
     handles = _legend(magnification, None if other is None else reference_name)
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    figure.suptitle(wrapped(heading, 110), fontsize=10, parse_math=False)
+    figure.suptitle(wrap_lines(heading, 110), fontsize=10, parse_math=False)
     return figure
 
 

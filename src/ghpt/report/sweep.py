@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ghpt.report.document import Table
-from ghpt.report.figures import wrapped
+from ghpt.report.figures import wrap_lines
 from ghpt.report.pair_figures import METHOD_STYLES, OTHER_STYLE
 from ghpt.report.pair_tables import NAMES
 from ghpt.report.tables import NONE
@@ -69,7 +69,7 @@ def frames_sweep(sweep: Sweep, heading: str) -> Figure:
     axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.set_title(wrapped(heading, 75), fontsize=10)
+    axes.set_title(wrap_lines(heading, 75), fontsize=10)
     figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     return figure
 

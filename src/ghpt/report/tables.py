@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 from ghpt.metrics.pose_prior import PARTS
@@ -19,7 +19,6 @@ from ghpt.report.document import (
     Table,
     Text,
 )
-from ghpt.report.markdown import render_markdown
 
 NAMES = {
     "h36m": "Human3.6M",
@@ -244,8 +243,3 @@ def _mm(value: float | None) -> str:
 
 def _percent(value: float | None) -> str:
     return NONE if value is None else f"{100 * value:.2f} %"
-
-
-def markdown(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """Return a table as Markdown."""
-    return render_markdown(Document("", [Table(header, list(rows))])).rstrip()

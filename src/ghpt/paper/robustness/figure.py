@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, NullLocator, ScalarFormatter
 
 from ghpt.paper.engine.artefact import Number, Spread
-from ghpt.report.figures import wrapped
+from ghpt.report.figures import wrap_lines
 from ghpt.report.tables import NAMES
 
 # Okabe and Ito's palette, and Tol's wine; told apart in grey print by dashes and markers.
@@ -88,7 +88,7 @@ def draw_curves(
     axes[0].set_ylabel(y)
     _scale_errors(axes[0], panels)
     _draw_legend(figure, axes)
-    figure.suptitle(wrapped(heading, 70 if single else 80), fontsize=10)
+    figure.suptitle(wrap_lines(heading, 70 if single else 80), fontsize=10)
     return figure
 
 
