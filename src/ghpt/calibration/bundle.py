@@ -5,6 +5,7 @@ afterwards.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -67,13 +68,12 @@ class BundleAdjustment:
             and final.in_front
             and final.gain <= self.tolerance * max(final.cost, 1e-12 * int(used.sum()))
         )
-        # Ceres counts the start as a successful step
-        steps = (
-            0
-            if report is None
-            else max(report.num_successful_steps + report.num_unsuccessful_steps - 1, 0)
-        )
-        seconds = 0.0 if report is None else report.total_time_in_seconds
+        steps = 0
+        seconds = 0.0
+        if report is not None:
+            tried = report.num_successful_steps + report.num_unsuccessful_steps
+            steps = max(tried - 1, 0)  # Ceres counts the start as a successful step
+            seconds = report.total_time_in_seconds
         return Adjusted(solved, start.cost, final, steps, seconds, bool(converged))
 
     def state(self, observed: Correspondences, rig: PlacedRig) -> Linearised:
@@ -82,7 +82,10 @@ class BundleAdjustment:
 
     def _solve(
         self, observed: Correspondences, rig: PlacedRig, used: Bool[Tensor, "V N"]
-    ) -> tuple[PlacedRig, object | None]:
+    ) -> tuple[PlacedRig, Any]:
+        """Return the adjusted rig and Ceres' summary, which pycolmap does not type; None where
+        nothing can be adjusted.
+        """
         views = torch.nonzero(rig.placed & used.any(1))[:, 0].tolist()
         chosen = np.flatnonzero(used.any(0).numpy())
         if len(views) < 2 or not len(chosen):
@@ -104,12 +107,14 @@ class BundleAdjustment:
             ]
             ids.append(model.add_point3D(point, pycolmap.Track(track)))
         config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        report = pycolmap.create_default_bundle_adjuster(self._options(), config, model).solve()
+        report: Any = pycolmap.create_default_bundle_adjuster(
+            self._options(), config, model
+        ).solve()
         R = rig.R.clone()
         t = rig.t.clone()
         points = rig.points.clone()
         for v in views:
-            pose = model.frame(v + 1).rig_from_world
+            pose: Any = model.frame(v + 1).rig_from_world
             R[v] = torch.from_numpy(pose.rotation.matrix().copy())
             t[v] = torch.from_numpy(np.array(pose.translation))
         points[chosen] = torch.from_numpy(np.stack([model.point3D(i).xyz for i in ids]))
@@ -157,7 +162,7 @@ def _add_view(
     """
     body = pycolmap.Rig(rig_id=view + 1)
     frame = pycolmap.Frame(frame_id=view + 1, rig_id=view + 1)
-    images = []
+    images: list[pycolmap.Image] = []
     for j in np.unique(joint).tolist():
         own = chosen[joint == j]
         focal = 1 / float(observed.noise[view, own[0]])

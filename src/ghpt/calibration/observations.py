@@ -73,7 +73,7 @@ def usable(
 def typical_size(
     key_points: Float[Tensor, "T V J 2"], valid: Bool[Tensor, "T V J"]
 ) -> Float[Tensor, " V"]:
-    """Median over the frames of the person's size in each view, pixels; NaN where nobody is seen."""
+    """Return the person's median size in each view, pixels; NaN where nobody is seen."""
     size = person_scale(key_points, valid)
     missing = torch.full_like(size[:0].sum(0), torch.nan)
     return torch.where(size > 0, size, torch.nan).nanmedian(0).values if len(size) else missing

@@ -31,8 +31,7 @@ class PlacedRig:
     placed: Bool[Tensor, " V"]
     points: Float[Tensor, "N 3"]
     inlier: Bool[Tensor, "V N"]
-    """Correspondences in placed views that agree with their point; a point has none or at least two.
-    """
+    """What agrees with its point in placed views; a point has none of it, or two or more."""
 
     @property
     def centre(self) -> Float[Tensor, "V 3"]:
@@ -106,7 +105,7 @@ class Resection:
         return None
 
     def supported(self, rig: PlacedRig) -> PlacedRig:
-        """The rig without the views that fewer than ``least`` inliers hold; a pair at least stays."""
+        """Return the rig without the views that fewer than ``least`` inliers hold, or a pair."""
         held = rig.placed & (rig.inlier.sum(1) >= self.least)
         return (
             replace(rig, placed=held, inlier=rig.inlier & held[:, None]) if held.sum() >= 2 else rig
@@ -140,10 +139,11 @@ class Resection:
         """All points anew from the placed views: of each, the pair of views with which most others
         agree, and its inliers together.
         """
-        of = Correspondences(
-            *(getattr(observed, f)[rig.placed] for f in ("xy", "noise", "valid")),
-            observed.frame,
-            observed.joint,
+        of = replace(
+            observed,
+            xy=observed.xy[rig.placed],
+            noise=observed.noise[rig.placed],
+            valid=observed.valid[rig.placed],
         )
         R = rig.R[rig.placed]
         t = rig.t[rig.placed]

@@ -1,4 +1,4 @@
-"""Covariance of a rig's extrinsics from its normal matrix and the scatter of the frames' gradients."""
+"""Covariance of a rig's extrinsics: its normal matrix and the scatter of the frames' gradients."""
 
 from __future__ import annotations
 

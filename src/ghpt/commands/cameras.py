@@ -7,6 +7,7 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -30,7 +31,6 @@ from ghpt.commands.inputs import (
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.config import Target, build, suggest
-from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError, check
@@ -161,7 +161,7 @@ def demonstration(settings: CamerasSettings, camera_check: CameraCheck) -> Subje
 
 
 def synthetic_evidence(
-    recording: Recording, data: KeyPointDataModule, camera_check: CameraCheck, frames: int
+    recording: Recording, data: Any, camera_check: CameraCheck, frames: int
 ) -> tuple[Evidence, CameraSet]:
     """Return the middle ``frames`` frames of a synthetic recording, as its rig's lenses show them,
     and the rig.

@@ -77,7 +77,7 @@ def write_rig(output: Path, cameras: CameraSet, result: CalibrationResult) -> No
     files, which must have one, it is twice the principal point, and the metadata say so.
     """
     errors = [camera.reprojection_px or 0.0 for camera in result.cameras]
-    metadata = {
+    metadata: dict[str, str | float | bool] = {
         "adjusted": False,
         "error": max(errors),
         "data": result.data,
