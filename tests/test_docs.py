@@ -161,6 +161,7 @@ SHELL = {
     (".", ".venv/bin/activate"): lambda command: None,
     ("pip",): check_pip,
     ("ruff",): check_program,
+    ("mypy",): check_program,
     ("pytest",): check_program,
     ("mkdocs", "serve"): check_program,
     ("tensorboard",): check_tensorboard,

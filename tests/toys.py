@@ -99,7 +99,7 @@ def run_test(config: Mapping[str, Any], output: Path) -> Any:
 
 
 class ToyData(KeyPointDataModule):
-    """Random bodies around the origin; key points with noise of 5 px, ``missing`` of them unseen."""
+    """Random bodies around the origin; key points with noise of 5 px, some of them missing."""
 
     def __init__(self, views: int, missing: float, **settings: Any) -> None:
         super().__init__(**settings)

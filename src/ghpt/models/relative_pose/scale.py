@@ -143,7 +143,8 @@ class KnownScale(Scale):
 
 
 class BodyScale(Scale):
-    """The person triangulated by the pair, against lengths (mm, in the order of BONES; 0: unknown)."""
+    """The person triangulated by the pair, against lengths (mm, in the order of BONES; 0:
+    unknown)."""
 
     lengths: tuple[float, ...]
 
@@ -213,7 +214,8 @@ class BodyHeight(BodyScale):
 
 
 class BoneLengths(BodyScale):
-    """Measured lengths (mm) by name: ``BONE_NAMES``, or without the side for both (``thigh: 430``)."""
+    """Measured lengths (mm) by name: ``BONE_NAMES``, or without the side for both (``thigh:
+    430``)."""
 
     def __init__(self, lengths: Mapping[str, float]) -> None:
         hint = f"Choose from {', '.join(BONE_NAMES)}, or leave out right_ or left_ for both."
