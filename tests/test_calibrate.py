@@ -14,6 +14,7 @@ import pytest
 import torch
 
 from composed import cameras_settings
+from ghpt.calibration.comparison import rig_difference
 from ghpt.calibration.findings import Severity
 from ghpt.commands.calibrate import COMMAND, people_findings
 from ghpt.commands.cameras import check_cameras
@@ -23,7 +24,6 @@ from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import project
 from ghpt.geometry.lens import distort
-from ghpt.report.rig_comparison import rig_difference
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import config, numbers_of
 from single_person import SinglePerson, write_person

@@ -9,10 +9,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from ghpt.geometry.cameras import Cameras, project
-from ghpt.models.estimators.classical import Linear
-from ghpt.observations import LabelledRecording
-from ghpt.report.rig_comparison import (
+from ghpt.calibration.comparison import (
     Similarity,
     align,
     bone_variation,
@@ -21,6 +18,9 @@ from ghpt.report.rig_comparison import (
     triangulate_recording,
     upright,
 )
+from ghpt.geometry.cameras import Cameras, project
+from ghpt.models.estimators.classical import Linear
+from ghpt.observations import LabelledRecording
 from ghpt.skeleton import BONES, JOINT, JOINTS
 from scenes import random_scene
 from toys import recording

@@ -8,6 +8,7 @@ import torch
 from markdown_it import MarkdownIt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
+from ghpt.calibration.comparison import BoneVariation, Quantiles, Similarity, ViewErrors
 from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.millimetres import RigScale
 from ghpt.commands.prediction.report import (
@@ -39,7 +40,6 @@ from ghpt.report.camera_check import (
     camera_check_summary,
 )
 from ghpt.report.markdown import render_markdown
-from ghpt.report.rig_comparison import BoneVariation, Quantiles, Similarity, ViewErrors
 from ghpt.report.rig_figure import DrawnRig, rig_figure
 from ghpt.report.terminal import print_document
 

@@ -14,6 +14,14 @@ from torch import Tensor
 from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.calibration.check.evidence import gather
 from ghpt.calibration.check.setup import setup_of
+from ghpt.calibration.comparison import (
+    Similarity,
+    align,
+    explain,
+    rig_difference,
+    triangulate_recording,
+    upright,
+)
 from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.millimetres import (
     RigScale,
@@ -48,14 +56,6 @@ from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.observations import Recording
 from ghpt.provenance import provenance
 from ghpt.report.calibration import CalibrationResult, Differences, calibration_summary
-from ghpt.report.rig_comparison import (
-    Similarity,
-    align,
-    explain,
-    rig_difference,
-    triangulate_recording,
-    upright,
-)
 from ghpt.report.rig_figure import DrawnRig
 from ghpt.report.rig_files import (
     RIG_FILES,

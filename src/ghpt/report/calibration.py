@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from ghpt.calibration.comparison import Explanation, Quantiles
 from ghpt.calibration.findings import Finding
 from ghpt.calibration.millimetres import RigScale
 from ghpt.models.relative_pose.scale import BONE_NAMES
@@ -20,7 +21,6 @@ from ghpt.report.document import (
     prose,
 )
 from ghpt.report.findings import finding_bullets, finding_paragraphs
-from ghpt.report.rig_comparison import Explanation, Quantiles
 from ghpt.report.tables import NONE
 
 Matrix = list[list[float]]

@@ -16,9 +16,9 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from torch import Tensor
 
+from ghpt.calibration.comparison import Similarity
 from ghpt.geometry.cameras import Cameras
 from ghpt.report.figures import MIDDLE, wrap_lines
-from ghpt.report.rig_comparison import Similarity
 from ghpt.skeleton import BONES
 
 ESTIMATED = "#0072B2"

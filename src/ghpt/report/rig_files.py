@@ -14,6 +14,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from torch import Tensor
 
+from ghpt.calibration.comparison import Similarity, align_robustly, upright
 from ghpt.calibration.rig import RigEstimate
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.files import atomic_write, finite, remove, write_json
@@ -25,7 +26,6 @@ from ghpt.report.calibration import (
     calibration_document,
 )
 from ghpt.report.markdown import write_markdown
-from ghpt.report.rig_comparison import Similarity, align_robustly, upright
 from ghpt.report.rig_figure import DrawnRig, rig_figure
 from ghpt.skeleton import JOINTS
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from ghpt.calibration.comparison import Quantiles
 from ghpt.commands.prediction.result import PredictionResult
 from ghpt.commands.prediction.statistics import EstimatorErrors
 from ghpt.commands.prediction.verdict import verdict_lines
@@ -21,7 +22,6 @@ from ghpt.report.document import (
     Text,
     prose,
 )
-from ghpt.report.rig_comparison import Quantiles
 from ghpt.report.tables import NAMES, NONE
 
 

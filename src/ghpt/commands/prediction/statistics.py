@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from ghpt.calibration.comparison import BoneVariation, ViewErrors, bone_variations, view_errors
 from ghpt.data.people.sequence import Sequence
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import person_scale
@@ -20,7 +21,6 @@ from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, stature
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import FILE_STATES, Reconstruction, State
-from ghpt.report.rig_comparison import BoneVariation, ViewErrors, bone_variations, view_errors
 
 Estimate = Callable[[Observations], PoseEstimate]
 _LEAST = 20

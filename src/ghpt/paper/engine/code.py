@@ -16,6 +16,8 @@ from pathlib import Path
 from typing import Any
 
 PACKAGE = "ghpt"
+PRESENTATION = "ghpt.report"
+"""The package that shows numbers and decides none: it is not followed."""
 LIBRARIES = ("torch", "numpy", "lightning")
 """Libraries that count with their versions."""
 
@@ -55,7 +57,7 @@ def import_closure(names: Iterable[str]) -> dict[str, Path]:
     waiting = first
     while waiting:
         name = waiting.pop()
-        if name.partition(".")[0] not in packages:
+        if name.partition(".")[0] not in packages or f"{name}.".startswith(f"{PRESENTATION}."):
             continue
         for module in _prefixes(name):
             file = source_file(module)
