@@ -29,9 +29,9 @@ class Finding:
     """What is wrong and what to do, as a sentence without its full stop."""
     cameras: tuple[str, ...] = ()
     """The cameras it is about; empty where it is about all of them, or about the recording."""
-    value: float = 0.0
+    value: int | float = 0.0
     """The number that shows it; 0 where there is none."""
-    limit: float = 0.0
+    limit: int | float = 0.0
     """The number that ``value`` is compared with; 0 where there is none."""
     before_px: float = 0.0
     """The held-out error of the cameras as the files have them, median, pixels; 0: not measured."""

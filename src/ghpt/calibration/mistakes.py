@@ -66,7 +66,9 @@ class Mistake:
     fitted: bool = False
     """Whether undoing it fits a number to the key points, rather than choosing one of a few."""
 
-    def describe(self, cameras: tuple[str, ...] = (), value: float = 0.0, **words: object) -> str:
+    def describe(
+        self, cameras: tuple[str, ...] = (), value: int | float = 0.0, **words: object
+    ) -> str:
         """Return the sentence on these cameras, without its full stop."""
         names = {
             "camera": cameras[0] if cameras else _ALL,
@@ -82,8 +84,8 @@ class Mistake:
     def finding(
         self,
         cameras: tuple[str, ...] = (),
-        value: float = 0.0,
-        limit: float = 0.0,
+        value: int | float = 0.0,
+        limit: int | float = 0.0,
         severity: Severity | None = None,
         **words: object,
     ) -> Finding:
@@ -100,7 +102,7 @@ class Candidate:
     views: tuple[int, ...]
     """The views whose mistake it is; empty where it is that of all."""
     setup: Setup
-    value: float
+    value: int | float
     """The mistake's own number: frames, a ratio, k1, degrees; 0 where it has none."""
 
 
@@ -176,7 +178,7 @@ def size_finding(height: float) -> Finding | None:
 
 
 def _undo_poses(change: PoseUndo) -> Undo:
-    def undo(setup: Setup, views: tuple[int, ...], value: float) -> Setup:
+    def undo(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
         at = list(views)
         R = setup.R.clone()
         t = setup.t.clone()
@@ -212,19 +214,19 @@ def invert_and_flip_axes(R: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
     return flip_axes(*invert(R, t))
 
 
-def _scale_translation(setup: Setup, views: tuple[int, ...], value: float) -> Setup:
+def _scale_translation(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     t = setup.t.clone()
     t[list(views)] *= value
     return replace(setup, t=t)
 
 
-def _scale_intrinsics(setup: Setup, views: tuple[int, ...], value: float) -> Setup:
+def _scale_intrinsics(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     K = setup.K.clone()
     K[list(views), :2] *= value
     return replace(setup, K=K)
 
 
-def _set_lens(setup: Setup, views: tuple[int, ...], value: float) -> Setup:
+def _set_lens(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     lens = setup.lens.clone()
     lens[list(views)] = radial_lens(value)
     return replace(setup, lens=lens)
@@ -239,15 +241,15 @@ def _toggle(values: tuple[bool, ...], views: tuple[int, ...]) -> tuple[bool, ...
     return tuple(value != (view in views) for view, value in enumerate(values))
 
 
-def _exchange_sides(setup: Setup, views: tuple[int, ...], value: float) -> Setup:
+def _exchange_sides(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     return replace(setup, sides=_toggle(setup.sides, views))
 
 
-def _mirror(setup: Setup, views: tuple[int, ...], value: float) -> Setup:
+def _mirror(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     return replace(setup, mirrored=_toggle(setup.mirrored, views))
 
 
-def _mirror_and_exchange_sides(setup: Setup, views: tuple[int, ...], value: float) -> Setup:
+def _mirror_and_exchange_sides(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     return _mirror(_exchange_sides(setup, views, value), views, value)
 
 

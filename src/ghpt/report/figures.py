@@ -19,7 +19,7 @@ from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.report.tables import title
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
 
-LineStyle = Literal["-", "--", "-.", ":"] | tuple[float, tuple[float, ...]]
+LineStyle = Literal["-", "--", "-.", ":"] | tuple[int, tuple[int, ...]]
 
 # Okabe and Ito's palette: told apart by all kinds of colour vision, and left from right by dashes
 # too.

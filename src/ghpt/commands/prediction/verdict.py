@@ -152,7 +152,7 @@ class Judge:
             yield replace(found, command=commands.cameras)
 
 
-def _grade(value: float, look: float, do_not_use: float) -> tuple[Severity, float]:
+def _grade(value: int | float, look: float, do_not_use: float) -> tuple[Severity, float]:
     """Return the severity of a value, and the limit that it exceeds."""
     if value > do_not_use:
         return Severity.ERROR, do_not_use

@@ -322,7 +322,11 @@ def _check_form(
 
 
 def npy_header(
-    where: object, field: str, handle: IO[bytes], size: int, pickled: bool = False
+    where: object,
+    field: str,
+    handle: IO[bytes] | zipfile.ZipExtFile,
+    size: int,
+    pickled: bool = False,
 ) -> tuple[tuple[int, ...], Literal["C", "F"], np.dtype]:
     """Return shape, order and dtype of the npy array in ``handle``, which then stands at its data.
 
