@@ -158,7 +158,7 @@ class Predictor:
         key_points: Array | Detections,
         cameras: CamerasLike,
         confidence: Array | None = None,
-        rate_hz: float | None = None,
+        rate_hz: int | float | None = None,
     ) -> Poses:
         """Return the poses of one person in millimetres, in the world of the cameras.
 
@@ -186,7 +186,7 @@ class Predictor:
 def calibrate_rig(
     key_points: Array | Detections,
     cameras: CamerasLike | Array,
-    height: float | None = None,
+    height: int | float | None = None,
     confidence: Array | None = None,
     **changes: Any,
 ) -> tuple[CameraSet, tuple[Finding, ...]]:
@@ -240,7 +240,7 @@ def check_cameras(
     return findings
 
 
-def write_poses(path: str | Path, poses: Poses | Array, rate_hz: float | None = None) -> None:
+def write_poses(path: str | Path, poses: Poses | Array, rate_hz: int | float | None = None) -> None:
     """Write poses into a file of the format that its suffix names.
 
     Formats are npz, csv, parquet, trc, c3d, html and rrd (rerun). ``poses`` may be points [T J 3]
@@ -254,7 +254,7 @@ def write_poses(path: str | Path, poses: Poses | Array, rate_hz: float | None = 
     suffix = Path(path).suffix
     check(suffix in writers, str(path), f"has the suffix {suffix!r}", f"Use {', '.join(writers)}.")
     whole = poses if isinstance(poses, Poses) else _poses_of(poses)
-    about = whole.about if rate_hz is None else replace(whole.about, rate_hz=rate_hz)
+    about = whole.about if rate_hz is None else replace(whole.about, rate_hz=float(rate_hz))
     writers[suffix].write(Path(path), about, lambda: iter([whole.reconstruction]))
 
 

@@ -48,18 +48,19 @@ def as_detections(
     key_points: Array | Detections,
     cameras: CameraSet,
     confidence: Array | None = None,
-    rate_hz: float | None = None,
+    rate_hz: int | float | None = None,
 ) -> Detections:
     """Return key points of the 17 joints as one person's detections in the views of cameras."""
+    rate = None if rate_hz is None else float(rate_hz)
     if isinstance(key_points, Detections):
-        return key_points if rate_hz is None else replace(key_points, rate_hz=rate_hz)
+        return key_points if rate is None else replace(key_points, rate_hz=rate)
     points = as_key_points(key_points, confidence, len(cameras))
     if points.valid.shape[-1] != len(JOINTS):
         problem = f"there are {points.valid.shape[-1]} joints, not {len(JOINTS)}"
         hint = "Give them in the order of ghpt.skeleton.JOINTS, NaN where there is none."
         raise GhptDataError("key_points", "", problem, hint)
     frame = np.arange(len(points))
-    return Detections.of_person(ARRAYS, cameras.names, JOINTS, frame, points, rate_hz)
+    return Detections.of_person(ARRAYS, cameras.names, JOINTS, frame, points, rate)
 
 
 def as_key_points(key_points: Array, confidence: Array | None, views: int) -> KeyPoints:

@@ -51,13 +51,13 @@ _log = logging.getLogger(__name__)
 class ScaleSettings:
     """What gives millimetres: at most one of the first three."""
 
-    height: float | None = None
+    height: int | float | None = None
     """Of the person, mm."""
     segments: dict[str, Any] | None = None
     """The measured lengths (mm) of bones by name."""
     baseline: list[Any] | None = None
     """Two cameras and the distance of their centres, mm."""
-    assumed_height: float = 1730.0
+    assumed_height: int | float = 1730.0
     """Of the person where nothing else is given, mm."""
 
 
