@@ -22,39 +22,40 @@ from single_person import read_person
 DOCUMENTED = {
     "human36m": """
         0 right_ankle, 1 right_knee, 2 right_hip, 3 left_hip, 4 left_knee, 5 left_ankle, 6 pelvis,
-        7 spine, 8 thorax, 9 head_top, 10 right_wrist, 11 right_elbow, 12 right_shoulder, 13
-        left_shoulder, 14 left_elbow, 15 left_wrist, 16 nose""",
+        7 spine, 8 thorax, 9 head_top, 10 right_wrist, 11 right_elbow, 12 right_shoulder,
+        13 left_shoulder, 14 left_elbow, 15 left_wrist, 16 nose""",
     "coco_17": """
-        0 nose, 1 left_eye, 2 right_eye, 3 left_ear, 4 right_ear, 5 left_shoulder, 6
-        right_shoulder, 7 left_elbow, 8 right_elbow, 9 left_wrist, 10 right_wrist, 11 left_hip, 12
-        right_hip, 13 left_knee, 14 right_knee, 15 left_ankle, 16 right_ankle""",
+        0 nose, 1 left_eye, 2 right_eye, 3 left_ear, 4 right_ear, 5 left_shoulder,
+        6 right_shoulder, 7 left_elbow, 8 right_elbow, 9 left_wrist, 10 right_wrist, 11 left_hip,
+        12 right_hip, 13 left_knee, 14 right_knee, 15 left_ankle, 16 right_ankle""",
     "coco_18": """
         0 Nose, 1 Neck, 2 RShoulder, 3 RElbow, 4 RWrist, 5 LShoulder, 6 LElbow, 7 LWrist, 8 RHip,
         9 RKnee, 10 RAnkle, 11 LHip, 12 LKnee, 13 LAnkle, 14 REye, 15 LEye, 16 REar, 17 LEar""",
     "coco_19": """
         0 Neck, 1 Nose, 2 BodyCenter, 3 lShoulder, 4 lElbow, 5 lWrist, 6 lHip, 7 lKnee, 8 lAnkle,
-        9 rShoulder, 10 rElbow, 11 rWrist, 12 rHip, 13 rKnee, 14 rAnkle, 15 lEye, 16 lEar, 17
-        rEye, 18 rEar""",
+        9 rShoulder, 10 rElbow, 11 rWrist, 12 rHip, 13 rKnee, 14 rAnkle, 15 lEye, 16 lEar,
+        17 rEye, 18 rEar""",
     "body_25": """
-        0 Nose, 1 Neck, 2 RShoulder, 3 RElbow, 4 RWrist, 5 LShoulder, 6 LElbow, 7 LWrist, 8
-        MidHip, 9 RHip, 10 RKnee, 11 RAnkle, 12 LHip, 13 LKnee, 14 LAnkle, 15 REye, 16 LEye, 17
-        REar, 18 LEar, 19 LBigToe, 20 LSmallToe, 21 LHeel, 22 RBigToe, 23 RSmallToe, 24 RHeel""",
+        0 Nose, 1 Neck, 2 RShoulder, 3 RElbow, 4 RWrist, 5 LShoulder, 6 LElbow, 7 LWrist,
+        8 MidHip, 9 RHip, 10 RKnee, 11 RAnkle, 12 LHip, 13 LKnee, 14 LAnkle, 15 REye, 16 LEye,
+        17 REar, 18 LEar, 19 LBigToe, 20 LSmallToe, 21 LHeel, 22 RBigToe, 23 RSmallToe, 24 RHeel""",
     "body_25b": """
-        0 Nose, 1 LEye, 2 REye, 3 LEar, 4 REar, 5 LShoulder, 6 RShoulder, 7 LElbow, 8 RElbow, 9
-        LWrist, 10 RWrist, 11 LHip, 12 RHip, 13 LKnee, 14 RKnee, 15 LAnkle, 16 RAnkle, 17
-        UpperNeck, 18 HeadTop, 19 LBigToe, 20 LSmallToe, 21 LHeel, 22 RBigToe, 23 RSmallToe, 24
-        RHeel""",
+        0 Nose, 1 LEye, 2 REye, 3 LEar, 4 REar, 5 LShoulder, 6 RShoulder, 7 LElbow, 8 RElbow,
+        9 LWrist, 10 RWrist, 11 LHip, 12 RHip, 13 LKnee, 14 RKnee, 15 LAnkle, 16 RAnkle,
+        17 UpperNeck, 18 HeadTop, 19 LBigToe, 20 LSmallToe, 21 LHeel, 22 RBigToe, 23 RSmallToe,
+        24 RHeel""",
     "halpe_26": """
-        0 Nose, 1 LEye, 2 REye, 3 LEar, 4 REar, 5 LShoulder, 6 RShoulder, 7 LElbow, 8 RElbow, 9
-        LWrist, 10 RWrist, 11 LHip, 12 RHip, 13 LKnee, 14 RKnee, 15 LAnkle, 16 RAnkle, 17 Head, 18
-        Neck, 19 Hip, 20 LBigToe, 21 RBigToe, 22 LSmallToe, 23 RSmallToe, 24 LHeel, 25 RHeel""",
+        0 Nose, 1 LEye, 2 REye, 3 LEar, 4 REar, 5 LShoulder, 6 RShoulder, 7 LElbow, 8 RElbow,
+        9 LWrist, 10 RWrist, 11 LHip, 12 RHip, 13 LKnee, 14 RKnee, 15 LAnkle, 16 RAnkle, 17 Head,
+        18 Neck, 19 Hip, 20 LBigToe, 21 RBigToe, 22 LSmallToe, 23 RSmallToe, 24 LHeel, 25 RHeel""",
     "mediapipe_33": """
-        0 nose, 1 left eye inner, 2 left eye, 3 left eye outer, 4 right eye inner, 5 right eye, 6
-        right eye outer, 7 left ear, 8 right ear, 9 mouth left, 10 mouth right, 11 left shoulder,
-        12 right shoulder, 13 left elbow, 14 right elbow, 15 left wrist, 16 right wrist, 17 left
-        pinky, 18 right pinky, 19 left index, 20 right index, 21 left thumb, 22 right thumb, 23
-        left hip, 24 right hip, 25 left knee, 26 right knee, 27 left ankle, 28 right ankle, 29
-        left heel, 30 right heel, 31 left foot index, 32 right foot index""",
+        0 nose, 1 left eye inner, 2 left eye, 3 left eye outer, 4 right eye inner, 5 right eye,
+        6 right eye outer, 7 left ear, 8 right ear, 9 mouth left, 10 mouth right,
+        11 left shoulder, 12 right shoulder, 13 left elbow, 14 right elbow, 15 left wrist,
+        16 right wrist, 17 left pinky, 18 right pinky, 19 left index, 20 right index,
+        21 left thumb, 22 right thumb, 23 left hip, 24 right hip, 25 left knee, 26 right knee,
+        27 left ankle, 28 right ankle, 29 left heel, 30 right heel, 31 left foot index,
+        32 right foot index""",
 }
 OUR_WORDS = {
     "Nose": "nose",
