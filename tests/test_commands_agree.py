@@ -19,6 +19,7 @@ from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.skeleton import MIRROR
 from predicting import config
+from sizes import NIGHTLY
 from test_verdict import NAMES, RIG, late, pixels, points_file
 
 OF_THE_RESULT = ("left_out_error", "few_views_agree", "rejected")
@@ -103,7 +104,11 @@ MISTAKES = {
 }
 
 
-@pytest.mark.parametrize("name", MISTAKES)
+TRIED = tuple(MISTAKES) if NIGHTLY else ("none", "exchanged", "moved")
+"""Of the mistakes; the others are tried at night."""
+
+
+@pytest.mark.parametrize("name", TRIED)
 def test_the_commands_name_the_same_mistake_of_the_same_cameras(name, tmp_path):
     values, cameras, expected = MISTAKES[name]
     points = points_file(tmp_path / "points.npz", values)
