@@ -8,6 +8,7 @@ from typing import Literal
 import pytest
 import torch
 
+from ghpt.commands.overrides import rename_settings
 from ghpt.config import Target, build, check_plain, settings
 from ghpt.errors import GhptConfigError, check
 from ghpt.models.scorer import Scorer
@@ -163,3 +164,9 @@ def test_a_setting_that_does_not_fit_is_named(changed, key, problem):
 def test_a_setting_without_a_default_is_needed():
     with pytest.raises(GhptConfigError, match=r"^name: is missing\. "):
         settings(Camera, {key: value for key, value in CAMERA.items() if key != "name"})
+
+
+def test_settings_by_their_former_names_are_understood():
+    given = ["doctor.shift=20", "swaps=false", "model.spread=1", "-m", "output=a/doctor.x=1"]
+    expected = ["camera_check.shift=20", "flips=false", "model.logit_std_cap=1", "-m"]
+    assert rename_settings(given) == [*expected, "output=a/doctor.x=1"]

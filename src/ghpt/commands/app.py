@@ -35,7 +35,13 @@ from ghpt.commands.jobs import (
     take_signals,
 )
 from ghpt.commands.outputs import Files, OutputFolder, SweepFolder
-from ghpt.commands.overrides import Source, check_overrides, compose, spread_seeds
+from ghpt.commands.overrides import (
+    Source,
+    check_overrides,
+    compose,
+    rename_settings,
+    spread_seeds,
+)
 from ghpt.config import plain
 from ghpt.config import settings as typed_settings
 from ghpt.errors import GhptConfigError, GhptError, one_line, out_of_memory
@@ -122,6 +128,7 @@ def _run(
 ) -> None:
     """Do what the command line asks for; jobs that end are added to ``ended``."""
     name = command if isinstance(command, str) else command.name
+    sys.argv[1:] = rename_settings(sys.argv[1:])
     if name == "reproduce":
         sys.argv[1:] = spread_seeds(sys.argv[1:])
     if "--version" in sys.argv:

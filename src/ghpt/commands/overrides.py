@@ -21,6 +21,12 @@ from ghpt.errors import GhptConfigError
 
 _SEARCH_PATH = "hydra.searchpath"
 _SWEEP = {"-m", "--multirun"}
+_FORMER_NAMES = {
+    "doctor": "camera_check",
+    "swaps": "flips",
+    "model.spread": "model.logit_std_cap",
+}
+"""Settings by the names that scripts written for earlier versions give."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +93,18 @@ def spread_seeds(words: Sequence[str]) -> list[str]:
     seeds = range(int(first), int(first) + int(count))
     others = [word for word in words if not word.startswith(("seeds=", "seed="))]
     return [*others, "seed=" + ",".join(map(str, seeds))]
+
+
+def rename_settings(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line with today's names of settings."""
+    renamed = []
+    for word in words:
+        key, equals, value = word.partition("=")
+        for former, name in _FORMER_NAMES.items():
+            if equals and (key == former or key.startswith(f"{former}.")):
+                key = name + key.removeprefix(former)
+        renamed.append(f"{key}{equals}{value}")
+    return renamed
 
 
 def _parse(word: str) -> Override:
