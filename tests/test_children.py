@@ -42,3 +42,4 @@ def test_what_a_child_has_started_ends_with_the_test():
     own = int(child.stdout.readline())
     children.close_all()
     children.wait_until(lambda: not os.path.exists(f"/proc/{own}"))
+    assert not os.path.exists(f"/proc/{own}")

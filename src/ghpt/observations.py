@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any, Generic, TypeVar
@@ -208,12 +209,12 @@ class Labelled(Batch, Generic[ObservationsT, TruthT]):
 
 
 @dataclass(frozen=True)
-class Estimate(Batch):
+class Estimate(Batch, ABC):
     """What an aggregation or a classical estimator gives: tensors, and a mask ``estimated``."""
 
+    @abstractmethod
     def valid(self) -> Bool[Tensor, "*B"]:
         """Return where the estimate means something: estimated, and finite."""
-        raise NotImplementedError
 
     def masked(self: EstimateT) -> EstimateT:
         """Return the estimate with zeros where it is not valid, and not ``estimated`` there."""
