@@ -10,16 +10,23 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.errors import check, check_positive
-from ghpt.models.estimators.classical import Estimator
+from ghpt.geometry.cameras import reprojection_error
+from ghpt.models.estimators.classical import Estimator, person_scale
+from ghpt.models.estimators.confidence import confidence_exponent, confidence_weights
+from ghpt.models.estimators.trajectory.disjoint import (
+    HALF_INFLATION,
+    LEAST_VIEWS,
+    DisjointTest,
+    halves,
+    observed_by_two,
+    square_distances,
+)
 from ghpt.models.estimators.trajectory.rows import ReprojectionRows
 from ghpt.models.estimators.trajectory.solver import Body, Frames, TrajectorySolver
 from ghpt.models.estimators.trajectory.uncertainty import covariances
 from ghpt.models.estimators.trajectory.windows import Clock, dense
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import HUMAN36M, Skeleton
-
-_LEAST_CONFIDENCE = 1e-3
-"""Less confidence than this is no less."""
 
 
 @dataclass(frozen=True)
@@ -42,17 +49,18 @@ class TrajectoryPart:
 class Trajectory:
     """Estimates all frames of a piece of recording together.
 
-    ``start`` gives each frame's first estimate. A key point weighs its confidence to the power
-    ``confidence``. A view agrees with a point if its residual is at most ``agree`` deviations of
-    its joint's key points; one view alone supports a joint that two views observe within
-    ``reach_s``. Frames farther apart than ``longest_gap_s`` have nothing to do with
-    each other. ``inflation``: of the variances, for what is common to successive frames and no
-    residual of a single frame tells (`calibrated`).
+    ``start`` gives each frame's first estimate. A key point weighs its confidence to a power that
+    is measured (`confidence_exponent`), at most ``largest_exponent``. A view agrees with a point if
+    its residual is at most ``agree`` deviations of its joint's key points; one view alone supports
+    a joint that two views observe within ``reach_s``. Frames farther apart than ``longest_gap_s``
+    have nothing to do with each other. ``inflation``: of the variances, for what is common to
+    successive frames and no residual of a single frame tells, with four views; with fewer it is
+    inversely proportional to their number, with more it is measured (`DisjointTest`).
     """
 
     start: Estimator
     solver: TrajectorySolver
-    confidence: float
+    largest_exponent: float
     agree: float
     reach_s: float
     longest_gap_s: float
@@ -61,11 +69,14 @@ class Trajectory:
     rate_hz: float | None = None
     body: Body | None = None
     """What the recording says of its person; None: each batch tells."""
+    exponent: float = 0.0
+    """Of the confidences."""
 
     def __post_init__(self) -> None:
         check_positive(agree=self.agree, longest_gap_s=self.longest_gap_s)
         check_positive(reach_s=self.reach_s, inflation=self.inflation)
-        check(self.confidence >= 0, "confidence", f"is {self.confidence}", "It must be >= 0.")
+        power = self.largest_exponent
+        check(power >= 0, "largest_exponent", f"is {power}", "It must be >= 0.")
 
     @torch.no_grad()
     def __call__(self, batch: Observations) -> PoseEstimate:
@@ -90,9 +101,38 @@ class Trajectory:
 
         They are of one recording, in the order of time; there may be gaps between them.
         """
-        frames, _ = self._frames(batch, self.start(batch))
-        body = self.solver(frames, self.skeleton).body
-        return replace(self, body=body)
+        first = self.start(batch)
+        plain = replace(self, exponent=0.0)
+        found = plain.solve(batch, first)
+        exchanged = found.exchanged
+        error = reprojection_error(batch.cameras, exchanged.key_points, found.points)
+        relative = error / person_scale(batch.key_points, batch.valid)[..., None]
+        exponent = confidence_exponent(relative, exchanged.confidence, exchanged.valid)
+        weighted = replace(self, exponent=min(exponent, self.largest_exponent))
+        frames, _ = weighted._frames(batch, first)
+        fitted = replace(weighted, body=self.solver(frames, self.skeleton).body)
+        views = int(batch.valid.any(-1).any(0).sum())
+        fitted = replace(fitted, inflation=self.inflation * LEAST_VIEWS / max(views, 2))
+        test = fitted.test_halves(batch)
+        if not test.is_decidable:
+            return fitted
+        return replace(fitted, inflation=fitted.inflation * test.inflation())
+
+    def test_halves(self, batch: Observations) -> DisjointTest:
+        """Return how far the trajectories of two halves of the views are from each other.
+
+        There is nothing in it where fewer than four views leave no two halves.
+        """
+        squares = [batch.key_points.new_zeros(0, dtype=torch.float64)]
+        half = replace(self, inflation=self.inflation * HALF_INFLATION)
+        if batch.valid.shape[1] >= LEAST_VIEWS:
+            for one, other in halves(batch):
+                a = half.solve(one, self.start(one), with_covariance=True)
+                b = half.solve(other, self.start(other), with_covariance=True)
+                both = observed_by_two(a.views) & observed_by_two(b.views)
+                difference = (a.points - b.points)[both]
+                squares.append(square_distances(difference, (a.covariance + b.covariance)[both]))
+        return DisjointTest(torch.cat(squares))
 
     def solve(
         self, batch: Observations, first: PoseEstimate, with_covariance: bool = False
@@ -124,12 +164,12 @@ class Trajectory:
         place, axis = clock.axis(numbers)
         length = len(axis.joined)
         rows = ReprojectionRows.from_observations(_dense_observations(batch, place, length))
-        confidence = batch.confidence.double().clamp(min=_LEAST_CONFIDENCE)
+        weight = confidence_weights(batch.confidence, self.exponent)
         placed = first.estimated & first.points.isfinite().all(-1)
         local = torch.where(placed[..., None], first.points.double() - rows.origin, 0.0)
         return Frames(
             rows=rows,
-            weight=_last(dense(confidence**self.confidence, place, length)),
+            weight=_last(dense(weight, place, length)),
             start=_last(dense(local, place, length)).transpose(0, 1).contiguous(),
             placed=_last(dense(placed, place, length)),
             axis=axis,

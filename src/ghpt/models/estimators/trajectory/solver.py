@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -34,6 +33,8 @@ from ghpt.skeleton import Skeleton
 
 _MEDIAN_LENGTH = 1.1774
 """Median length of a 2D vector whose coordinates are normal with deviation 1: sqrt(2 ln 2)."""
+_COUNTS = 0.05
+"""Weight from which a key point says that a joint is seen."""
 _START_DEVIATION = 10.0
 """Of the points that the solver starts from, mm, where they are first joined through time."""
 
@@ -61,11 +62,6 @@ class Frames:
     """Points of the local world to start from; 0 where not ``placed``."""
     placed: Bool[Tensor, "J T"]
     axis: TimeAxis
-
-    @cached_property
-    def seen(self) -> Bool[Tensor, "J T"]:
-        """Whether any view sees the joint."""
-        return self.rows.used.any(0)
 
 
 @dataclass(frozen=True)
@@ -171,6 +167,7 @@ class _Rounds:
         self.near = solver.bones.near(self.both_placed, frames.axis)
         self.given = body
         self.deviation = solver.motion.initial(frames.axis, joints)
+        self.seen = frames.rows.used.any(0)
         self.points = self._join_start()
         self.body = body or self._measure(self.points)
 
@@ -188,7 +185,9 @@ class _Rounds:
         robust = (1 + (relative / kernel).square()).square().reciprocal()
         if solver.others is not None:
             robust *= solver.others.weight(relative, self.rows.used, frames.axis)
-        self.precision = self.weight * robust / scale.square()
+        counted = self.weight * robust
+        self.seen = (counted * self.rows.used).amax(0) > _COUNTS
+        self.precision = counted / scale.square()
         blocks, right = self.rows.sums(self.precision)
         self.observed = blocks.clone()
         weighted = blocks.new_zeros(3, 0, blocks.shape[-1])
@@ -246,7 +245,7 @@ class _Rounds:
         return self._solve(equations, (), self.single)
 
     def _coupling(self) -> TimeCoupling:
-        return self.solver.motion.coupling(self.deviation, self.frames.seen, self.frames.axis)
+        return self.solver.motion.coupling(self.deviation, self.seen, self.frames.axis)
 
     def _solve(
         self, equations: NormalEquations, bones: Bones, groups: BodyGroups

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -18,6 +20,8 @@ _APART = 24
 """Frames between two whose columns of the inverse are computed at once; what is farther apart is
 taken to be independent.
 """
+_LARGEST = 1000.0
+"""mm. No deviation is larger: what nothing is known of is independent of frames ``_APART``."""
 _EVERY = 4
 """Covariances are computed at every 4th frame, and interpolated between them."""
 
@@ -35,7 +39,7 @@ def covariances(solution: Solution) -> Float[Tensor, "6 J T"]:
     start, end = across.ends
     blocks = observed.clone()
     for one, other in ((start, end), (end, start)):
-        along = _quadratic(alone[:, other], across.direction)
+        along = _quadratic(alone[:, other], across.direction).clamp(min=0)
         variance = 1 / across.precision.clamp(min=1e-12) + along
         told = torch.where(across.precision > 0, 1 / variance, 0.0)
         outer = torch.stack([across.direction[i] * across.direction[k] for i, k in UPPER])
@@ -49,7 +53,9 @@ def _inverse_blocks(
     """Return the 3x3 blocks of the inverse, of joints that only time ties to themselves."""
     joints, frames = blocks.shape[1:]
     right = torch.zeros_like(equations.right)
-    alone = NormalEquations(blocks, right, equations.time, equations.bones[:, :0])
+    own = equations.time.own + 1 / _LARGEST**2
+    time = replace(equations.time, own=own)
+    alone = NormalEquations(blocks, right, time, equations.bones[:, :0])
     factor = Factor(body_groups(joints, (), 1).even, alone, (), ())
     at = torch.arange(0, frames, _EVERY)
     found = blocks.new_zeros(6, joints, len(at))
