@@ -51,6 +51,7 @@ from ghpt.export import WRITERS, Chunks, Evidence, Scene, find_marker_set
 from ghpt.export.scene import origin_note
 from ghpt.files import sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
+from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.joint_means import JointMeans, all_joints, human_joints
 from ghpt.models.estimators.predictors import Classical, Learned
@@ -164,7 +165,7 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     None in the processes beside the first.
     """
     estimator = build_estimator(settings)
-    compared = {
+    compared: dict[str, Estimator] = {
         name: build(settings.baselines[name], f"baselines.{name}") for name in settings.compare
     }
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
@@ -383,14 +384,17 @@ def _fitted(
 
 def _evaluate(
     estimator: PoseEstimator,
-    compared: Mapping[str, Estimate],
+    compared: Mapping[str, Estimator],
     sequence: Sequence,
     settings: PredictSettings,
 ) -> Evaluation:
     """Return what the estimators are worth on the 17 joints, or on all key points without them."""
     judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
-    own = pose_estimate(_fitted(estimator, judged, settings).rejecting_nothing())
-    estimates = {estimator.name: own, **{k: v for k, v in compared.items() if k != estimator.name}}
+    sample = judged.read(judged.spread(settings.fitted_frames))
+    own = _fitted(estimator, judged, settings).rejecting_nothing()
+    estimates: dict[str, Estimate] = {estimator.name: pose_estimate(own)}
+    for name, other in compared.items():
+        estimates.setdefault(name, other.fitted(sample))
     flips = estimator.flips and estimator.flips.for_skeleton(judged.skeleton)
     return evaluate(judged, flips, estimates, settings.evaluated_frames, settings.batch)
 

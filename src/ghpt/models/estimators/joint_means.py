@@ -58,7 +58,7 @@ class JointMeans:
     def _average(self, part: Reconstruction) -> Reconstruction:
         """Return the joints that are no key points."""
         weights = self._matrix[self._is_mean]
-        most = int((weights > 0).sum(-1).max()) if len(weights) else 0
+        most = int((self._matrix > 0).sum(-1).max())
         weight, parts = weights.topk(most, dim=-1)
         used = weight > 0
         state = torch.where(used, part.state[:, parts], int(State.OBSERVED)).amax(-1)
