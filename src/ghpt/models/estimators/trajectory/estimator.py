@@ -66,7 +66,8 @@ class Trajectory:
     longest_gap_s: float
     inflation: float
     skeleton: Skeleton = HUMAN36M
-    rate_hz: float | None = None
+    clock: Clock | None = None
+    """Of the recording; None: each batch tells, at the nominal rate."""
     body: Body | None = None
     """What the recording says of its person; None: each batch tells."""
     exponent: float = 0.0
@@ -157,10 +158,15 @@ class Trajectory:
             exchanged=_exchange(batch, order),
         )
 
+    def _clock(self, batch: Observations) -> Clock:
+        if self.clock is not None:
+            return self.clock
+        return Clock.of_frames(batch.index.numpy(), None, self.longest_gap_s)
+
     def _frames(self, batch: Observations, first: PoseEstimate) -> tuple[Frames, np.ndarray]:
         """Return the frames on an axis without gaps, and the place of each given one on it."""
         numbers = batch.index.numpy()
-        clock = Clock.of_frames(numbers, self.rate_hz, self.longest_gap_s)
+        clock = self._clock(batch)
         place, axis = clock.axis(numbers)
         length = len(axis.joined)
         rows = ReprojectionRows.from_observations(_dense_observations(batch, place, length))
@@ -177,7 +183,7 @@ class Trajectory:
 
     def within_reach(self, batch: Observations, known: Bool[Tensor, "N J"]) -> Bool[Tensor, "N J"]:
         """Return which joints are known in a frame at most ``reach_s`` away."""
-        clock = Clock.of_frames(batch.index.numpy(), self.rate_hz, self.longest_gap_s)
+        clock = self._clock(batch)
         reach = round(self.reach_s * clock.rate_hz) * clock.step
         number = batch.index[:, None].double()
         before = torch.where(known, number, -torch.inf).cummax(0).values

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
+from ghpt.errors import check_positive
 from ghpt.models.estimators.trajectory.priors import NOMINAL_RATE, TimeAxis
 
 Rows = Int[np.ndarray, " N"]
@@ -69,6 +70,9 @@ class Windows:
 
     length: int
     overlap: int
+
+    def __post_init__(self) -> None:
+        check_positive(length=self.length, overlap=self.overlap)
 
     def covering(self, frame: Rows, rows: Rows, clock: Clock) -> Iterator[Window]:
         """Yield the windows whose cores hold these rows of a recording, in order."""
