@@ -34,7 +34,7 @@ _SEEDS = 48
 """Pairs of detections of a frame that are tried as bodies at once: those that agree best."""
 _ROUNDS = 8
 """How often seeds are sought among the detections that no body has taken."""
-_SAME = 0.1
+_SAME = 0.04
 """Bodies of a frame are one if the median distance of their joints is below this part of the
 height.
 """
@@ -237,7 +237,9 @@ def _agreement(pairs: _Pairs, candidates: _Candidates) -> Float[Tensor, "T Q P P
     return torch.where(count >= _LEAST_JOINTS, mean, 0.0)
 
 
-def _line_distance(line: Float[Tensor, "*B 3"], point: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B"]:
+def _line_distance(
+    line: Float[Tensor, "*B 3"], point: Float[Tensor, "*B 3"]
+) -> Float[Tensor, "*B"]:
     """Return the distance of points from lines of the image; inf from a line that is none."""
     length = torch.hypot(line[..., 0], line[..., 1])
     distance = (line[..., 0] * point[..., 0]).addcmul(line[..., 1], point[..., 1])
@@ -340,7 +342,7 @@ def _take_bodies(
 
     What they take is marked in ``taken``.
     """
-    found = []
+    found: list[tuple[Tensor, Tensor]] = []
     while True:
         most, detection = torch.where(taken[:, None], 0.0, support).max(-1)
         agrees = most > _AGREE
@@ -388,9 +390,7 @@ def _settle(
     return settled[kept].numpy(), frame[kept].numpy()
 
 
-def _repeated(
-    points: Float[Tensor, "T B J 3"], ok: Bool[Tensor, "T B J"]
-) -> Bool[Tensor, "T B"]:
+def _repeated(points: Float[Tensor, "T B J 3"], ok: Bool[Tensor, "T B J"]) -> Bool[Tensor, "T B"]:
     """Return which bodies are an earlier one of their frame again, listed twice by a detector."""
     both = ok[:, :, None] & ok[:, None]
     distance = torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1)

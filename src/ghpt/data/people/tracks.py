@@ -21,14 +21,14 @@ height.
 """
 _SURELY_NEAR = 0.3
 """Parts of the reach within which a body is a track's before farther ones are thought of."""
-_SPEED = 0.12
-"""Parts of the height that a body can move further in every frame in which it was not seen."""
-_GAP = 15
+_SPEED = 0.05
+"""Parts of the height that a body can move further in each frame in which it was not seen."""
+_GAP = 4
 """Frames after which a track that was not seen has ended."""
 _COASTING = 3
 """Frames for which a body that is not seen is taken to go on as it went."""
 _SAME_IDENTITY = 0.2
-"""What it is worth, in parts of the reach, that the views' trackers gave a body the track's numbers."""
+"""What it is worth, in parts of the reach, that the trackers of the views call a body the same."""
 _LEAST_JOINTS = 4
 """Joints that two bodies must share to be compared."""
 _SIZE_SPREAD = 0.02

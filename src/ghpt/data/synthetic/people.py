@@ -134,11 +134,13 @@ def record_people(name: str, scene: Scene, detector: Detector, seed: int) -> Peo
     if scene.false_detections:
         false = _false_detections(scene, rig, pieces[0], generator(seed, "false", name))
         pieces.append(false)
-    row, view, owner = (np.concatenate([piece[i] for piece in pieces]) for i in range(3))
-    points = KeyPoints(
-        pixels=np.concatenate([piece[3].pixels for piece in pieces]),
-        confidence=np.concatenate([piece[3].confidence for piece in pieces]),
-        valid=np.concatenate([piece[3].valid for piece in pieces]),
+    row = np.concatenate([piece.row for piece in pieces])
+    view = np.concatenate([piece.view for piece in pieces])
+    owner = np.concatenate([piece.owner for piece in pieces])
+    found_points = KeyPoints(
+        pixels=np.concatenate([piece.points.pixels for piece in pieces]),
+        confidence=np.concatenate([piece.points.confidence for piece in pieces]),
+        valid=np.concatenate([piece.points.valid for piece in pieces]),
     )
     at = np.lexsort((order.random(len(row)), row, view))
     detections = Detections(
@@ -149,15 +151,21 @@ def record_people(name: str, scene: Scene, detector: Detector, seed: int) -> Peo
         row=row[at],
         view=view[at],
         identity=np.full(len(at), -1),
-        points=points[at],
+        points=found_points[at],
         rate_hz=scene.rate_hz,
     )
     cameras = CameraSet.from_cameras(rig.names, rig.cameras, size=rig.size, path=name)
     return PeopleRecording(name, cameras, detections, owner[at], truth, present)
 
 
-_Piece = tuple[np.ndarray, np.ndarray, np.ndarray, KeyPoints]
-"""Frame, view and owner of detections, and their key points."""
+@dataclass(frozen=True)
+class _Piece:
+    """Detections with their owners."""
+
+    row: Int[np.ndarray, " N"]
+    view: Int[np.ndarray, " N"]
+    owner: Int[np.ndarray, " N"]
+    points: KeyPoints
 
 
 def _motions(name: str, scene: Scene, seed: int) -> Float[np.ndarray, "T P J 3"]:
@@ -335,7 +343,7 @@ def _people_detections(key_points: np.ndarray, confidence: np.ndarray, valid: np
     owner, row, view = np.nonzero(valid.any(-1))
     at = (owner, row, view)
     points = KeyPoints(key_points[at].astype(np.float64), confidence[at].astype(float), valid[at])
-    return row, view, owner, points
+    return _Piece(row, view, owner, points)
 
 
 def _false_detections(
@@ -347,8 +355,8 @@ def _false_detections(
     total = scene.frames * views * count
     row = np.repeat(np.arange(scene.frames), views * count)
     view = np.tile(np.repeat(np.arange(views), count), scene.frames)
-    source = rng.integers(0, len(people[0]), total)
-    points = people[3][source]
+    source = rng.integers(0, len(people.row), total)
+    points = people.points[source]
     middle = points.pixels.mean(1, keepdims=True)
     size = rig.image_size.numpy()[view][:, None]
     place = rng.uniform(0.1, 0.9, (total, 1, 2)) * size
@@ -356,4 +364,5 @@ def _false_detections(
     pixels = place + scale * (points.pixels - middle)
     confidence = _FALSE_CONFIDENCE * rng.random((total, 1)) * points.valid
     inside = ((pixels >= 0) & (pixels < size)).all(-1)
-    return row, view, np.full(total, -1), KeyPoints(pixels, confidence, points.valid & inside)
+    found = KeyPoints(pixels, confidence, points.valid & inside)
+    return _Piece(row, view, np.full(total, -1), found)
