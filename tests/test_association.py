@@ -27,6 +27,7 @@ from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
+from ghpt.skeleton import BONES
 
 FRAMES = 240
 
@@ -187,6 +188,7 @@ def test_numbers_of_trackers_tell_who_came_back_in_a_view():
         points=body + place[:, None, None] * np.array([1.0, 0, 0]),
         valid=np.ones((3, 17), bool),
         identity=np.array([[4, 9], [7, 2], [7, 2]]),
+        bones=BONES,
     )
     assert track_bodies(bodies).tolist() == [0, 1, 1]
 
@@ -255,7 +257,7 @@ def test_who_was_seen_beside_another_is_not_that_one():
     body = np.random.default_rng(0).uniform(-1, 1, (17, 3)) * [300, 300, 900]
     frame, place = np.array([0, 0, 1, 1, 2, 2, 3]), np.array([0, 4000, 30, 4020, 60, 9000, 9020])
     points = body + place[:, None, None] * np.array([1.0, 0, 0])
-    bodies = Bodies(frame, points, np.ones((7, 17), bool), np.full((7, 2), -1))
+    bodies = Bodies(frame, points, np.ones((7, 17), bool), np.full((7, 2), -1), BONES)
     assert track_bodies(bodies).tolist() == [0, 1, 0, 1, 0, 2, 2]
 
 

@@ -5,6 +5,7 @@ The detections of a frame that agree on one body in space are one person's.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -19,6 +20,7 @@ from ghpt.geometry.cameras import Cameras, project, relative_pose
 from ghpt.geometry.epipolar import fundamental, homogeneous
 from ghpt.geometry.normal_equations import local_cameras
 from ghpt.geometry.triangulation import triangulate
+from ghpt.skeleton import BONES
 
 _FAR = 0.12
 """Distance of a joint, as a part of the size of the person in the image, at which it says nothing
@@ -70,12 +72,14 @@ def associate(
     view: Int[np.ndarray, " N"],
     points: KeyPoints,
     identity: Int[np.ndarray, " N"] | None = None,
+    bones: Sequence[tuple[int, int]] = BONES,
 ) -> list[Int[np.ndarray, "T V"]]:
     """Return for each person the index of their detection in each frame and view.
 
     It is -1 where there is none; the best person comes first. ``row`` and ``view`` are those of the
     N detections, whose undistorted key points are ``points`` [N J]. ``identity`` is the number that
-    a tracker of the view gave each, -1 where none did; it means nothing in another view.
+    a tracker of the view gave each, -1 where none did; it means nothing in another view. ``bones``
+    are the pairs of joints whose distances tell people apart who are not there together.
 
     1. Within a frame, two detections in two views make a body if they lie near one another's
        epipolar lines. It is projected into all views, where those detections support it that are
@@ -108,6 +112,7 @@ def associate(
         points=np.concatenate([part.points for part in parts]),
         valid=np.concatenate([part.valid for part in parts]),
         identity=own,
+        bones=tuple(bones),
     )
     worth = np.where(chosen >= 0, prominence[chosen], 0).sum(1)
     return join_tracks(frames, bodies, track_bodies(bodies), worth, chosen)
@@ -411,4 +416,4 @@ def _triangulate_bodies(
     valid = points.valid[members] & (members >= 0)[..., None]
     pixels = torch.from_numpy(points.pixels[members].astype(np.float64))
     found = triangulate(cameras, pixels, torch.from_numpy(valid).double())
-    return Bodies(frame, found.points.numpy(), found.ok.numpy(), members)
+    return Bodies(frame, found.points.numpy(), found.ok.numpy(), members, ())

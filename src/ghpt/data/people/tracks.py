@@ -13,8 +13,6 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import linear_sum_assignment
 
-from ghpt.skeleton import BONES
-
 _NEAR = 0.35
 """A body is the next frame's if the median distance of their joints is below this part of its
 height.
@@ -59,6 +57,8 @@ class Bodies:
     valid: Bool[np.ndarray, "G J"]
     identity: Int[np.ndarray, "G V"]
     """The number that each view's own tracker gave the body's detection, -1 where none did."""
+    bones: tuple[tuple[int, int], ...]
+    """Pairs of joints whose distance hardly changes."""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -389,9 +389,7 @@ def _neighbours(person: _Person, track: _Track, place: int) -> list[tuple[_Track
 
 def _tracks(bodies: Bodies, rows_of_track: list[Int[np.ndarray, " N"]]) -> list[_Track]:
     """Return the tracks, with the lengths of their bones."""
-    joints = bodies.valid.shape[1]
-    bones = np.array([bone for bone in BONES if max(bone) < joints]).reshape(-1, 2)
-    start, end = bones.T
+    start, end = np.array(bodies.bones, np.int64).reshape(-1, 2).T
     length = np.linalg.norm(bodies.points[:, start] - bodies.points[:, end], axis=-1)
     known = bodies.valid[:, start] & bodies.valid[:, end] & (length > 0)
     logarithm = np.log(np.where(known, length, 1.0))
