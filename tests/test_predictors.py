@@ -283,7 +283,7 @@ def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
     conf = Path(__file__).parents[1] / "conf"
     config, baselines = (
         yaml.safe_load((conf / name / "default.yaml").read_text())
-        for name in ("estimator", "baselines")
+        for name in ("predictor", "baselines")
     )
     estimator = build(baselines["adaptive_ransac"], "baselines.adaptive_ransac")
     scene = random_scene(9, frames=30, views=5).noisy(2, 0)

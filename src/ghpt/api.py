@@ -121,10 +121,10 @@ def triangulate(key_points: Array, cameras: CamerasLike, confidence: Array | Non
     points = as_key_points(key_points, confidence, len(rig))
     names = tuple(f"joint_{joint}" for joint in range(points.valid.shape[-1]))
     defaults = _defaults("predict")
-    name = defaults["triangulation"]
-    group = defaults["estimator"]["classical"] | {"flips": None}
+    name = "adaptive_ransac"
+    group = defaults["predictor"]["classical"] | {"flips": None}
     baseline = build(defaults["baselines"][name], f"baselines.{name}")
-    predictor: Classical = build(group, "estimator.classical")(estimator=baseline)
+    predictor: Classical = build(group, "predictor.classical")(estimator=baseline)
     observations = _observe(points, rig)
     source = _ArraySource(np.arange(len(points)), None, observations)
     part = _estimate(predictor, source, defaults["fitted_frames"], defaults["batch"])
