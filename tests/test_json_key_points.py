@@ -93,12 +93,14 @@ def test_one_coco_file_whose_images_name_the_views(form, tmp_path):
     ("content", "says"),
     [
         ([], "people: is empty"),
-        ([1], "annotations: is not a list of objects"),
+        ([1], "is not a key-point format that is known"),
+        ({"annotations": [1]}, "annotations: is not a list of objects"),
         ({"images": 1, "annotations": []}, "images: is not a list"),
-        ([{"keypoints": [1, 2, 3]}], "image_id: an image has neither number nor name"),
-        ([result("frame.jpg")], "'frame.jpg' has no frame number"),
-        ([result(-1)], "image_id: -1 has no frame number"),
-        ([{"image_id": 1}], r"\[0\]\.keypoints: is not a list of x, y, confidence"),
+        ([{"keypoints": [1, 2, 3]}], "it looks like mmpose's"),
+        ([result(None)], "image_id: an image has neither number nor name"),
+        ([result("frame.jpg")], "frame.jpg: its name has no frame number"),
+        ([result(-1)], "image_id: -1 is no frame number"),
+        ([{"image_id": 1}], r"\[0\]: has no key points"),
         ([{"image_id": 1, "keypoints": [1, 2, "3"]}], r"\[0\]\.keypoints: is not a list"),
         ([{"image_id": 1, "keypoints": [1, 2e6, 3]}], "beyond 1e6"),
         ([{"image_id": 1, "keypoints": [10**400, 2, 3]}], "beyond 1e6"),
@@ -170,7 +172,7 @@ def test_the_joints_are_those_that_mmpose_names(tmp_path):
         ([{"frame_id": 1, "instances": []}] * 2, "frame_id: is there twice"),
         (
             [{"frame_id": 1, "instances": [{"keypoints": [1]}]}],
-            r"keypoints: is not a list of \[x, y\]",
+            r"keypoints: is not a list of x, y",
         ),
         (
             [{"frame_id": 1, "instances": [{"keypoints": [[1, 2]]}]}],
@@ -206,5 +208,5 @@ def test_a_format_is_chosen_by_name(tmp_path):
     write(tmp_path / "a.json", mmpose([(1, [0.0])]))
     with pytest.raises(GhptDataError, match=f"there is no format 'c3d'.*{', '.join(FORMATS)}"):
         read_key_points(tmp_path, format="c3d")
-    with pytest.raises(GhptDataError, match="annotations: is not a list of objects"):
+    with pytest.raises(GhptDataError, match="is not of coco: it looks like mmpose's"):
         read_key_points(tmp_path, format="coco")

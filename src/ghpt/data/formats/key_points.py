@@ -9,20 +9,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from ghpt.data.formats.authors_npy import read_authors
-from ghpt.data.formats.coco import read_coco
-from ghpt.data.formats.mediapipe import is_caliscope, opening, read_caliscope
-from ghpt.data.formats.mmpose import read_mmpose
-from ghpt.data.formats.movement_files import (
-    EXTENSIONS,
-    read_deeplabcut,
-    read_lightning_pose,
-    read_sleap,
-)
-from ghpt.data.formats.openpose import read_openpose
+from ghpt.data.formats.authors_npy import is_authors_file, read_authors
+from ghpt.data.formats.json_content import looks_like_people
+from ghpt.data.formats.json_people import read_json_people
+from ghpt.data.formats.layout import find_files
+from ghpt.data.formats.mediapipe import is_caliscope, read_caliscope
+from ghpt.data.formats.movement_files import read_deeplabcut, read_lightning_pose, read_sleap
+from ghpt.data.formats.names import Name
 from ghpt.data.formats.own_npz import read_own, write_key_points
 from ghpt.data.formats.skeletons import joints_of, parts_of
-from ghpt.data.formats.validate import frame_rate, open_input
+from ghpt.data.formats.source import Source
+from ghpt.data.formats.validate import frame_rate, open_input, opening
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -30,11 +27,13 @@ from ghpt.errors import GhptDataError
 __all__ = ["FORMATS", "Detections", "KeyPoints", "read_key_points", "write_key_points"]
 
 _HINT = (
-    "Known: a folder with OpenPose's JSON files in a folder for each camera; COCO results or "
-    "MMPose's JSON, a file for each camera; caliscope's xy_*.csv; an npz file of ghpt; the "
-    "authors' all_2d_preds.npy; DeepLabCut, SLEAP and LightningPose files (docs/calibration.md). "
-    "Or name it: format=."
+    "Known: JSON files of OpenPose, AlphaPose, MMPose, rtmlib, EasyMocap and COCO results; "
+    "caliscope's xy_*.csv; an npz file of ghpt; the authors' all_2d_preds.npy; DeepLabCut, SLEAP "
+    "and LightningPose files (docs/calibration.md). Or name it: format=."
 )
+_ENDINGS = (".json", ".csv", ".slp", ".h5", ".npy", ".npz")
+_LOOKED_AT = 20
+"""Files of a folder that are opened to recognise the format."""
 
 
 def read_key_points(
@@ -42,11 +41,13 @@ def read_key_points(
     skeleton: str | None = None,
     rate_hz: int | float | None = None,
     format: str | None = None,
+    session: Name = None,
 ) -> Detections:
     """Return everybody in a folder or file of key points.
 
     ``skeleton`` and ``rate_hz`` say what the files do not, or overrule them; ``format`` is one of
-    ``FORMATS``, and recognised by content if None.
+    ``FORMATS``, and recognised by content if None. ``session`` chooses one of several recordings
+    in a folder.
 
     Raises GhptDataError for what is damaged, empty or not known, naming file, field and hint.
     """
@@ -58,7 +59,9 @@ def read_key_points(
         raise GhptDataError(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
-    people = FORMATS[format or _format_of(path)](path, skeleton)
+    source = Source(path, skeleton, session, format)
+    form = format or _format_of(path)
+    people = read_json_people(source) if form == "json" else FORMATS[form](source)
     parts_of(path, people.joints)
     seen_by = set(people.view[people.points.valid.any(-1)].tolist())
     for view, name in enumerate(people.views):
@@ -69,33 +72,40 @@ def read_key_points(
     return people if rate_hz is None else replace(people, rate_hz=rate)
 
 
-FORMATS: dict[str, Callable[[Path, str | None], Detections]] = {
-    "openpose": read_openpose,
-    "coco": read_coco,
-    "mmpose": read_mmpose,
-    "caliscope": lambda path, _: read_caliscope(path),
-    "npz": read_own,
-    "authors": read_authors,
-    "deeplabcut": read_deeplabcut,
-    "sleap": read_sleap,
-    "lightningpose": read_lightning_pose,
+FORMATS: dict[str, Callable[[Source], Detections]] = {
+    "openpose": read_json_people,
+    "alphapose": read_json_people,
+    "coco": read_json_people,
+    "mmpose": read_json_people,
+    "rtmlib": read_json_people,
+    "easymocap": read_json_people,
+    "caliscope": lambda source: read_caliscope(source.path),
+    "npz": lambda source: read_own(source.path, source.skeleton),
+    "authors": lambda source: read_authors(source.path, source.skeleton),
+    "deeplabcut": lambda source: read_deeplabcut(source.path, source.skeleton),
+    "sleap": lambda source: read_sleap(source.path, source.skeleton),
+    "lightningpose": lambda source: read_lightning_pose(source.path, source.skeleton),
 }
 
 
 def _format_of(path: Path) -> str:
-    """Return the name of the format, by what a folder has in it or how a file begins."""
-    if not path.is_dir():
-        form = _format_of_file(path)
-        if form in (None, "openpose"):
-            raise GhptDataError(path, "", "is not a key-point format that is known", _HINT)
-        return form
-    if any(path.glob("all_2d_preds*.npy")):
+    """Return the name of the format, by how the files of a folder, or a file, begin."""
+    files = find_files(path, _ENDINGS)
+    if path.is_dir() and any(is_authors_file(file) for file in files):
         return "authors"
-    inside = (
-        file for file in sorted(path.iterdir()) if file.suffix.lower() in (".json", *EXTENSIONS)
-    )
-    first = next(inside, None)
-    return "openpose" if first is None else _format_of_file(first) or "openpose"
+    # the first files of each ending: others may lie beside the key points
+    looked_at = [
+        file
+        for ending in _ENDINGS
+        for file in [file for file in files if file.suffix.lower() == ending][:_LOOKED_AT]
+    ]
+    for file in looked_at if path.is_dir() else files:
+        form = _format_of_file(file)
+        if form is not None:
+            return form
+    if any(file.suffix.lower() == ".json" for file in files):
+        return "json"
+    raise GhptDataError(path, "", "is not a key-point format that is known", _HINT)
 
 
 def _format_of_file(path: Path) -> str | None:
@@ -109,10 +119,7 @@ def _format_of_file(path: Path) -> str | None:
         return "caliscope"
     if text.startswith("scorer,"):
         return "deeplabcut"
-    if text.startswith(("{", "[")):
-        words = (('"instance', "mmpose"), ('"meta_info"', "mmpose"), ('"people"', "openpose"))
-        return next((form for word, form in words if word in text), "coco")
-    return None
+    return "json" if looks_like_people(text) else None
 
 
 _MAGIC = {b"PK\x03\x04": "npz", b"\x93NUMPY": "authors", b"\x89HDF": "sleap"}

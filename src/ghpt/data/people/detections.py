@@ -18,6 +18,7 @@ MOST_PEOPLE = 64
 _MOST_VALUES = 1 << 31
 _FARTHEST = 1e6
 """Pixels."""
+_NUMBERS = {int, float, type(None)}
 
 
 @dataclass(frozen=True)
@@ -220,9 +221,9 @@ def joint_values(
 ) -> Float[np.ndarray, "K per_joint"]:
     """Return a flat list of ``per_joint`` numbers for each joint as an array.
 
-    Raises GhptDataError for anything else, and for numbers from 1e6 on.
+    A joint with NaN or null among them is missing: it is all zeros. Raises GhptDataError for anything else, and for numbers from 1e6 on.
     """
-    numbers = isinstance(flat, list) and {int, float}.issuperset(map(type, flat))
+    numbers = isinstance(flat, list) and _NUMBERS.issuperset(map(type, flat))
     if not isinstance(flat, list) or not numbers or len(flat) % per_joint:
         words = "x, y, confidence" if per_joint == 3 else "x, y"
         raise GhptDataError(path, field, f"is not a list of {words}", "Detect this frame again.")
@@ -230,6 +231,7 @@ def joint_values(
         joints = np.array(flat, dtype=np.float64).reshape(-1, per_joint)
     except OverflowError:
         joints = np.full((1, per_joint), np.inf)
+    joints[np.isnan(joints).any(1)] = 0
     if not (np.abs(joints) < _FARTHEST).all():
         raise GhptDataError(path, field, "holds a number beyond 1e6", "Detect this frame again.")
     return joints
