@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.geometry.lens import distort, undistort
+from ghpt.geometry.lens import distort, fisheye_lens, is_fisheye, undistort
 
 K = np.array([[1100.0, 0, 510], [0, 1120, 495], [0, 0, 1]])
 LENSES = [
@@ -107,5 +107,50 @@ def test_what_is_not_finite_is_masked_and_changes_nothing_beside_it():
 
 
 def test_another_number_of_coefficients_is_refused():
-    with pytest.raises(ValueError, match="4, 5 or 8"):
+    with pytest.raises(ValueError, match="4, 5, 8 or 9"):
         distort(*as_tensors(grid(), K, np.zeros(3)))
+
+
+FISHEYES = [(0.0, 0.0, 0.0, 0.0), (0.05, -0.01, 0.002, 0.0), (-0.03, 0.02, -0.01, 0.001)]
+
+
+@pytest.mark.parametrize("coefficients", FISHEYES)
+def test_fisheye_is_opencv_s_both_ways(coefficients):
+    pixels = grid()
+    lens = fisheye_lens(torch.tensor(coefficients, dtype=torch.float64))
+    ideal, exists = undistort(*as_tensors(pixels, K), lens)
+    assert exists.all()
+    np.testing.assert_allclose(distort(ideal, *as_tensors(K), lens), pixels, atol=1e-9)
+    rays = np.c_[(ideal.numpy() - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(len(ideal))]
+    zero = np.zeros((3, 1))
+    theirs = cv2.fisheye.projectPoints(rays[:, None], zero, zero, K, np.array(coefficients))[0]
+    np.testing.assert_allclose(theirs[:, 0], pixels, atol=1e-9)
+
+
+def test_fisheye_shows_no_pinhole_what_lies_beside_or_behind():
+    lens = fisheye_lens(torch.zeros(4, dtype=torch.float64))
+    angle = torch.tensor([0.0, 1.2, 1.39, 1.41, 1.6, 3.0], dtype=torch.float64)
+    pixels = torch.stack((510 + 1100 * angle, torch.full_like(angle, 495)), dim=-1)
+    ideal, exists = undistort(pixels, *as_tensors(K), lens)
+    assert exists.tolist() == [True, True, True, False, False, False]
+    torch.testing.assert_close(ideal[:3, 0], 510 + 1100 * torch.tan(angle[:3]))
+
+
+def test_fisheye_that_folds_over_is_undone_up_to_the_fold():
+    # theta (1 - 0.5 theta^2) grows up to theta = sqrt(2 / 3)
+    fold = (2 / 3) ** 0.5 * 2 / 3
+    lens = fisheye_lens(torch.tensor([-0.5, 0, 0, 0], dtype=torch.float64))
+    radius = torch.tensor([0.5, 0.9999, 1.0001, 2.0], dtype=torch.float64) * fold
+    pixels = torch.stack((510 + 1100 * radius, torch.full_like(radius, 495)), dim=-1)
+    assert undistort(pixels, *as_tensors(K), lens)[1].tolist() == [True, True, False, False]
+
+
+def test_lenses_of_both_kinds_are_undone_each_by_its_own():
+    wide = fisheye_lens(torch.tensor(FISHEYES[1], dtype=torch.float64))
+    brown = torch.tensor([*LENSES[4], 0.0], dtype=torch.float64)
+    lenses = torch.stack((wide, brown))
+    assert is_fisheye(lenses).tolist() == [True, False]
+    pixels, matrix = as_tensors(grid(), K)
+    both, _ = undistort(pixels.expand(2, -1, -1), matrix.expand(2, 3, 3), lenses)
+    for one, lens in zip(both, (wide, brown), strict=True):
+        torch.testing.assert_close(one, undistort(pixels, matrix, lens)[0], rtol=0, atol=0)

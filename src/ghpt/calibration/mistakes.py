@@ -228,7 +228,8 @@ def _scale_intrinsics(setup: Setup, views: tuple[int, ...], value: int | float) 
 
 def _set_lens(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     lens = setup.lens.clone()
-    lens[list(views)] = radial_lens(value)
+    radial = radial_lens(value)
+    lens[list(views)] = torch.nn.functional.pad(radial, (0, lens.shape[-1] - len(radial)))
     return replace(setup, lens=lens)
 
 

@@ -316,9 +316,10 @@ def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Seque
 def _files_sequence(settings: PredictSettings) -> Sequence:
     cameras = own_cameras(settings, "Calib.toml")
     cameras.check_calibrated(str(settings.cameras))
-    if settings.format in (None, "npz"):
+    if settings.format in (None, "npz") and settings.session is None:
         path = str(settings.keypoints)
-        stored = open_stored(path, settings.skeleton, settings.rate_hz)
+        least = settings.least_confidence
+        stored = open_stored(path, settings.skeleton, settings.rate_hz, least)
         if stored is not None:
             title = own_title(settings)
             return stored_sequence(stored, cameras, settings.match, settings.views, title)

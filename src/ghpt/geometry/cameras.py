@@ -100,8 +100,10 @@ class CameraSet:
     names: tuple[str, ...]
     K: Float[Tensor, "V 3 3"]
     """Intrinsics, pixels, float64."""
-    distortion: Float[Tensor, "V 5"]
-    """OpenCV's k1, k2, p1, p2, k3."""
+    distortion: Float[Tensor, "V C"]
+    """Coefficients of ``ghpt.geometry.lens``: k1, k2, p1, p2, k3, or nine numbers where a lens of
+    the rig needs more.
+    """
     size: Int[Tensor, "V 2"] | None = None
     """Width and height of the images, pixels."""
     R: Float[Tensor, "V 3 3"] | None = None
@@ -122,7 +124,7 @@ class CameraSet:
         cls,
         names: Sequence[str],
         cameras: Cameras,
-        distortion: Float[Tensor, "V 5"] | None = None,
+        distortion: Float[Tensor, "V C"] | None = None,
         size: Int[Tensor, "V 2"] | None = None,
         path: str = "",
     ) -> CameraSet:

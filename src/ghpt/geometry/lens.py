@@ -1,8 +1,10 @@
-"""Lens distortion: OpenCV's Brown-Conrady model, undone where the key points enter.
+"""Lens distortion, undone where the key points enter: OpenCV's Brown-Conrady and fisheye models.
 
 Coefficients are k1 k2 p1 p2 [k3 [k4 k5 k6]]: in normalised image coordinates with s = x^2 + y^2,
 ``x_d = x (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3) + 2 p1 x y + p2 (s + 2 x^2)``
-and y likewise.
+and y likewise. A ninth number says which model they are of: 0 for this one, 1 for the fisheye
+(``ghpt.geometry.fisheye``), whose k1 k2 k3 k4 are then the first four. So the lenses of a rig of
+both kinds are one tensor [V 9].
 """
 
 from __future__ import annotations
@@ -14,8 +16,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.linalg import vector_norm
 
+from ghpt.geometry.fisheye import distort_fisheye, undistort_fisheye
 from ghpt.geometry.masking import finite_vectors, where
+from ghpt.geometry.polynomials import largest_inverse_root
 
+COEFFICIENTS = 9
+"""Numbers that hold a lens of either model."""
 _STEPS = 100
 _CONVERGED = 1e-12
 """In normalised coordinates, so 1e-9 pixels or less."""
@@ -25,6 +31,29 @@ pole.
 """
 
 
+def fisheye_lens(k: Float[Tensor, "*B 4"]) -> Float[Tensor, "*B 9"]:
+    """Return the coefficients of a fisheye lens (k1 k2 k3 k4)."""
+    lens = pad_lens(k)
+    lens[..., -1] = 1.0
+    return lens
+
+
+def is_fisheye(coefficients: Float[Tensor, "*B C"]) -> Bool[Tensor, "*B"]:
+    """Return which lenses are fisheyes."""
+    return pad_lens(coefficients)[..., -1] != 0
+
+
+def pad_lens(coefficients: Float[Tensor, "*B C"]) -> Float[Tensor, "*B 9"]:
+    """Return all nine numbers of lenses, float64; those that are not given are 0.
+
+    Raises ValueError unless C is 4, 5, 8 or 9.
+    """
+    count = coefficients.shape[-1]
+    if count not in (4, 5, 8, COEFFICIENTS):
+        raise ValueError(f"a lens has 4, 5, 8 or 9 coefficients here, not {count}")
+    return torch.nn.functional.pad(coefficients.double(), (0, COEFFICIENTS - count))
+
+
 def distort(
     pixels: Float[Tensor, "*B N 2"],
     K: Float[Tensor, "*B 3 3"],
@@ -32,10 +61,14 @@ def distort(
 ) -> Float[Tensor, "*B N 2"]:
     """Return where the lens shows the points whose ideal pinhole pixels are given, float64.
 
-    C is 4, 5 or 8.
+    C is 4, 5, 8 or 9.
     """
     ideal = _normalise(pixels, K)
-    distorted, _ = _apply_lens(ideal, _pad(coefficients))
+    fisheye, lens, brown = _models(coefficients)
+    distorted, _ = _apply_lens(ideal, brown)
+    if fisheye.any():
+        seen = distort_fisheye(ideal, lens[..., :4])
+        distorted = torch.where(fisheye[..., None, None], seen, distorted)
     return _to_pixels(distorted, K)
 
 
@@ -48,19 +81,42 @@ def undistort(
 
     Ideal pixels have the same K and are float64. A pixel that no ray of the lens's invertible
     region reaches (or that is not finite) has no such point: its mask is False and the pixel comes
-    back as it was (0 if not finite). C is 4, 5 or 8.
+    back as it was (0 if not finite). C is 4, 5, 8 or 9.
     """
     finite = finite_vectors(pixels)
     safe = where(finite, pixels.double(), 0.0)
-    lens = _pad(coefficients)
     target = _normalise(safe, K)
+    fisheye, lens, brown = _models(coefficients)
+    point, exists = _undistort_brown(target, brown)
+    if fisheye.any():
+        ideal, shown = undistort_fisheye(target, lens[..., :4])
+        point = torch.where(fisheye[..., None, None], ideal, point)
+        exists = torch.where(fisheye[..., None], shown, exists)
+    exists = finite & exists
+    return where(exists, _to_pixels(point, K), safe), exists
+
+
+def _models(
+    coefficients: Float[Tensor, "*B C"],
+) -> tuple[Bool[Tensor, "*B"], Float[Tensor, "*B 1 9"], Float[Tensor, "*B 1 8"]]:
+    """Return which lenses are fisheyes, all their numbers, and those of the Brown-Conrady model,
+    which are 0 for a fisheye.
+    """
+    lens = pad_lens(coefficients)
+    fisheye = lens[..., -1] != 0
+    brown = torch.where(fisheye[..., None], 0.0, lens[..., :-1])
+    return fisheye, lens.unsqueeze(-2), brown.unsqueeze(-2)
+
+
+def _undistort_brown(
+    target: Float[Tensor, "*B N 2"], lens: Float[Tensor, "*B 1 8"]
+) -> tuple[Float[Tensor, "*B N 2"], Bool[Tensor, "*B N"]]:
     limit = _largest_radius(lens)[..., None] * _INSIDE
     point, converged = _invert_lens(target, lens, limit)
     _, jacobian = _apply_lens(point, lens)
     radius = vector_norm(point, dim=-1)
     invertible = (jacobian.determinant > 0) & (radius <= limit)
-    exists = finite & converged & invertible
-    return where(exists, _to_pixels(point, K), safe), exists
+    return point, converged & invertible
 
 
 def _invert_lens(
@@ -86,15 +142,6 @@ def _invert_lens(
         # those that are done stay: the digits of a point must not depend on the points beside it
         point = where(converged, point, _clamp_radius(point - step, limit))
     return point, converged
-
-
-def _pad(coefficients: Float[Tensor, "*B C"]) -> Float[Tensor, "*B 1 8"]:
-    """Return all eight coefficients, float64; those that are not given are 0."""
-    count = coefficients.shape[-1]
-    if count not in (4, 5, 8):
-        raise ValueError(f"OpenCV's lens model has 4, 5 or 8 coefficients here, not {count}")
-    padded = torch.nn.functional.pad(coefficients.double(), (0, 8 - count))
-    return padded.unsqueeze(-2)
 
 
 def _normalise(
@@ -189,8 +236,8 @@ def _largest_radius(lens: Float[Tensor, "*B 1 8"]) -> Float[Tensor, "*B"]:
     numerator = [one, k1, k2, k3]
     denominator = [one, k4, k5, k6]
     growth = _growth(numerator, denominator)
-    growth_root = _largest_inverse_root(growth)
-    pole = _largest_inverse_root(denominator)
+    growth_root = largest_inverse_root(growth)
+    pole = largest_inverse_root(denominator)
     inverse_square = torch.maximum(growth_root, pole)
     radius = inverse_square.clamp(min=1e-300) ** -0.5
     return torch.where(inverse_square > 0, radius, torch.inf)
@@ -207,22 +254,3 @@ def _growth(numerator: list[Tensor], denominator: list[Tensor]) -> list[Tensor]:
             factor = 1 + 2 * i - 2 * j
             growth[i + j] = growth[i + j] + factor * n * d
     return growth
-
-
-def _largest_inverse_root(polynomial: list[Tensor]) -> Float[Tensor, "*B"]:
-    """Return 1 / (smallest positive real root) of polynomials with constant term 1.
-
-    It is 0 where there is none. The inverse roots are those of the reversed polynomial, which is
-    monic whatever its other coefficients are.
-    """
-    first, *others = polynomial
-    degree = len(others)
-    shape = (*first.shape, degree, degree)
-    companion = torch.zeros(shape, dtype=torch.float64)
-    companion[..., 0, :] = -torch.stack(others, dim=-1).cpu()
-    companion[..., range(1, degree), range(degree - 1)] = 1
-    roots = torch.linalg.eigvals(companion)
-    real = roots.imag.abs() <= 1e-9 * roots.abs()
-    positive = real & (roots.real > 0)
-    largest = torch.where(positive, roots.real, 0.0).amax(-1)
-    return largest.to(first.device)

@@ -24,7 +24,7 @@ class Setup:
     """V cameras, and which key points each of them is given, and how."""
 
     K: Float[Tensor, "V 3 3"]
-    lens: Float[Tensor, "V 5"]
+    lens: Float[Tensor, "V C"]
     R: Float[Tensor, "V 3 3"]
     t: Float[Tensor, "V 3"]
     source: tuple[int, ...]
@@ -188,7 +188,7 @@ def rays_of(
     pixels: Float[Tensor, "F J 2"],
     valid: Bool[Tensor, "F J"],
     K: Float[Tensor, "3 3"],
-    lens: Float[Tensor, " 5"],
+    lens: Float[Tensor, " C"],
 ) -> Rays:
     """Return the rays of pixels through a lens; a pixel that no ray reaches is not valid."""
     straight, valid = ideal(pixels, valid, K, lens)
@@ -202,7 +202,7 @@ def ideal(
     pixels: Float[Tensor, "*B J 2"],
     valid: Bool[Tensor, "*B J"],
     K: Float[Tensor, "3 3"],
-    lens: Float[Tensor, " 5"],
+    lens: Float[Tensor, " C"],
 ) -> tuple[Float[Tensor, "*B J 2"], Bool[Tensor, "*B J"]]:
     """Return the pinhole pixels of pixels through a lens, and which of them exist."""
     valid = valid & (pixels.abs() < _FAR).all(-1)

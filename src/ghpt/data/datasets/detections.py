@@ -36,7 +36,7 @@ def undistort_key_points(
     pixels: Float[np.ndarray, "T J 2"],
     valid: Bool[np.ndarray, "T J"],
     K: Float[np.ndarray, "3 3"],
-    distortion: Float[np.ndarray, " 5"],
+    distortion: Float[np.ndarray, " C"],
 ) -> tuple[Float[np.ndarray, "T J 2"], Bool[np.ndarray, "T J"]]:
     """Return one camera's key points as an ideal pinhole has them (float32), and which are valid.
 

@@ -17,7 +17,7 @@ from ghpt.data.formats.mediapipe import is_caliscope, read_caliscope
 from ghpt.data.formats.movement_files import read_deeplabcut, read_lightning_pose, read_sleap
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.own_npz import read_own, write_key_points
-from ghpt.data.formats.skeletons import joints_of, parts_of
+from ghpt.data.formats.skeletons import find_skeleton
 from ghpt.data.formats.source import Source
 from ghpt.data.formats.validate import frame_rate, open_input, opening
 from ghpt.data.people.detections import Detections
@@ -42,33 +42,41 @@ def read_key_points(
     rate_hz: int | float | None = None,
     format: str | None = None,
     session: Name = None,
+    least_confidence: float = 0.0,
 ) -> Detections:
     """Return everybody in a folder or file of key points.
 
     ``skeleton`` and ``rate_hz`` say what the files do not, or overrule them; ``format`` is one of
     ``FORMATS``, and recognised by content if None. ``session`` chooses one of several recordings
-    in a folder.
+    in a folder. A key point whose confidence is below ``least_confidence`` is missing.
 
     Raises GhptDataError for what is damaged, empty or not known, naming file, field and hint.
     """
     path = Path(path)
     rate = None if rate_hz is None else frame_rate(path, rate_hz)
-    if skeleton is not None:
-        joints_of(path, skeleton)
+    wanted = None if skeleton is None else find_skeleton(path, skeleton)
     if format is not None and format not in FORMATS:
         raise GhptDataError(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
     source = Source(path, skeleton, session, format)
     form = format or _format_of(path)
+    if session is not None and form in _ONE_RECORDING:
+        problem = "files of this format hold one recording"
+        raise GhptDataError(path, "session", problem, "Leave session= out.")
     people = read_json_people(source) if form == "json" else FORMATS[form](source)
-    parts_of(path, people.joints)
+    if wanted is not None and wanted.key_points == people.joints:
+        people = replace(people, own_skeleton=wanted)
+    people.skeleton.require_joints(path)
+    people = people.above(least_confidence)
     seen_by = set(people.view[people.points.valid.any(-1)].tolist())
     for view, name in enumerate(people.views):
         if view not in seen_by:
-            raise GhptDataError(
-                path, f"view {name}", "has no key point", "Detect this view again, or leave it out."
-            )
+            problem = "has no key point"
+            if least_confidence > 0:
+                problem += f" with a confidence of at least {least_confidence:g}"
+            hint = "Detect this view again, or leave it out."
+            raise GhptDataError(path, f"view {name}", problem, hint)
     return people if rate_hz is None else replace(people, rate_hz=rate)
 
 
@@ -86,6 +94,8 @@ FORMATS: dict[str, Callable[[Source], Detections]] = {
     "sleap": lambda source: read_sleap(source.path, source.skeleton),
     "lightningpose": lambda source: read_lightning_pose(source.path, source.skeleton),
 }
+
+_ONE_RECORDING = ("caliscope", "npz", "authors")
 
 
 def _format_of(path: Path) -> str:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from ghpt.data.formats.skeletons import joints_of, recognise
+from ghpt.data.formats.skeletons import joints_of, recognise, skeleton_of
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
+from ghpt.skeleton import Skeleton
 
 MOST_PEOPLE = 64
 """In a view of a frame; more are no people."""
@@ -43,9 +44,16 @@ class Detections:
     points: KeyPoints
     """[N K]."""
     rate_hz: float | None = None
+    own_skeleton: Skeleton | None = None
+    """The skeleton with these joints that was asked for; None: what their names tell."""
 
     def __len__(self) -> int:
         return len(self.row)
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """What is known of the joints. Raises GhptDataError for a name that is there twice."""
+        return self.own_skeleton or skeleton_of(self.path, self.joints)
 
     @classmethod
     def of_person(
@@ -69,6 +77,18 @@ class Detections:
             identity=np.full(len(row), -1),
             points=points[row, view],
             rate_hz=rate_hz,
+        )
+
+    def above(self, least_confidence: float) -> Detections:
+        """Return the detections without key points below this confidence, nor who has no other."""
+        points = self.points.above(least_confidence)
+        kept = np.flatnonzero(points.valid.any(-1) | ~self.points.valid.any(-1))
+        return replace(
+            self,
+            row=self.row[kept],
+            view=self.view[kept],
+            identity=self.identity[kept],
+            points=points[kept],
         )
 
     def counts(self) -> Int[np.ndarray, "T V"]:
