@@ -8,7 +8,6 @@ be told from its structure alone.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -239,8 +238,10 @@ def _persons_of_arrays(
 
 
 def _scores_of(content: dict[str, Any]) -> Any:
-    empty = [] if content.get("keypoints", []) == [] else None
-    return next((content[name] for name in _SCORES if name in content), empty)
+    for name in _SCORES:
+        if name in content:
+            return content[name]
+    return None if content.get("keypoints") else []
 
 
 def _by_image(path: Path, content: dict[str, Any]) -> JsonContent | None:

@@ -4,6 +4,7 @@ EasyMocap's.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath, PurePosixPath
@@ -31,7 +32,6 @@ from ghpt.data.formats.source import Source
 from ghpt.data.formats.validate import (
     LARGE_JSON,
     SMALL_JSON,
-    check_view_count,
     open_input,
     opening,
 )
@@ -66,10 +66,8 @@ def read_json_people(source: Source) -> Detections:
     if source.format not in (None, content.format, *_SAME.get(content.format, ())):
         problem = f"is not of {source.format}: it looks like {content.format}'s"
         raise GhptDataError(first, "", problem, f"Leave format= out, or format={content.format}.")
-    if content.is_recording:
-        found = _recordings(source, files)
-    else:
-        found = _frame_files(source, files)
+    read = _recordings if content.is_recording else _frame_files
+    found = read(source, files)
     if not all((view.identity >= 0).all() for view in found):
         found = [replace(view, identity=np.full_like(view.identity, -1)) for view in found]
     skeleton = source.skeleton
@@ -223,17 +221,17 @@ def _views_of_file(source: Source, content: JsonContent) -> list[_Recording]:
     file = source.path
     images = _images(file, content.frames)
     if any(isinstance(key, int) for key in images):
-        ((view, _),) = arrange_recordings(file.parent, [PurePath(file.name)], source.session)
-        return [_view_of_file(file, view)]
+        ((name, _),) = arrange_recordings(file.parent, [PurePath(file.name)], source.session)
+        return [_view_of_file(file, name)]
     names = [*dict.fromkeys(key for key in images if isinstance(key, PurePath))]
-    views = arrange_frames(file, names, source.session)
-    check_view_count(file, len(views))
+    rows: dict[PurePath, list[int]] = defaultdict(list)
+    for row, key in enumerate(images):
+        rows[PurePath(key)].append(row)
     recordings = []
-    for view in views:
-        own = {names[index]: number for number, index in view.files.items()}
-        rows = [row for row, key in enumerate(images) if key in own]
-        numbers = tuple(own[images[row]] for row in rows)  # type: ignore[index]
-        frames = tuple(content.frames[row] for row in rows)
+    for view in arrange_frames(file, names, source.session):
+        own = [(n, row) for n, index in view.files.items() for row in rows[names[index]]]
+        numbers = tuple(number for number, _ in own)
+        frames = tuple(content.frames[row] for _, row in own)
         recordings.append(_Recording(file, view.view, numbers, frames, content.joints))
     return recordings
 

@@ -122,8 +122,8 @@ def arrange_frames(
 
     The frame's number is, of the numbers in a name that change within a folder, the last one,
     unless one before it has clearly more values; words like ``frame`` and ``cam`` before a number
-    tell more than both. The rest of the name and the folders tell view and session as `_assign` says. Raises
-    GhptDataError.
+    tell more than both. The rest of the name and the folders tell view and session as `_assign`
+    says. Raises GhptDataError.
     """
     rest, frames = _frame_numbers(where, names)
     series: dict[tuple[tuple[str, ...], str, str], dict[int, int]] = defaultdict(dict)
@@ -140,9 +140,9 @@ def arrange_frames(
     items = []
     for (folders, before, after), numbered in series.items():
         first = names[next(iter(numbered.values()))]
-        parts = (before if own_before or not own_after else "", after if own_after else "")
-        name = "_".join(part for part in parts if part)
-        items.append(_Item(folders, name, str(first)))
+        kept_before = before if own_before or not own_after else ""
+        text = _join((kept_before, after if own_after else ""))
+        items.append(_Item(folders, text, str(first)))
     chosen = _assign(where, items, session)
     listed = list(series.values())
     views = [Frames(item.view or where.name, listed[index]) for index, item in chosen.items()]
@@ -224,7 +224,7 @@ def _around(texts: Sequence[str], numbers: Sequence[str], slot: int) -> tuple[st
     for number, text in zip(numbers, texts[1:], strict=True):
         words += [number, text]
     place = 2 * slot + 1
-    before = "".join(words[:place]).strip(_SEPARATORS)
+    before = _BEFORE_FRAME.sub("", "".join(words[:place])).strip(_SEPARATORS)
     return before, "".join(words[place + 1 :]).strip(_SEPARATORS)
 
 
@@ -294,7 +294,7 @@ def _without_stage(item: _Item) -> _Item:
     for name in (*item.folders, item.name):
         found += [word.lower() for word in _STAGE.findall(name)]
         names.append(_STAGE.sub("", name).strip(_SEPARATORS) or name)
-    stages = [_STAGES.index(stage) for stage in _STAGES if any(w.startswith(stage[:4]) for w in found)]
+    stages = [at for at, stage in enumerate(_STAGES) for w in found if w.startswith(stage[:4])]
     folders = tuple(names[:-1])
     return replace(item, folders=folders, name=names[-1], stage=max(stages, default=0))
 
@@ -365,9 +365,7 @@ def _view_column(columns: Sequence[Sequence[str]], names_last: bool, session: Na
     """Return which of the columns names the views."""
     wanted = [str(session) in column for column in columns]
     cameras = [
-        place
-        for place, column in enumerate(columns)
-        if _are_cameras(column) and not wanted[place]
+        place for place, column in enumerate(columns) if _are_cameras(column) and not wanted[place]
     ]
     folders = [place for place in range(len(columns) - names_last) if not wanted[place]]
     # the names of the files repeat their camera's: a folder of cameras comes first

@@ -241,7 +241,8 @@ def joint_values(
 ) -> Float[np.ndarray, "K per_joint"]:
     """Return a flat list of ``per_joint`` numbers for each joint as an array.
 
-    A joint with NaN or null among them is missing: it is all zeros. Raises GhptDataError for anything else, and for numbers from 1e6 on.
+    A joint with NaN or null among them is missing: it is all zeros. Raises GhptDataError for
+    anything else, and for numbers from 1e6 on.
     """
     numbers = isinstance(flat, list) and _NUMBERS.issuperset(map(type, flat))
     if not isinstance(flat, list) or not numbers or len(flat) % per_joint:
