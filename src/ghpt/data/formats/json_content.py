@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from ghpt.data.formats.frame_files import Person
 from ghpt.data.formats.skeletons import canonical
 from ghpt.data.formats.validate import read_json
 from ghpt.data.people.detections import check_people, joint_values
@@ -67,16 +68,6 @@ class JsonContent:
     """The joints' names, where the file tells them."""
 
 
-@dataclass(frozen=True)
-class JsonPerson:
-    """A person of a frame."""
-
-    joints: Float[np.ndarray, "K 3"]
-    """x, y, confidence."""
-    identity: int
-    """-1 where the file does not say."""
-
-
 def read_content(path: Path, largest: int) -> JsonContent:
     """Return what a file of at most ``largest`` bytes holds.
 
@@ -97,14 +88,14 @@ def looks_like_people(text: str) -> bool:
     return text.startswith(("{", "[")) and any(f'"{word}"' in text for word in _WORDS)
 
 
-def read_people(path: Path, frame: JsonFrame) -> list[JsonPerson]:
+def read_people(path: Path, frame: JsonFrame) -> list[Person]:
     """Return the people of a frame who have key points. Raises GhptDataError."""
     found = []
     for index, person in enumerate(frame.people):
         place = frame.field if frame.is_person else f"{frame.field}[{index}]"
         joints = _joints(path, place, person)
         if len(joints):
-            found.append(JsonPerson(joints, _identity(person.get("person_id"))))
+            found.append(Person(joints, _identity(person.get("person_id"))))
     return found
 
 

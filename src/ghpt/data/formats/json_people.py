@@ -11,10 +11,10 @@ from pathlib import Path, PurePath, PurePosixPath
 
 import numpy as np
 
+from ghpt.data.formats.frame_files import Person, read_frame_files
 from ghpt.data.formats.json_content import (
     JsonContent,
     JsonFrame,
-    JsonPerson,
     Key,
     looks_like_people,
     read_content,
@@ -37,7 +37,6 @@ from ghpt.data.formats.validate import (
 )
 from ghpt.data.people.detections import (
     Detections,
-    detections_in_view,
     merge_views,
     sort_people,
 )
@@ -104,51 +103,15 @@ def _first(files: Sequence[Path]) -> tuple[Path, JsonContent]:
 
 def _frame_files(source: Source, files: Sequence[Path]) -> list[Detections]:
     """Return the views of files that hold one frame each."""
-    root = source.path
-    if not root.is_dir():
-        problem = "is one frame of one view"
-        raise GhptDataError(root, "", problem, "Name the folder with the folders of all views.")
-    views = arrange_frames(root, [file.relative_to(root) for file in files], source.session)
-    if len(views) == 1 and all(file.parent == root for file in files):
-        problem = "holds the frames of one view"
-        raise GhptDataError(root, "", problem, "Name the folder above.")
-    found = []
-    for view in views:
-        own = {number: files[index] for number, index in view.files.items()}
-        found.append(read_frames(root, view.view, own))
-    return found
+    return read_frame_files(source, files, _people_of_frame)
 
 
-def read_frames(root: Path, view: str, files: dict[int, Path]) -> Detections:
-    """Return one view's people from the files of its frames; all have the same number of joints.
-
-    Raises GhptDataError for a damaged file.
-    """
-    found: list[tuple[int, JsonPerson]] = []
-    for number in sorted(files):
-        content = read_content(files[number], SMALL_JSON)
-        if content.is_recording:
-            problem = "holds a recording, and the files beside it hold a frame each"
-            raise GhptDataError(files[number], "", problem, _LAYOUT)
-        people = read_people(files[number], content.frames[0])
-        for person in people:
-            count, expected = len(person.joints), len((found[0][1] if found else person).joints)
-            if count != expected:
-                problem = f"has people of {count} joints, the files before of {expected}"
-                hint = "Detect all frames with one model."
-                raise GhptDataError(files[number], "people", problem, hint)
-            found.append((number, person))
-    values = np.zeros((0, 0, 3))
-    if found:
-        values = np.stack([person.joints for _, person in found])
-    return detections_in_view(
-        root,
-        view,
-        frames=sorted(files),
-        number=np.array([number for number, _ in found], np.int64),
-        values=values,
-        identity=np.array([person.identity for _, person in found], np.int64),
-    )
+def _people_of_frame(file: Path) -> list[Person]:
+    content = read_content(file, SMALL_JSON)
+    if content.is_recording:
+        problem = "holds a recording, and the files beside it hold a frame each"
+        raise GhptDataError(file, "", problem, _LAYOUT)
+    return read_people(file, content.frames[0])
 
 
 @dataclass(frozen=True)
@@ -226,7 +189,8 @@ def _views_of_file(source: Source, content: JsonContent) -> list[_Recording]:
     names = [*dict.fromkeys(key for key in images if isinstance(key, PurePath))]
     rows: dict[PurePath, list[int]] = defaultdict(list)
     for row, key in enumerate(images):
-        rows[PurePath(key)].append(row)
+        if isinstance(key, PurePath):
+            rows[key].append(row)
     recordings = []
     for view in arrange_frames(file, names, source.session):
         own = [(n, row) for n, index in view.files.items() for row in rows[names[index]]]

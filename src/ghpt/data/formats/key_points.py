@@ -10,16 +10,23 @@ from dataclasses import replace
 from pathlib import Path
 
 from ghpt.data.formats.authors_npy import is_authors_file, read_authors
+from ghpt.data.formats.hdf5_files import ENDINGS as HDF5_ENDINGS
+from ghpt.data.formats.hdf5_files import read_hdf5
 from ghpt.data.formats.json_content import looks_like_people
 from ghpt.data.formats.json_people import read_json_people
 from ghpt.data.formats.layout import find_files
 from ghpt.data.formats.mediapipe import is_caliscope, read_caliscope
-from ghpt.data.formats.movement_files import read_deeplabcut, read_lightning_pose, read_sleap
+from ghpt.data.formats.movement_files import (
+    read_deeplabcut_csv,
+    read_lightning_pose,
+    read_sleap_labels,
+)
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.own_npz import read_own, write_key_points
 from ghpt.data.formats.skeletons import find_skeleton
 from ghpt.data.formats.source import Source
 from ghpt.data.formats.validate import frame_rate, open_input, opening
+from ghpt.data.formats.yolo import looks_like_yolo, read_yolo
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -28,10 +35,11 @@ __all__ = ["FORMATS", "Detections", "KeyPoints", "read_key_points", "write_key_p
 
 _HINT = (
     "Known: JSON files of OpenPose, AlphaPose, MMPose, rtmlib, EasyMocap and COCO results; "
-    "caliscope's xy_*.csv; an npz file of ghpt; the authors' all_2d_preds.npy; DeepLabCut, SLEAP "
-    "and LightningPose files (docs/calibration.md). Or name it: format=."
+    "Ultralytics' labels; caliscope's xy_*.csv; DeepLabCut, anipose, SLEAP and LightningPose "
+    "files; the authors' all_2d_preds.npy; an npz file of ghpt (docs/calibration.md). Or name it: "
+    "format=."
 )
-_ENDINGS = (".json", ".csv", ".slp", ".h5", ".npy", ".npz")
+_ENDINGS = (".json", ".csv", ".slp", *HDF5_ENDINGS, ".npy", ".npz", ".txt")
 _LOOKED_AT = 20
 """Files of a folder that are opened to recognise the format."""
 
@@ -87,15 +95,23 @@ FORMATS: dict[str, Callable[[Source], Detections]] = {
     "mmpose": read_json_people,
     "rtmlib": read_json_people,
     "easymocap": read_json_people,
+    "yolo": read_yolo,
     "caliscope": lambda source: read_caliscope(source.path),
     "npz": lambda source: read_own(source.path, source.skeleton),
     "authors": lambda source: read_authors(source.path, source.skeleton),
-    "deeplabcut": lambda source: read_deeplabcut(source.path, source.skeleton),
-    "sleap": lambda source: read_sleap(source.path, source.skeleton),
-    "lightningpose": lambda source: read_lightning_pose(source.path, source.skeleton),
+    "deeplabcut": lambda source: _of_own_or_hdf5(source, ".csv", read_deeplabcut_csv),
+    "anipose": read_hdf5,
+    "sleap": lambda source: _of_own_or_hdf5(source, ".slp", read_sleap_labels),
+    "lightningpose": read_lightning_pose,
 }
-
 _ONE_RECORDING = ("caliscope", "npz", "authors")
+
+
+def _of_own_or_hdf5(
+    source: Source, ending: str, read: Callable[[Source], Detections]
+) -> Detections:
+    """Return what a tool's own files hold, or its HDF5 where it exported nothing else."""
+    return read(source) if find_files(source.path, (ending,)) else read_hdf5(source)
 
 
 def _format_of(path: Path) -> str:
@@ -129,7 +145,9 @@ def _format_of_file(path: Path) -> str | None:
         return "caliscope"
     if text.startswith("scorer,"):
         return "deeplabcut"
-    return "json" if looks_like_people(text) else None
+    if looks_like_people(text):
+        return "json"
+    return "yolo" if looks_like_yolo(text) else None
 
 
 _MAGIC = {b"PK\x03\x04": "npz", b"\x93NUMPY": "authors", b"\x89HDF": "sleap"}

@@ -46,6 +46,8 @@ class Detections:
     rate_hz: float | None = None
     own_skeleton: Skeleton | None = None
     """The skeleton with these joints that was asked for; None: what their names tell."""
+    normalised: bool = False
+    """Pixels are shares of the image's width and height; see `scale_to_images`."""
 
     def __len__(self) -> int:
         return len(self.row)
