@@ -95,7 +95,7 @@ def read_people(path: Path, frame: JsonFrame) -> list[Person]:
         place = frame.field if frame.is_person else f"{frame.field}[{index}]"
         joints = _joints(path, place, person)
         if len(joints):
-            found.append(Person(joints, _identity(person.get("person_id"))))
+            found.append(Person(joints, _identity(person)))
     return found
 
 
@@ -317,7 +317,8 @@ def _flat(path: Path, field: str, points: list[Any], each: int) -> list[Any]:
     return [*chain.from_iterable(points)]
 
 
-def _identity(value: Any) -> int:
+def _identity(person: dict[str, Any]) -> int:
+    value = person.get("person_id", person.get("track_id"))
     if isinstance(value, list) and len(value) == 1:
         value = value[0]
     return value if type(value) is int and 0 <= value < 1 << 31 else -1

@@ -9,8 +9,6 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath, PurePosixPath
 
-import numpy as np
-
 from ghpt.data.formats.frame_files import Person, read_frame_files
 from ghpt.data.formats.json_content import (
     JsonContent,
@@ -53,9 +51,9 @@ _MOST_DIGITS = 15
 def read_json_people(source: Source) -> Detections:
     """Return everybody in JSON files, each of a frame or of a whole recording.
 
-    The layout of the files is told as ``ghpt.data.formats.layout`` says. A ``person_id`` that all
-    people of all views have, from 0 on, is taken as the person's number in all views; OpenPose
-    itself writes -1. Raises GhptDataError.
+    The layout of the files is told as ``ghpt.data.formats.layout`` says. A ``person_id`` or
+    ``track_id`` from 0 on is what a tracker of the view gave the person; OpenPose itself writes
+    -1. Raises GhptDataError.
     """
     files = _json_files(source.path)
     first, content = _first(files)
@@ -67,8 +65,6 @@ def read_json_people(source: Source) -> Detections:
         raise GhptDataError(first, "", problem, f"Leave format= out, or format={content.format}.")
     read = _recordings if content.is_recording else _frame_files
     found = read(source, files)
-    if not all((view.identity >= 0).all() for view in found):
-        found = [replace(view, identity=np.full_like(view.identity, -1)) for view in found]
     skeleton = source.skeleton
     counts = {view.points.valid.shape[1] for view in found if len(view)}
     if skeleton is None and content.format == "coco" and counts == {len(SKELETONS["coco_17"])}:

@@ -23,7 +23,7 @@ from ghpt.data.formats.movement_files import (
 )
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.own_npz import read_own, write_key_points
-from ghpt.data.formats.skeletons import find_skeleton
+from ghpt.data.formats.skeletons import find_skeleton, skeleton_of
 from ghpt.data.formats.source import Source
 from ghpt.data.formats.validate import frame_rate, open_input, opening
 from ghpt.data.formats.yolo import looks_like_yolo, read_yolo
@@ -73,9 +73,9 @@ def read_key_points(
         problem = "files of this format hold one recording"
         raise GhptDataError(path, "session", problem, "Leave session= out.")
     people = read_json_people(source) if form == "json" else FORMATS[form](source)
-    if wanted is not None and wanted.key_points == people.joints:
-        people = replace(people, own_skeleton=wanted)
-    people.skeleton.require_joints(path)
+    if wanted is None or wanted.key_points != people.joints:
+        wanted = skeleton_of(path, people.joints)
+    people = replace(people, own_skeleton=wanted)
     people = people.above(least_confidence)
     seen_by = set(people.view[people.points.valid.any(-1)].tolist())
     for view, name in enumerate(people.views):
