@@ -1,4 +1,20 @@
-"""The 17 joints of Human3.6M, in the order that every array of the project uses on its J axis."""
+"""Skeletons: what a detector's key points are called, and the 17 joints of Human3.6M among them.
+
+The paper's data sets, the learned scorer and the calibration have the 17 joints on their J axis, in
+the order of ``JOINTS``. What is predicted has those of the detector's own `Skeleton`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from itertools import pairwise
+
+import numpy as np
+from jaxtyping import Float
+
+from ghpt.errors import GhptDataError
 
 JOINTS = (
     "right_ankle",
@@ -64,9 +80,8 @@ SYMMETRIC_BONES = {
 
 
 def _mirror(name: str) -> str:
-    if name.startswith("left"):
-        return name.replace("left", "right")
-    return name.replace("right", "left")
+    other = {"left": "right", "right": "left"}
+    return "_".join(other.get(word, word) for word in name.split("_"))
 
 
 MIRROR = tuple(JOINT[_mirror(name)] for name in JOINTS)
@@ -84,3 +99,202 @@ SIX_JOINTS = (
 
 PELVIS = JOINT["pelvis"]
 THORAX = JOINT["thorax"]
+
+
+NamePair = tuple[str, str]
+
+_MEANS: Mapping[str, tuple[tuple[str, ...], ...]] = {
+    "pelvis": (("mid_hip",), ("left_hip", "right_hip")),
+    "thorax": (("neck",), ("left_shoulder", "right_shoulder")),
+    "head_top": (("left_eye", "right_eye", "left_ear", "right_ear"),),
+    "spine": (("pelvis", "thorax"),),
+}
+"""The means that may stand for a joint that a detector lacks; the first that it has is taken."""
+
+_LEAST_JOINTS = 8
+"""Of the 17; with fewer, what is known of people says too little."""
+
+
+@dataclass(frozen=True)
+class Skeleton:
+    """The K key points of a detector, in its order, and what is known of them."""
+
+    name: str
+    key_points: tuple[str, ...]
+    bones: tuple[tuple[int, int], ...]
+    """Index pairs of key points whose distance hardly changes."""
+    pairs: tuple[tuple[int, int], ...]
+    """Index pairs (left, right); the other key points are on the midline."""
+    joints: tuple[tuple[float, ...], ...]
+    """[17 K]: each of the 17 joints as a weighted mean of key points. The weights are at least 0
+    and sum to 1; a joint that the detector cannot give has zeros.
+    """
+
+    def __len__(self) -> int:
+        return len(self.key_points)
+
+    @cached_property
+    def mirror(self) -> tuple[int, ...]:
+        """For each key point, the one on the other side of the body."""
+        order = list(range(len(self)))
+        for left, right in self.pairs:
+            order[left] = right
+            order[right] = left
+        return tuple(order)
+
+    @cached_property
+    def joint_weights(self) -> Float[np.ndarray, "17 K"]:
+        """``joints`` as an array."""
+        return np.array(self.joints).reshape(len(JOINTS), len(self))
+
+    @cached_property
+    def missing_joints(self) -> tuple[str, ...]:
+        """The names of those of the 17 joints that the key points do not give."""
+        rows = zip(JOINTS, self.joints, strict=True)
+        return tuple(name for name, weights in rows if not any(weights))
+
+    @property
+    def has_joints(self) -> bool:
+        """Whether the key points give enough of the 17 joints."""
+        return len(JOINTS) - len(self.missing_joints) >= _LEAST_JOINTS
+
+    def require_joints(self, where: object) -> None:
+        """Raise GhptDataError, for the file ``where``, unless ``has_joints``."""
+        if not self.has_joints:
+            problem = f"lack {', '.join(self.missing_joints)}"
+            known = ", ".join(JOINTS)
+            hint = f"Name them as the 17 ({known}), or say in a yaml how these are made: skeleton=."
+            raise GhptDataError(where, "joints", problem, hint)
+
+
+def make_skeleton(
+    where: object,
+    name: str,
+    key_points: Sequence[str],
+    bones: Sequence[Sequence[str]] | None = None,
+    pairs: Sequence[Sequence[str]] = (),
+    joints: Mapping[str, Mapping[str, float]] | None = None,
+) -> Skeleton:
+    """Return a skeleton whose parts are given by the names of key points.
+
+    ``bones``: each a chain of two names or more; None: those of ``HUMAN_BONES`` that are there.
+    ``pairs``: (left, right), beside those whose names differ in left and right alone. ``joints``:
+    those of the 17 that are not what their name says, or are a mean that ``_MEANS`` does not know,
+    as weights of key points, which are scaled to the sum of 1.
+
+    Raises GhptDataError, for the file ``where``, for a name that is there twice, one that is no key
+    point, and weights that give no mean.
+    """
+    index = {key_point: place for place, key_point in enumerate(key_points)}
+    if len(index) != len(key_points):
+        twice = next(one for one in key_points if list(key_points).count(one) > 1)
+        hint = "Name each key point once."
+        raise GhptDataError(where, "key_points", f"{twice} is there twice", hint)
+    if bones is None:
+        bones = [bone for bone in HUMAN_BONES if index.keys() >= set(bone)]
+    named = [(key_point, _mirror(key_point)) for key_point in key_points if _is_left(key_point)]
+    named = [pair for pair in named if pair[1] in index]
+    chains = [_indices(where, "bones", index, chain) for chain in bones]
+    sides = [_indices(where, "pairs", index, pair) for pair in (*named, *pairs)]
+    paired = [key_point for side in sides for key_point in side]
+    if any(len(side) != 2 for side in sides) or len(set(paired)) != len(paired):
+        hint = "Give each key point once: [left, right]."
+        raise GhptDataError(where, "pairs", "are no pairs of different key points", hint)
+    return Skeleton(
+        name=name,
+        key_points=tuple(key_points),
+        bones=tuple(bone for chain in chains for bone in pairwise(chain)),
+        pairs=tuple((left, right) for left, right in sides),
+        joints=_joint_weights(where, index, joints or {}),
+    )
+
+
+def _is_left(name: str) -> bool:
+    return "left" in name.split("_")
+
+
+def _indices(
+    where: object, field: str, index: Mapping[str, int], names: Sequence[str]
+) -> tuple[int, ...]:
+    unknown = [name for name in names if name not in index]
+    if unknown or len(set(names)) != len(names):
+        problem = f"{', '.join(names)} names one twice"
+        if unknown:
+            problem = f"{unknown[0]} is no key point"
+        raise GhptDataError(where, field, problem, f"The key points are {', '.join(index)}.")
+    return tuple(index[name] for name in names)
+
+
+def _joint_weights(
+    where: object, index: Mapping[str, int], given: Mapping[str, Mapping[str, float]]
+) -> tuple[tuple[float, ...], ...]:
+    """Return the rows of ``Skeleton.joints``."""
+    known = {name: _unit_row(len(index), place) for name, place in index.items()}
+    for joint, weights in given.items():
+        if joint not in JOINT:
+            hint = f"The 17 are {', '.join(JOINTS)}."
+            raise GhptDataError(where, "joints", f"{joint} is none of the 17", hint)
+        _indices(where, f"joints.{joint}", index, list(weights))
+        total = sum(weights.values())
+        if not total > 0 or min(weights.values()) < 0:
+            hint = "Give weights of at least 0, one of them more."
+            raise GhptDataError(where, f"joints.{joint}", "is no weighted mean", hint)
+        known[joint] = _mean([known[part] for part in weights], list(weights.values()))
+    for joint, choices in _MEANS.items():
+        parts = next((parts for parts in choices if known.keys() >= set(parts)), ())
+        if joint not in known and parts:
+            known[joint] = _mean([known[part] for part in parts], [1.0] * len(parts))
+    nothing = (0.0,) * len(index)
+    return tuple(known.get(joint, nothing) for joint in JOINTS)
+
+
+def _unit_row(count: int, place: int) -> tuple[float, ...]:
+    return tuple(float(column == place) for column in range(count))
+
+
+def _mean(rows: Sequence[tuple[float, ...]], weights: Sequence[float]) -> tuple[float, ...]:
+    total = sum(weights)
+    columns = zip(*rows, strict=True)
+    return tuple(
+        sum(weight * value for weight, value in zip(weights, column, strict=True)) / total
+        for column in columns
+    )
+
+
+def _both_sides(*chain: str) -> tuple[NamePair, ...]:
+    """Return the bones of a chain on the left and on the right of the body."""
+    bones = pairwise(chain)
+    sided = [(f"left_{start}", f"left_{end}") for start, end in bones]
+    return (*sided, *((_mirror(start), _mirror(end)) for start, end in sided))
+
+
+HUMAN_BONES: tuple[NamePair, ...] = (
+    *((JOINTS[start], JOINTS[end]) for start, end in BONES),
+    *_both_sides("eye", "ear"),
+    ("nose", "left_eye"),
+    ("nose", "right_eye"),
+    *_both_sides("shoulder", "hip"),
+    ("left_shoulder", "right_shoulder"),
+    ("left_hip", "right_hip"),
+    ("neck", "left_shoulder"),
+    ("neck", "right_shoulder"),
+    ("neck", "head_top"),
+    ("neck", "nose"),
+    ("mid_hip", "left_hip"),
+    ("mid_hip", "right_hip"),
+    ("mid_hip", "neck"),
+    *_both_sides("ankle", "heel", "big_toe"),
+    *_both_sides("heel", "small_toe"),
+    *_both_sides("wrist", "index"),
+    *_both_sides("wrist", "pinky"),
+    *_both_sides("wrist", "thumb"),
+)
+"""Bones between the key points of people by name, whichever of them a detector has."""
+
+HUMAN36M = make_skeleton(
+    "ghpt.skeleton",
+    "human36m",
+    JOINTS,
+    bones=[(JOINTS[start], JOINTS[end]) for start, end in BONES],
+)
+"""The 17 joints as a skeleton of their own."""

@@ -21,7 +21,7 @@ from ghpt.data.formats.movement_files import (
 )
 from ghpt.data.formats.openpose import read_openpose
 from ghpt.data.formats.own_npz import read_own, write_key_points
-from ghpt.data.formats.skeletons import joints_of, parts_of
+from ghpt.data.formats.skeletons import find_skeleton
 from ghpt.data.formats.validate import frame_rate, open_input
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
@@ -52,14 +52,15 @@ def read_key_points(
     """
     path = Path(path)
     rate = None if rate_hz is None else frame_rate(path, rate_hz)
-    if skeleton is not None:
-        joints_of(path, skeleton)
+    wanted = None if skeleton is None else find_skeleton(path, skeleton)
     if format is not None and format not in FORMATS:
         raise GhptDataError(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
     people = FORMATS[format or _format_of(path)](path, skeleton)
-    parts_of(path, people.joints)
+    if wanted is not None and wanted.key_points == people.joints:
+        people = replace(people, own_skeleton=wanted)
+    people.skeleton.require_joints(path)
     seen_by = set(people.view[people.points.valid.any(-1)].tolist())
     for view, name in enumerate(people.views):
         if view not in seen_by:

@@ -1,84 +1,71 @@
-"""The skeletons of common 2D detectors, by joint name, and their map to the project's 17 joints."""
+"""The skeletons of common 2D detectors, by name, and their map to the project's 17 joints."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
 
 import numpy as np
+import yaml
 from jaxtyping import Bool, Float
 
-from ghpt.data.datasets.panoptic import COCO19
+from ghpt.config import CONF, settings
 from ghpt.data.points import KeyPoints
-from ghpt.errors import GhptDataError
-from ghpt.skeleton import JOINTS
+from ghpt.errors import GhptConfigError, GhptDataError
+from ghpt.skeleton import JOINTS, Skeleton, make_skeleton
+
+_FOLDER = CONF / "skeletons"
+_SUFFIXES = (".yaml", ".yml")
+_LARGEST = 1 << 20
+"""Bytes of a file."""
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""libyaml's, which is ten times as fast, where it is there."""
+_HINT = "See docs/skeletons.md for what the file holds."
 
 
-def _sides(*names: str) -> tuple[str, ...]:
-    return tuple(f"{side}_{name}" for name in names for side in ("left", "right"))
+@dataclass(frozen=True)
+class SkeletonFile:
+    """What the yaml of a skeleton holds; see `make_skeleton`."""
+
+    key_points: list[str]
+    bones: list[list[str]] | None = None
+    pairs: list[list[str]] = field(default_factory=list)
+    joints: dict[str, dict[str, float]] = field(default_factory=dict)
 
 
-_LIMBS = _sides("shoulder", "elbow", "wrist", "hip", "knee", "ankle")
-_FEET = ("big_toe", "small_toe", "heel")
-_COCO_17 = ("nose", *_sides("eye", "ear"), *_LIMBS)
-_OPENPOSE_BODY = (
-    "nose",
-    "neck",
-    "right_shoulder",
-    "right_elbow",
-    "right_wrist",
-    "left_shoulder",
-    "left_elbow",
-    "left_wrist",
-)
-_OPENPOSE_LEGS = ("right_hip", "right_knee", "right_ankle", "left_hip", "left_knee", "left_ankle")
-_OPENPOSE_HEAD = ("right_eye", "left_eye", "right_ear", "left_ear")
-_LEFT_FOOT_FIRST = tuple(f"{side}_{part}" for side in ("left", "right") for part in _FEET)
+def read_skeleton(path: Path) -> Skeleton:
+    """Return the skeleton of a yaml, named as the file is.
+
+    Raises GhptDataError for a file that is none.
+    """
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise GhptDataError(path, "", "is larger than any skeleton", _HINT)
+        content = yaml.load(path.read_text(encoding="utf-8"), _LOADER)
+    except (OSError, UnicodeError, yaml.YAMLError, RecursionError) as error:
+        problem = f"is no yaml that can be read ({' '.join(str(error).split())[:200]})"
+        raise GhptDataError(path, "", problem, _HINT) from error
+    if not isinstance(content, dict):
+        raise GhptDataError(path, "", "is no mapping", _HINT)
+    try:
+        file = settings(SkeletonFile, content)
+    except GhptConfigError as error:
+        raise GhptDataError(path, error.key, error.problem, f"{error.hint} {_HINT}") from error
+    return make_skeleton(path, path.stem, file.key_points, file.bones, file.pairs, file.joints)
+
+
+@cache
+def _known_skeletons() -> dict[str, Skeleton]:
+    return {path.stem: read_skeleton(path) for path in sorted(_FOLDER.glob("*.yaml"))}
+
 
 SKELETONS: dict[str, tuple[str, ...]] = {
-    "human36m": JOINTS,
-    "coco_17": _COCO_17,
-    "coco_18": (*_OPENPOSE_BODY, *_OPENPOSE_LEGS, *_OPENPOSE_HEAD),
-    "coco_19": COCO19,
-    "body_25": (*_OPENPOSE_BODY, "mid_hip", *_OPENPOSE_LEGS, *_OPENPOSE_HEAD, *_LEFT_FOOT_FIRST),
-    "body_25b": (*_COCO_17, "upper_neck", "head_top", *_LEFT_FOOT_FIRST),
-    "halpe_26": (*_COCO_17, "head_top", "neck", "mid_hip", *_sides(*_FEET)),
-    "mediapipe_33": (
-        "nose",
-        "left_eye_inner",
-        "left_eye",
-        "left_eye_outer",
-        "right_eye_inner",
-        "right_eye",
-        "right_eye_outer",
-        "left_ear",
-        "right_ear",
-        "mouth_left",
-        "mouth_right",
-        *_sides(
-            "shoulder",
-            "elbow",
-            "wrist",
-            "pinky",
-            "index",
-            "thumb",
-            "hip",
-            "knee",
-            "ankle",
-            "heel",
-            "big_toe",
-        ),
-    ),
+    name: skeleton.key_points for name, skeleton in _known_skeletons().items()
 }
-"""Joints in the detector's order, in the words of ``ghpt.skeleton``. ``coco_19`` is CMU Panoptic's.
-"""
-
-_SOURCES: dict[str, tuple[tuple[str, ...], ...]] = {joint: ((joint,),) for joint in JOINTS} | {
-    "pelvis": (("pelvis",), ("mid_hip",), ("left_hip", "right_hip")),
-    "thorax": (("thorax",), ("neck",), ("left_shoulder", "right_shoulder")),
-    "head_top": (("head_top",), ("left_eye", "right_eye", "left_ear", "right_ear")),
-}
-"""The means that may stand for a joint; the first whose parts the skeleton has is taken."""
+"""The key points of the known skeletons in the detector's order. ``coco_19`` is CMU Panoptic's."""
 
 _BONES = (
     ("nose", "left_eye"),
@@ -102,36 +89,38 @@ _CLEARLY = 0.8
 """A skeleton is told from another when its bones have less than this part of the other's length."""
 
 
-def joints_of(where: object, skeleton: str) -> tuple[str, ...]:
-    """Return the joints of a skeleton by name. Raises GhptDataError for one that is not known."""
-    name = skeleton.lower().replace("-", "_")
-    if name not in SKELETONS:
-        problem = f"there is no skeleton {skeleton!r}"
-        raise GhptDataError(where, "skeleton", problem, f"Choose from {', '.join(SKELETONS)}.")
-    return SKELETONS[name]
+def find_skeleton(where: object, skeleton: str) -> Skeleton:
+    """Return a known skeleton by name, or the one of a yaml by path.
 
-
-def parts_of(where: object, joints: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return for each of the 17 joints the detector's joints whose mean it is.
-
-    It is () where the detector has none.
-
-    Raises GhptDataError if a detector's joint is there twice or fewer than 8 of the 17 joints can
-    be had.
+    Raises GhptDataError, for the key points ``where``, for a name that is not known, and for a
+    file that holds no skeleton.
     """
-    if len(set(joints)) != len(joints):
-        twice = next(name for name in joints if list(joints).count(name) > 1)
-        raise GhptDataError(where, "joints", f"{twice} is there twice", "Name each joint once.")
-    found = {}
-    for joint, choices in _SOURCES.items():
-        found[joint] = next((parts for parts in choices if set(parts) <= set(joints)), ())
-    if "spine" not in joints and found["pelvis"] and found["thorax"]:
-        found["spine"] = ("pelvis", "thorax")
-    missing = [joint for joint in JOINTS if not found[joint]]
-    if len(missing) > 9:
-        hint = f"Name the joints as in {', '.join(SKELETONS)}; the 17 are {', '.join(JOINTS)}."
-        raise GhptDataError(where, "joints", f"lack {', '.join(missing)}", hint)
-    return [found[joint] for joint in JOINTS]
+    if skeleton.lower().endswith(_SUFFIXES):
+        return read_skeleton(Path(skeleton))
+    name = skeleton.lower().replace("-", "_")
+    known = _known_skeletons()
+    if name not in known:
+        problem = f"there is no skeleton {skeleton!r}"
+        hint = f"Choose from {', '.join(known)}, or name a yaml of your own."
+        raise GhptDataError(where, "skeleton", problem, hint)
+    return known[name]
+
+
+def joints_of(where: object, skeleton: str) -> tuple[str, ...]:
+    """Return the key points of a skeleton by name; see `find_skeleton`."""
+    return find_skeleton(where, skeleton).key_points
+
+
+def skeleton_of(where: object, key_points: Sequence[str]) -> Skeleton:
+    """Return the skeleton that has these key points in this order.
+
+    Without a known one it is what their names tell. Raises GhptDataError for a name that is there
+    twice.
+    """
+    for skeleton in _known_skeletons().values():
+        if skeleton.key_points == tuple(key_points):
+            return skeleton
+    return make_skeleton(where, "own", key_points)
 
 
 def joints17(where: object, joints: Sequence[str], points: KeyPoints) -> KeyPoints:
@@ -140,25 +129,23 @@ def joints17(where: object, joints: Sequence[str], points: KeyPoints) -> KeyPoin
     A joint that is a mean of others is valid where all of them are and has the least of their
     confidences; a joint that the detector does not have is never valid.
     """
-    index = {name: i for i, name in enumerate(joints)}
+    return map_to_joints(points, skeleton_of(where, joints))
+
+
+def map_to_joints(points: KeyPoints, skeleton: Skeleton) -> KeyPoints:
+    """Map a skeleton's undistorted key points to the 17 joints, as `joints17` says."""
     shape = (*points.valid.shape[:-1], len(JOINTS))
     pixels = np.zeros((*shape, 2), np.float32)
     confidence = np.zeros(shape, np.float32)
     valid = np.zeros(shape, np.bool_)
-    parts = parts_of(where, joints)
-    for joint, names in enumerate(parts):
-        if not names or not set(names) <= set(index):
+    for joint, weights in enumerate(skeleton.joint_weights):
+        parts = np.flatnonzero(weights)
+        if not len(parts):
             continue
-        chosen = [index[name] for name in names]
-        valid[..., joint] = points.valid[..., chosen].all(-1)
-        confidence[..., joint] = points.confidence[..., chosen].min(-1)
-        pixels[..., joint, :] = points.pixels[..., chosen, :].mean(-2)
-    spine = JOINTS.index("spine")
-    if parts[spine] == ("pelvis", "thorax"):
-        ends = [JOINTS.index(name) for name in parts[spine]]
-        valid[..., spine] = valid[..., ends].all(-1)
-        confidence[..., spine] = confidence[..., ends].min(-1)
-        pixels[..., spine, :] = pixels[..., ends, :].mean(-2)
+        valid[..., joint] = points.valid[..., parts].all(-1)
+        confidence[..., joint] = points.confidence[..., parts].min(-1)
+        mean = (weights[parts, None] * points.pixels[..., parts, :]).sum(-2)
+        pixels[..., joint, :] = mean
     pixels = np.where(valid[..., None], pixels, 0)
     return KeyPoints(pixels, np.where(valid, confidence, 0), valid)
 

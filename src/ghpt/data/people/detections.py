@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from ghpt.data.formats.skeletons import joints_of, recognise
+from ghpt.data.formats.skeletons import joints_of, recognise, skeleton_of
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
+from ghpt.skeleton import Skeleton
 
 MOST_PEOPLE = 64
 """In a view of a frame; more are no people."""
@@ -42,9 +43,16 @@ class Detections:
     points: KeyPoints
     """[N K]."""
     rate_hz: float | None = None
+    own_skeleton: Skeleton | None = None
+    """The skeleton with these joints that was asked for; None: what their names tell."""
 
     def __len__(self) -> int:
         return len(self.row)
+
+    @property
+    def skeleton(self) -> Skeleton:
+        """What is known of the joints. Raises GhptDataError for a name that is there twice."""
+        return self.own_skeleton or skeleton_of(self.path, self.joints)
 
     @classmethod
     def of_person(
