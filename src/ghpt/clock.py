@@ -40,6 +40,16 @@ class Clock:
         """Whether frames of one number were taken at one time."""
         return all(rate == 1 for rate in self.rate) and not any(self.shift)
 
+    def split(self) -> tuple[tuple[int, ...], Clock]:
+        """Return the shifts by whole frames, and the clock of what is left once they are undone;
+        nothing is undone where a view has another rate.
+        """
+        if any(rate != 1 for rate in self.rate):
+            return (0,) * len(self), self
+        whole = tuple(round(shift) for shift in self.shift)
+        rest = tuple(shift - by for shift, by in zip(self.shift, whole, strict=True))
+        return whole, Clock(self.rate, rest)
+
     def select(self, views: Sequence[int]) -> Clock:
         """Return the clock of some of the views, in this order."""
         rate = tuple(self.rate[view] for view in views)

@@ -359,6 +359,12 @@ FRAME_RATE = Mistake(
     "{camera} has another frame rate: {value:.3g} of its frames go with one of the others'",
     "take those of the others' moments (frame numbers must be of one clock)",
 )
+TIME_UNKNOWN = Mistake(
+    "time_unknown",
+    "when the frames of {cameras} were taken cannot be told from the people in view",
+    "let somebody walk and turn before all cameras, or clap",
+    Severity.WARNING,
+)
 MOVED = Mistake(
     "moved",
     "{camera} is not where the file has it: its key points lie as if it were rotated by "

@@ -47,6 +47,7 @@ class InputSettings(OutputSettings):
     skeleton: str | None
     format: str | None
     rate_hz: float | None
+    time: str
     recording: str | None
     data: Target
 

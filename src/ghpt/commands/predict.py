@@ -41,13 +41,18 @@ from ghpt.commands.prediction.statistics import (
     pose_estimate,
 )
 from ghpt.commands.prediction.verdict import Judge, Level, Measures
+from ghpt.commands.time import check_time, clock_of
 from ghpt.config import Target, build, suggest
+from ghpt.data.people.detections import Detections
+from ghpt.data.people.matching import match_views
+from ghpt.data.people.retimed import retime, shift_detections
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Chunks, Evidence, Scene
 from ghpt.export.scene import origin_note
 from ghpt.files import sweep_temporaries, write_json
+from ghpt.geometry.cameras import CameraSet
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.predictors import Classical, Learned
@@ -308,12 +313,12 @@ def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Seque
     """Return what is predicted: the user's own key points, or a recording of the data set."""
     if not settings.keypoints:
         return recording_sequence(settings)
-    sequence = _files_sequence(settings)
+    sequence = _files_sequence(settings, camera_check)
     sequence.cameras.check_calibrated(sequence.source)
     return resolve_unit(sequence, camera_check.consensus, ask=True)
 
 
-def _files_sequence(settings: PredictSettings) -> Sequence:
+def _files_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Sequence:
     cameras = own_cameras(settings, "Calib.toml")
     cameras.check_calibrated(str(settings.cameras))
     if settings.format in (None, "npz"):
@@ -321,9 +326,10 @@ def _files_sequence(settings: PredictSettings) -> Sequence:
         stored = open_stored(path, settings.skeleton, settings.rate_hz)
         if stored is not None:
             title = own_title(settings)
-            return stored_sequence(stored, cameras, settings.match, settings.views, title)
+            sequence = stored_sequence(stored, cameras, settings.match, settings.views, title)
+            return retime(sequence, clock_of(settings.time, sequence, camera_check.time))
     people = own_people(settings)
-    sequence = own_sequence(settings, people, cameras, settings.person)
+    sequence = _in_one_time(settings, people, cameras, camera_check)
     crowded = people.crowded_frames()
     if crowded:
         words = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
@@ -331,6 +337,28 @@ def _files_sequence(settings: PredictSettings) -> Sequence:
             "Several people are in %s: person %d is followed (person=).", words, settings.person
         )
     return sequence
+
+
+def _in_one_time(
+    settings: PredictSettings, people: Detections, cameras: CameraSet, camera_check: CameraCheck
+) -> Sequence:
+    """Return the person who is predicted, with all views in one time.
+
+    Who is tracked best in each view tells the time. Views are shifted by whole frames before people
+    are told apart across them, and by parts of a frame afterwards.
+    """
+    if settings.time == "estimate" or cameras.clock is not None:
+        tracked = own_sequence(settings, people, cameras, person=None)
+        clock = clock_of(settings.time, tracked, camera_check.time)
+    else:
+        check_time(settings.time)
+        return own_sequence(settings, people, cameras, settings.person)
+    whole, rest = clock.split()
+    at, _ = match_views(people.path, people.views, cameras, settings.match, settings.views)
+    by = np.zeros(len(people.views), np.int64)
+    by[at] = whole
+    shifted = shift_detections(people, by)
+    return retime(own_sequence(settings, shifted, cameras, settings.person), rest)
 
 
 def _about(

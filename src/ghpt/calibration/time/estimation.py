@@ -6,7 +6,9 @@ what is said is what beats every other shift by more than its blocks of time dif
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -27,6 +29,7 @@ from ghpt.geometry.cameras import Cameras, relative_pose
 from ghpt.geometry.epipolar import essential
 
 _ROUNDS = 10
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -47,6 +50,34 @@ class TimeEstimate:
     whole: bool
     """Whether views disagree too much for parts of a frame."""
 
+    @classmethod
+    def unknown(cls, views: int) -> TimeEstimate:
+        """Return what is known of views whose time cannot be told."""
+        return cls(
+            clock=Clock.synchronised(views),
+            shift=(0.0,) * views,
+            std=(float("inf"),) * views,
+            distinctness=(0.0,) * views,
+            determined=(False,) * views,
+            whole=False,
+        )
+
+    def among(self, views: Sequence[int], count: int) -> TimeEstimate:
+        """Return the estimate of ``count`` views of which these ``views`` were estimated."""
+        at = {view: row for row, view in enumerate(views)}
+
+        def spread(values: tuple[T, ...], fallback: T) -> tuple[T, ...]:
+            return tuple(values[at[v]] if v in at else fallback for v in range(count))
+
+        return TimeEstimate(
+            clock=Clock(spread(self.clock.rate, 1.0), spread(self.clock.shift, 0.0)),
+            shift=spread(self.shift, 0.0),
+            std=spread(self.std, float("inf")),
+            distinctness=spread(self.distinctness, 0.0),
+            determined=spread(self.determined, False),
+            whole=self.whole,
+        )
+
     @property
     def is_synchronised(self) -> bool:
         """Whether nothing says that frames of one number were taken at different times."""
@@ -62,12 +93,12 @@ class TimeEstimation:
     a shift compares, of those of the best. ``apart``: frames beyond which a shift is another one.
     ``distinctness``: least z of a shift against every other one and, where it is not 0, against 0.
     ``std``: largest standard deviation of a shift, frames. ``least``: smallest shift that is said,
-    frames. ``blocks``: of time, from which uncertainties come. ``rough``: mean
-    distance of the key points from their epipolar lines beyond which only whole frames are told,
-    and at least ``rough_least`` of them. ``smooth``: frames of the running mean before parts of a frame
-    are told. ``centred``: frames over which a residual's median is subtracted. ``rated``: cost (0
-    to 1) beyond which other rates are tried. ``rate_ratio``: largest ratio of the cost with another
-    rate to that without.
+    frames. ``blocks``: of time, from which uncertainties come. ``rough``: mean distance of the key
+    points from their epipolar lines beyond which only whole frames are told, and at least
+    ``rough_least`` of them. ``smooth``: frames of the running mean before parts of a frame are
+    told. ``centred``: frames over which a residual's median is subtracted. ``rated``: cost (0 to 1)
+    beyond which other rates are tried. ``rate_ratio``: largest ratio of the cost with another rate
+    to that without.
     """
 
     frames: int
@@ -93,7 +124,10 @@ class TimeEstimation:
     @torch.no_grad()
     def __call__(self, timeline: Timeline, cameras: Cameras) -> TimeEstimate:
         """Return when the frames of calibrated views were taken."""
-        views = all_pairs_of(len(timeline.valid), self.pairs)
+        count = len(timeline.valid)
+        if count < 2 or timeline.frames < 2 * self.blocks:
+            return TimeEstimate.unknown(count)
+        views = all_pairs_of(count, self.pairs)
         E = essential_matrices(cameras, views)
         costs = self._costs(timeline, E, views)
         slow = self._slow_views(timeline, E, costs)
@@ -161,8 +195,7 @@ class TimeEstimation:
             determined[int(weakness.argmax())] = False
         if int(determined.sum()) < 2:
             determined[:] = False
-        first = int(determined.double().argmax())
-        shift = shift - shift[first]
+        shift = shift - shift[_reference(shift, determined, self.least)]
         least = self.rough_least if is_whole else self.least
         told = self._told(pairs, shift, determined, least)
         ones = (1.0,) * count
@@ -258,9 +291,7 @@ def at_rates(found: TimeEstimate, slow: tuple[bool, ...], first: int) -> TimeEst
         )
 
     determined = found.determined
-    known = tuple(
-        ratio if known else 1.0 for ratio, known in zip(rate, determined, strict=True)
-    )
+    known = tuple(ratio if known else 1.0 for ratio, known in zip(rate, determined, strict=True))
     told = tuple(
         shift if known else 0.0
         for shift, known in zip(shifts(found.clock.shift), determined, strict=True)
@@ -273,6 +304,13 @@ def at_rates(found: TimeEstimate, slow: tuple[bool, ...], first: int) -> TimeEst
         determined=determined,
         whole=found.whole,
     )
+
+
+def _reference(shift: Float[Tensor, " V"], determined: Bool[Tensor, " V"], near: float) -> int:
+    """Return the determined view with whose time most others agree; the first of several."""
+    agree = (shift[:, None] - shift).abs() < near
+    count = (agree & determined).sum(-1)
+    return int(torch.where(determined, count, -1).argmax())
 
 
 def _levels(

@@ -127,9 +127,7 @@ class PairResiduals:
         return total.index_add(1, block, values.sum(-1))
 
 
-def _median(
-    residual: Float[Tensor, "P N J"], both: Bool[Tensor, "P N J"]
-) -> Float[Tensor, " P"]:
+def _median(residual: Float[Tensor, "P N J"], both: Bool[Tensor, "P N J"]) -> Float[Tensor, " P"]:
     masked = torch.where(both, residual.abs(), torch.nan).flatten(1)
     return masked.nanmedian(-1).values.nan_to_num(TRUNCATION)
 

@@ -31,6 +31,11 @@ class Timeline:
         """N."""
         return self.valid.shape[1]
 
+    def select(self, views: Sequence[int]) -> Timeline:
+        """Return some of the views."""
+        at = list(views)
+        return replace(self, xy=self.xy[at], valid=self.valid[at], size=self.size[at])
+
     def thinned(self, views: Sequence[bool], step: int) -> Timeline:
         """Return every ``step``-th frame of some views, and as many of the first of the others."""
         count = -(-self.frames // step)

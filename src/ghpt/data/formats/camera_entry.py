@@ -19,3 +19,5 @@ class CameraEntry:
     R: object = None
     """A 3x3 matrix or a rotation vector."""
     t: object = None
+    time: object = None
+    """``rate`` and ``shift`` of a `Clock`; None where the file does not say it."""

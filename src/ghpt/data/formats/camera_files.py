@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from ghpt.clock import Clock
 from ghpt.data.formats.camera_entry import CameraEntry
 from ghpt.data.formats.colmap import is_colmap, read_colmap
 from ghpt.data.formats.names import Name, chosen_name
@@ -158,6 +159,7 @@ def _toml_camera(path: Path, key: str, table: Mapping[str, Any], numbered: bool)
         size=table.get("size"),
         R=table.get("rotation"),
         t=table.get("translation"),
+        time=table.get("time"),
     )
 
 
@@ -314,7 +316,29 @@ def _camera_set(path: Path, content: _Content, unit_mm: float, unit_known: bool)
         t=cameras.t if calibrated else None,
         unit_mm=unit_mm,
         unit_known=unit_known,
+        clock=_clock(path, entries),
     )
+
+
+def _clock(path: Path, entries: Sequence[CameraEntry]) -> Clock | None:
+    """Return when the cameras' frames are taken; None where no camera says it."""
+    if all(entry.time is None for entry in entries):
+        return None
+    pairs = [
+        (1.0, 0.0) if entry.time is None else _rate_and_shift(path, entry) for entry in entries
+    ]
+    return Clock(tuple(rate for rate, _ in pairs), tuple(shift for _, shift in pairs))
+
+
+def _rate_and_shift(path: Path, entry: CameraEntry) -> tuple[float, float]:
+    table = entry.time if isinstance(entry.time, dict) else {}
+    values = [table.get("rate", 1.0), table.get("shift", 0.0)]
+    rate, shift = _numbers(path, entry.name, "time", values, (2,)).tolist()
+    if not isinstance(entry.time, dict) or rate <= 0:
+        problem = "is not a table of a positive rate and a shift"
+        hint = "Write time = {rate = 1.0, shift = 12.5}, or leave it out."
+        raise GhptDataError(path, f"camera {entry.name}, time", problem, hint)
+    return rate, shift
 
 
 def _intrinsics(path: Path, entry: CameraEntry) -> Float[np.ndarray, "3 3"]:

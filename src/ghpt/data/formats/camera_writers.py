@@ -13,6 +13,7 @@ from pathlib import Path
 from jaxtyping import Float
 from torch import Tensor
 
+from ghpt.clock import Clock
 from ghpt.data.formats.opencv_yml import read_yml
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
@@ -109,6 +110,7 @@ def _write_toml(
             f"rotation = {vectors[i]}",
             f"translation = {metres[i]}",
             "fisheye = false",
+            *_time(rig.clock, i),
             "",
         ]
     values = {key: json.dumps(value, ensure_ascii=False) for key, value in metadata.items()}
@@ -117,6 +119,12 @@ def _write_toml(
         path, "w", verify=lambda file: tomllib.loads(file.read_text(encoding="utf-8"))
     ) as handle:
         handle.write("\n".join(lines))
+
+
+def _time(clock: Clock | None, view: int) -> list[str]:
+    if clock is None or clock.is_synchronised:
+        return []
+    return [f"time = {{ rate = {clock.rate[view]!r}, shift = {clock.shift[view]!r} }}"]
 
 
 def _matrix(key: str, values: Float[Tensor, "rows cols"]) -> list[str]:

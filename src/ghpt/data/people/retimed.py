@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from ghpt.clock import Clock
+from ghpt.data.people.detections import Detections
 from ghpt.data.people.sequence import KeyPointSource, Rows, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -104,3 +105,12 @@ def _select(
     chosen = points[rows, np.arange(rows.shape[1])]
     valid = chosen.valid & exists[..., None]
     return KeyPoints(chosen.pixels, chosen.confidence, valid)
+
+
+def shift_detections(people: Detections, by: Int[np.ndarray, " V"]) -> Detections:
+    """Return everybody with the frames of view v counted ``by[v]`` lower, so that its frame
+    n + by[v] is of the others' frame n.
+    """
+    number = people.frame[people.row] - by[people.view]
+    frame = np.unique(number)
+    return replace(people, frame=frame, row=np.searchsorted(frame, number))
