@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ghpt.calibration.check.camera_check import CameraCheckResult
 from ghpt.calibration.check.evidence import moment
@@ -45,7 +46,7 @@ def write_mended(
         R=setup.R,
         t=setup.t,
         distortion=setup.lens,
-        size=cameras.image_size,
+        size=torch.tensor([setup.width, setup.height]).T.round().long(),
     )
     every = (*time, *result.findings)
     mended = "; ".join(finding.text for finding in every if finding.mended)
