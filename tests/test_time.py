@@ -189,10 +189,16 @@ def recorded(rig, walk, tmp_path_factory):
 def test_the_camera_check_says_and_mends_the_time_of_several_cameras(recorded, tmp_path):
     words = [f"keypoints={recorded}/points.npz", f"cameras={recorded}/Calib.toml"]
     with pytest.raises(GhptDataError, match="out_of_sync"):
-        check_cameras(cameras_settings("camera_check.frames=24", *words), tmp_path / "checked")
+        check_cameras(
+            cameras_settings("camera_check.frames=24", "camera_check.shift=2", *words),
+            tmp_path / "checked",
+        )
     mended = tmp_path / "checked"
     words = [f"keypoints={mended}/keypoints.npz", f"cameras={mended}/cameras.toml"]
-    found = check_cameras(cameras_settings("camera_check.frames=24", *words), tmp_path / "again")
+    found = check_cameras(
+        cameras_settings("camera_check.frames=24", "camera_check.shift=2", *words),
+        tmp_path / "again",
+    )
     assert found.findings == ()
     assert max(camera.error_px for camera in found.cameras) < 4
 

@@ -9,6 +9,7 @@ the size of the person tells (``ghpt.calibration.check.units``).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
