@@ -16,12 +16,10 @@ from ghpt.calibration.check.evidence import gather
 from ghpt.calibration.check.recording_time import unknown_time
 from ghpt.calibration.check.setup import setup_of
 from ghpt.calibration.comparison import (
-    Similarity,
     align,
     explain,
     rig_difference,
     triangulate_recording,
-    upright,
 )
 from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.millimetres import (
@@ -55,6 +53,8 @@ from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.similarity import Similarity
+from ghpt.geometry.upright import upright
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.observations import Recording

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 
+import numpy as np
 import torch
 
 from ghpt.calibration.check.recording_time import (
@@ -15,9 +16,13 @@ from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.estimation import TimeEstimate, TimeEstimation
 from ghpt.calibration.time.uncalibrated import UncalibratedShifts
 from ghpt.clock import Clock
-from ghpt.data.people.retimed import retime
+from ghpt.commands.inputs import InputSettings, own_detector_sequence, own_sequence
+from ghpt.data.people.detections import Detections
+from ghpt.data.people.matching import match_views
+from ghpt.data.people.retimed import retime, shift_detections
 from ghpt.data.people.sequence import Sequence
 from ghpt.errors import check
+from ghpt.geometry.cameras import CameraSet
 
 TIMES = ("file", "estimate", "none")
 """Where the time of the views comes from: the camera file, the people in view, the numbers of the
@@ -43,6 +48,30 @@ def clock_of(time: str, sequence: Sequence, estimation: TimeEstimation) -> Clock
     estimate = estimate_time(sequence, estimation)
     log_time(sequence.cameras.names, estimate)
     return estimate.clock
+
+
+def person_in_one_time(
+    inputs: InputSettings,
+    people: Detections,
+    cameras: CameraSet,
+    person: int,
+    estimation: TimeEstimation,
+) -> Sequence:
+    """Return one person with all key points of the detector, and all views in one time.
+
+    Who is tracked best in each view tells the time. Views are shifted by whole frames before people
+    are told apart across them, and by parts of a frame afterwards.
+    """
+    check_time(inputs.time)
+    if inputs.time != "estimate" and (inputs.time == "none" or cameras.clock is None):
+        return own_detector_sequence(inputs, people, cameras, person)
+    tracked = own_sequence(inputs, people, cameras, person=None)
+    whole, rest = clock_of(inputs.time, tracked, estimation).split()
+    at, _ = match_views(people.path, people.views, cameras, inputs.match, inputs.views)
+    by = np.zeros(len(people.views), np.int64)
+    by[at] = whole
+    shifted = shift_detections(people, by)
+    return retime(own_detector_sequence(inputs, shifted, cameras, person), rest)
 
 
 def log_time(names: tuple[str, ...], estimate: TimeEstimate) -> None:

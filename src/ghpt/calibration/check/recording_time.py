@@ -37,7 +37,8 @@ def timeline_of_sequence(sequence: Sequence, most: int) -> Timeline:
     """Return the key points of the middle ``most`` frames by the numbers of the frames."""
     first = max(0, (len(sequence) - most) // 2)
     rows = np.arange(first, min(first + most, len(sequence)))
-    points = sequence.undistorted(rows)
+    shown = sequence.as_joints() if sequence.skeleton.has_joints else sequence
+    points = shown.undistorted(rows)
     K = sequence.cameras.K
     return timeline_of(K, points.pixels, points.valid, sequence.frame[rows], most)
 
