@@ -25,6 +25,8 @@ FORMATS = (
     "panoptic",
     "human36m",
     "colmap",
+    "opencap",
+    "camera_json",
 )
 
 
