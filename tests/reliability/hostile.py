@@ -216,6 +216,32 @@ def panoptic(folder: Path) -> Path:
     return folder / "calibration.json"
 
 
+def fields(view: int) -> dict[str, Any]:
+    rig = panoptic_rig((1, 2))
+    return {
+        "intrinsicMat": rig.cameras.K[view].numpy(),
+        "distortion": rig.distortion[view].numpy(),
+        "imageSize": np.array([[1080.0], [1920.0]]),
+        "rotation": rig.cameras.R[view].numpy(),
+        "translation": rig.cameras.t[view].numpy()[:, None],
+    }
+
+
+def opencap(folder: Path) -> Path:
+    for view in (1, 0):
+        path = folder / f"{view}.pickle"
+        path.write_bytes(pickle.dumps(fields(view)))
+    return path
+
+
+def camera_json(folder: Path) -> Path:
+    for view in (1, 0):
+        path = folder / f"{view}.json"
+        values = {name: value.tolist() for name, value in fields(view).items()}
+        path.write_text(json.dumps({"convention": "opencv", "world2cam": True} | values))
+    return path
+
+
 def human36m(folder: Path) -> Path:
     rig = panoptic_rig((1, 2))
     intrinsics = {
@@ -434,6 +460,8 @@ FORMATS: dict[str, Format] = {
     "panoptic": Format(
         panoptic, lambda folder: read_cameras(folder / "calibration.json"), mutate_json
     ),
+    "opencap": Format(opencap, read_cameras, mutate_records),
+    "camera_json": Format(camera_json, read_cameras, mutate_json),
     "human36m": Format(human36m, lambda folder: read_cameras(folder / "cameras.json"), mutate_json),
     "colmap": Format(colmap, lambda folder: read_cameras(folder, unit_mm=1), mutate_records),
 }
@@ -464,7 +492,7 @@ def part_of(found: Any, whole: Any) -> bool:
         return all(
             one[name] is None or np.array_equal(one[name], other[name])
             for name in one
-            if name != "unit_known"
+            if name not in ("unit_known", "unposed")
         )
     if not {*one["views"]} <= {*other["views"]} or one["joints"] != other["joints"]:
         return False

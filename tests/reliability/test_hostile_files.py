@@ -29,6 +29,8 @@ FORMATS = (
     "panoptic",
     "human36m",
     "colmap",
+    "opencap",
+    "camera_json",
 )
 HDF5 = ("sleap", "deeplabcut")
 """Read by h5py, which is an extra."""

@@ -49,6 +49,7 @@ class InputSettings(OutputSettings):
     session: Name
     least_confidence: float
     rate_hz: float | None
+    time: str
     recording: str | None
     data: Target
 

@@ -93,8 +93,8 @@ def check_image_sizes(where: str, points: KeyPoints, cameras: CameraSet) -> None
                 "turned by 90 degrees, or x and y exchanged"
             )
             hint = (
-                "Detect in images that are turned as the calibration's, "
-                "or calibrate the turned ones."
+                "Detect in images that are turned as the calibration's, or give the cameras of "
+                "the turned ones, which cameras.py writes."
             )
         raise GhptDataError(where, f"view {cameras.names[view]}", problem, hint)
 
