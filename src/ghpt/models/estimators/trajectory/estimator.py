@@ -85,17 +85,30 @@ class Trajectory:
 
         A joint is estimated where it is observed or supported.
         """
+        return self._estimate(batch, least_views=1)
+
+    @torch.no_grad()
+    def complete(self, batch: Observations) -> PoseEstimate:
+        """Return the same with joints that no view sees, near frames in which they are observed."""
+        return self._estimate(batch, least_views=0)
+
+    def _estimate(self, batch: Observations, least_views: int) -> PoseEstimate:
         pieces = []
         for rows in _recordings(batch):
             part = batch.rows(rows)
             found = self.solve(part, self.start(part))
-            count = found.views.sum(1)
-            observed = count >= 2
-            supported = (count == 1) & self.within_reach(part, observed)
+            agreeing = found.views.sum(1)
+            observed = agreeing >= 2
+            carried = (agreeing >= least_views) & self.within_reach(part, observed)
             points = found.points.to(part.key_points.dtype)
-            pieces.append(PoseEstimate(points, observed | supported))
+            pieces.append(PoseEstimate(points, observed | carried))
         points = torch.cat([piece.points for piece in pieces])
         return PoseEstimate(points, torch.cat([piece.estimated for piece in pieces]))
+
+    def at_rate(self, batch: Observations, rate_hz: float | None) -> Trajectory:
+        """Return the same for a recording with these frames, so many in a second."""
+        clock = Clock.of_frames(batch.index.numpy(), rate_hz, self.longest_gap_s)
+        return replace(self, clock=clock)
 
     def fitted(self, batch: Observations) -> Trajectory:
         """Return the same with the body, and the inflation, that these frames show.
