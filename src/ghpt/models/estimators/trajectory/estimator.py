@@ -29,6 +29,10 @@ from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import HUMAN36M, Skeleton
 
 
+_LEAST_EXPONENT = 0.25
+"""Of the confidences: less than a single frame needs, since many frames are averaged."""
+
+
 @dataclass(frozen=True)
 class TrajectoryPart:
     """The trajectory of N frames, as they were given."""
@@ -121,7 +125,9 @@ class Trajectory:
         exchanged = found.exchanged
         error = reprojection_error(batch.cameras, exchanged.key_points, found.points)
         relative = error / person_scale(batch.key_points, batch.valid)[..., None]
-        exponent = confidence_exponent(relative, exchanged.confidence, exchanged.valid)
+        exponent = confidence_exponent(
+            relative, exchanged.confidence, exchanged.valid, _LEAST_EXPONENT
+        )
         weighted = replace(self, exponent=min(exponent, self.largest_exponent))
         frames, _ = weighted._frames(batch, first)
         fitted = replace(weighted, body=self.solver(frames, self.skeleton).body)
