@@ -29,8 +29,8 @@ from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import HUMAN36M, Skeleton
 
 
-_LEAST_EXPONENT = 0.25
-"""Of the confidences: less than a single frame needs, since many frames are averaged."""
+_LEAST_EXPONENT = 0.0
+"""Of the confidences: any that is surely positive counts, since many frames are averaged."""
 
 
 @dataclass(frozen=True)
