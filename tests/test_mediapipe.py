@@ -26,7 +26,7 @@ def test_rows_become_an_array_whatever_their_order(tmp_path):
     for t, v, k in zip(*np.nonzero(there), strict=True):
         x, y = pixels[t, v, k].tolist()
         rows.append(f"{frames[t]},{ports[v]},{t},1.5,{k},{x!r},{y!r},,")
-    rows += ["5,0,0,1.5,400,1,2,,", "5,2,0,1.5,100,1,2,,"]
+    rows += ["5,0,0,1.5,400,1,2,,", "5,2,0,1.5,500,1,2,,"]
     found = read_person(table(tmp_path, *rng.permutation(rows)))
     assert found.views == ("cam_0", "cam_2", "cam_10")
     assert found.frame.tolist() == frames
@@ -58,6 +58,15 @@ def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):
 def test_a_bad_table_is_named(rows, says, tmp_path):
     with pytest.raises(GhptDataError, match=says):
         read_person(table(tmp_path, *rows))
+
+
+def test_hands_come_behind_the_body_the_right_one_first(tmp_path):
+    rows = ["0,0,0,0,0,1,2,,", "0,0,0,0,100,3,4,,", "0,0,0,0,220,5,6,,", "0,1,0,0,0,1,2,,"]
+    found = read_person(table(tmp_path, *rows))
+    assert found.joints == SKELETONS["mediapipe_75"]
+    assert found.key_points[0, 0, found.joints.index("right_hand_root")].tolist() == [3, 4]
+    assert found.key_points[0, 0, found.joints.index("left_pinky_finger4")].tolist() == [5, 6]
+    assert found.valid.sum() == 4
 
 
 def test_another_csv_is_not_taken_for_it(tmp_path):
