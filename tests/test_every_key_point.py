@@ -49,7 +49,8 @@ def recording(folder, names=HALPE, valid=None):
     key_points = KeyPoints(pixels, valid.astype(float), valid)
     path = folder / "points.npz"
     write_key_points(path, views, names, np.arange(FRAMES), key_points, 50.0)
-    return [f"keypoints={path}", f"cameras={cameras_file(folder)}", f"output={folder / 'out'}"]
+    words = [f"keypoints={path}", f"cameras={cameras_file(folder)}", f"output={folder / 'out'}"]
+    return [*words, "estimator=frame"]
 
 
 @pytest.fixture(scope="module")
