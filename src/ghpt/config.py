@@ -305,9 +305,10 @@ def check_type(value: Any, wanted: Any, key: str) -> None:
             check_type(value[name], inner, f"{key}.{name}".lstrip("."))
     elif not _fits(value, wanted):
         shown = "null" if value is None else repr(value)
-        raise GhptConfigError(
-            key, f"is {shown}, not {_words(wanted)}", "Give a value of this kind."
-        )
+        hint = "Give a value of this kind."
+        if isinstance(value, str | int | float) and _fits([value], wanted):
+            hint = f"Give a list: {key}=[{value}]."
+        raise GhptConfigError(key, f"is {shown}, not {_words(wanted)}", hint)
 
 
 def _parameters(target: Any) -> tuple[dict[str, tuple[Any, bool]], bool]:
