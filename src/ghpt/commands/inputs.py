@@ -47,7 +47,10 @@ class InputSettings(OutputSettings):
     match: dict[Name, Name] | None
     skeleton: str | None
     format: str | None
+    session: Name
+    least_confidence: float
     rate_hz: float | None
+    time: str
     recording: str | None
     data: Target
 
@@ -73,7 +76,14 @@ def own_people(inputs: InputSettings) -> Detections:
     """Return everybody in the user's key points."""
     path = _required_path(inputs)
     try:
-        return read_key_points(path, inputs.skeleton, inputs.rate_hz, inputs.format)
+        return read_key_points(
+            path,
+            inputs.skeleton,
+            inputs.rate_hz,
+            inputs.format,
+            inputs.session,
+            inputs.least_confidence,
+        )
     except GhptDataError as error:
         cameras = Path(inputs.cameras) if inputs.cameras else None
         raise explain_key_points(error, path, cameras) from error

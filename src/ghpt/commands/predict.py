@@ -20,7 +20,6 @@ from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
-    own_detector_sequence,
     own_people,
     own_title,
     recording_sequence,
@@ -43,7 +42,9 @@ from ghpt.commands.prediction.statistics import (
 )
 from ghpt.commands.prediction.verdict import Judge, Level, Measures
 from ghpt.commands.prediction.world import World, choose_world
+from ghpt.commands.time import clock_of, person_in_one_time
 from ghpt.config import Target, build, suggest
+from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
@@ -319,7 +320,8 @@ def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Seque
     """Return what is predicted: the user's own key points, or a recording of the data set."""
     if not settings.keypoints:
         return recording_sequence(settings)
-    sequence = needed_key_points(settings, _files_sequence(settings))
+    found = _files_sequence(settings, camera_check)
+    sequence = needed_key_points(settings, found)
     sequence.cameras.check_calibrated(sequence.source)
     return resolve_unit(sequence, camera_check.consensus, ask=True)
 
@@ -338,17 +340,19 @@ def needed_key_points(settings: PredictSettings, sequence: Sequence) -> Sequence
     return sequence.select_key_points(parts.tolist())
 
 
-def _files_sequence(settings: PredictSettings) -> Sequence:
+def _files_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Sequence:
     cameras = own_cameras(settings, "Calib.toml")
     cameras.check_calibrated(str(settings.cameras))
-    if settings.format in (None, "npz"):
+    if settings.format in (None, "npz") and settings.session is None:
         path = str(settings.keypoints)
-        stored = open_stored(path, settings.skeleton, settings.rate_hz)
+        least = settings.least_confidence
+        stored = open_stored(path, settings.skeleton, settings.rate_hz, least)
         if stored is not None:
             title = own_title(settings)
-            return stored_sequence(stored, cameras, settings.match, settings.views, title)
+            sequence = stored_sequence(stored, cameras, settings.match, settings.views, title)
+            return retime(sequence, clock_of(settings.time, sequence, camera_check.time))
     people = own_people(settings)
-    sequence = own_detector_sequence(settings, people, cameras, settings.person)
+    sequence = person_in_one_time(settings, people, cameras, settings.person, camera_check.time)
     crowded = people.crowded_frames()
     if crowded:
         words = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
