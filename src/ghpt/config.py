@@ -380,7 +380,7 @@ def _words(wanted: Any) -> str:
     origin = get_origin(wanted)
     inner = get_args(wanted)
     if origin in (Union, types.UnionType):
-        plain_ones = [one for one in inner if _is_plain(one)]
+        plain_ones = [one for one in inner if _is_plain(one) or get_origin(one) is list]
         return " or ".join(dict.fromkeys(map(_words, plain_ones or inner)))
     if origin is Literal:
         return ("one of " if len(inner) > 1 else "") + ", ".join(map(repr, inner))

@@ -144,11 +144,9 @@ def _check_single(override: Override) -> None:
     if not override.is_sweep_override() or key.startswith("hydra"):
         return
     text = str(override.input_line).partition("=")[2]
-    point = text.replace(",", ".")
-    is_number = re.fullmatch(r"-?\d+,\d+", text)
     hint = f"For a list, write '{key}=[{text}]'; to run with each in turn, add -m."
-    if is_number:
-        hint = f"A number has a point: {key}={point}. {hint}"
+    if re.fullmatch(r"-?\d+,\d+", text):
+        hint = f"A number has a point: {key}={text.replace(',', '.')}. {hint}"
     raise GhptConfigError(key, f"has several values ({text})", hint)
 
 
