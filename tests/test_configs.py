@@ -116,7 +116,7 @@ def test_the_adaptive_ransac_of_the_tables_is_everyone_s():
     config = compose("predict")
     users = (
         config["view_weights"]["consensus"],
-        *(config["estimator"][kind]["flips"]["estimator"] for kind in ("classical", "learned")),
+        *(config["predictor"][kind]["flips"]["estimator"] for kind in ("classical", "learned")),
     )
     assert all(settings == config["baselines"]["adaptive_ransac"] for settings in users)
 
