@@ -88,10 +88,10 @@ class CalibrateSettings(InputSettings):
     calibration: Target
     baselines: dict[str, Target]
     camera_check: Target
+    estimator: str
     start_times: Target
     intrinsics: Target
     image_size: list[int] | None
-    triangulation: str
     evaluated_frames: int
     seed: int
 
@@ -104,9 +104,9 @@ class CalibrateSettings(InputSettings):
             check(sane, "image_size", f"is {self.image_size}", example)
             hint = "Give the image size or the cameras' file."
             check(not self.cameras, "image_size", "is given beside cameras", hint)
-        name = self.triangulation
+        name = self.estimator
         hint = suggest(name, self.baselines)
-        check(name in self.baselines, "triangulation", f"is {name!r}", hint)
+        check(name in self.baselines, "estimator", f"is {name!r}", hint)
 
 
 @dataclass(frozen=True)
@@ -192,7 +192,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     are none. Returns what calibration.json holds.
     """
     calibration: RigCalibration = build(settings.calibration, "calibration")
-    name = settings.triangulation
+    name = settings.estimator
     estimator: Estimator = build(settings.baselines[name], f"baselines.{name}")
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
     case = in_one_time(settings, open_case(settings, estimator), calibration, camera_check)
@@ -227,7 +227,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         intrinsics=case.intrinsics,
         world=solution.world,
         reference=None if reference is None else case.reference,
-        triangulation=settings.triangulation,
+        triangulation=settings.estimator,
         converged=estimate.converged,
         usable=tuple(cameras.names[view] for view in usable),
         cameras=calibrated_cameras(estimate, change, cameras),

@@ -28,10 +28,13 @@ from ghpt.export.scene import (
 from ghpt.export.stream import Chunks, extent, local_points, pieces
 from ghpt.files import atomic_write
 from ghpt.geometry.masking import where
-from ghpt.reconstruction import About, Reconstruction, State
+from ghpt.reconstruction import About, Reconstruction
 
 MOST_FRAMES = 6000
-"""A page holds no more: 2.5 MB. Of longer recordings it has every n-th frame, and says so."""
+"""A page holds no more: 2.5 MB with 17 joints. Of longer recordings it has every n-th frame, and
+says so."""
+_MOST_JOINTS = 300_000
+"""In all frames of a page: those of 50 joints at the most frames, 7 MB."""
 _FRUSTUM = 300.0
 """Depth at which cameras are drawn, mm."""
 
@@ -58,7 +61,8 @@ def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = N
     ``about.origin``, which the page tells.
     """
     whole = extent(path, about, chunks)
-    stride = math.ceil(whole.count / MOST_FRAMES)
+    most = min(MOST_FRAMES, max(1, _MOST_JOINTS // max(len(about.joints), 1)))
+    stride = math.ceil(whole.count / most)
     parts = []
     up = torch.zeros(3, dtype=torch.float64)
     count = 0
@@ -99,7 +103,7 @@ def _resource(name: str) -> str:
 
 
 def _select_frames(about: About, piece: Reconstruction, rows: slice) -> _Frames:
-    observed = (piece.state == State.OBSERVED)[rows]
+    observed = piece.is_measured[rows]
     total = torch.where(observed, piece.error[rows], 0.0).sum(1)
     count = observed.sum(1)
     mean = torch.where(count > 0, total / count.clamp(min=1), torch.nan)
