@@ -10,16 +10,16 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 import torch
 import yaml
 
+import blank
 import children
+import quick_yaml
 import toys
 from ghpt.commands.app import Command, run
 from ghpt.data.synthetic import recordings as synthetic
-from ghpt.report import pair_tensorboard, tensorboard
 
 ROOT = Path(__file__).resolve().parents[1]
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
@@ -27,6 +27,8 @@ if WORKER:  # each of several test processes has its own core, and so have the c
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
+
+quick_yaml.use_libyaml()
 
 FIRST = (
     "test_docs.py",
@@ -126,11 +128,10 @@ def little_data(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """TensorBoard's figures stay blank: to draw them is most of what a small test costs."""
-    blank = np.zeros((8, 8, 3), np.uint8)
-    monkeypatch.setattr(tensorboard, "image", lambda figure: blank)
-    monkeypatch.setattr(pair_tensorboard, "image", lambda figure: blank)
+def blank_figures() -> Iterator[None]:
+    """Figures stay blank, see `blank`."""
+    with blank.blank_figures():
+        yield
 
 
 @pytest.fixture(scope="session")

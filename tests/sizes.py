@@ -31,7 +31,7 @@ KILLED_PREDICTIONS = _size(6, 200)
 """B3: kills of a prediction."""
 PREDICTED_FRAMES = _size(1_000, 100_000)
 """B3: frames of that prediction."""
-TRAINING_STEPS = _size(450, 20_000)
+TRAINING_STEPS = _size(240, 20_000)
 """E3: steps of a long training."""
 STREAMED_FRAMES = _size(18_000, 1_000_000)
 """E2: frames of a prediction whose memory stays flat."""

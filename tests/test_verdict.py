@@ -10,18 +10,17 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import hydra
 import numpy as np
 import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from composed import cameras_settings
+from composed import cameras_settings, compose
 from ghpt.calibration.check.units import unit_for, unit_of
 from ghpt.commands.cameras import CamerasSettings, check_cameras
 from ghpt.commands.prediction.next_commands import commands_on, setting
 from ghpt.commands.prediction.verdict import Commands, Judge, Level, Measures
-from ghpt.config import build, plain
+from ghpt.config import build
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_pose2sim
 from ghpt.data.people.persons import person_sequence
@@ -30,7 +29,7 @@ from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
-from predicting import CONF, cameras_file, config, numbers_of, walk
+from predicting import cameras_file, config, numbers_of, walk
 from single_person import SinglePerson, write_person
 
 RIG = human36m_rig("S9")
@@ -258,8 +257,7 @@ def test_images_that_are_turned_are_named(tmp_path):
 
 
 def judge() -> Judge:
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return build(plain(hydra.compose("predict", []))["verdict"], "verdict")
+    return build(compose("predict")["verdict"], "verdict")
 
 
 def said(
