@@ -23,7 +23,14 @@ def robustly(scene, loss, iterations, valid=None, tolerance=TOLERANCE):
     scale = torch.full(valid.shape[:2], SCALE, dtype=torch.float64)
     scale[:, 1] = 2 * SCALE
     result = triangulate_robustly(
-        scene.cameras, scene.key_points, valid, scale, WEIGHTS[loss], iterations, tolerance
+        scene.cameras,
+        scene.key_points,
+        valid,
+        scale,
+        torch.ones_like(scene.key_points[..., 0]),
+        WEIGHTS[loss],
+        iterations,
+        tolerance,
     )
     return result, scale
 

@@ -204,6 +204,7 @@ def calibrate_rig(
     scale = defaults["scale"] | {"height": height}
     wanted = settings(CalibrateSettings, defaults | {"scale": scale} | changes)
     rig = as_camera_set(cameras)
+    rig = rig.without_extrinsics() if rig.unposed else rig
     people = as_detections(key_points, rig, confidence)
     sequence = person_sequence(people, rig, wanted.match, wanted.views, person=None)
     case = Case(sequence, "the given calibration", is_own=True)

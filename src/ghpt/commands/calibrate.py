@@ -286,6 +286,8 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     if not settings.keypoints:
         return Case(recording_sequence(settings), "the truth", is_own=False)
     cameras = own_cameras(settings, "intrinsics.toml")
+    if cameras.unposed:
+        cameras = cameras.without_extrinsics()
     people = own_people(settings)
     sequence = own_sequence(settings, people, cameras, person=None)
     sequence = resolve_unit(sequence, estimator, ask=False)

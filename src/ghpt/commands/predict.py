@@ -49,6 +49,7 @@ from ghpt.export import WRITERS, Chunks, Evidence, Scene
 from ghpt.export.scene import origin_note
 from ghpt.files import sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
+from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.predictors import Classical, Learned
 from ghpt.models.pose.problem import PoseTriangulation
@@ -157,7 +158,7 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     None in the processes beside the first.
     """
     estimator = build_estimator(settings)
-    compared = {
+    compared: dict[str, Estimator] = {
         name: build(settings.baselines[name], f"baselines.{name}") for name in settings.compare
     }
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
@@ -181,7 +182,8 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         estimator.text,
     )
     sweep_temporaries(output)
-    predictor = estimator.predictor.fitted(sequence.read(sequence.spread(settings.fitted_frames)))
+    sample = sequence.read(sequence.spread(settings.fitted_frames))
+    predictor = estimator.predictor.fitted(sample)
     key = _shard_key(sequence, estimator, origin)
     how = RunSettings(
         settings.shard_frames, settings.batch, settings.progress_bar, settings.trainer
@@ -196,7 +198,7 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
     estimates: dict[str, Estimate] = {estimator.name: pose_estimate(predictor.rejecting_nothing())}
     for name, other in compared.items():
-        estimates.setdefault(name, other)
+        estimates.setdefault(name, other.fitted(sample))
     evaluation = evaluate(
         sequence, estimator.flips, estimates, settings.evaluated_frames, settings.batch
     )

@@ -66,12 +66,13 @@ def valid_key_points(
 def local_cameras(
     cameras: Cameras,
     valid: Bool[Tensor, "*B V"] | None = None,
+    shared: bool = False,
 ) -> tuple[Cameras, Float[Tensor, "*B 3"]]:
     """Return float64 cameras in a world whose origin is the rig's median centre, and that origin.
 
     Far from the world's origin the squares of coordinates would cost digits, and a (component-wise)
     median is not moved by one camera with absurd numbers. Invalid cameras are replaced by one at
-    the origin. ``valid``: ``valid_cameras``.
+    the origin. ``valid``: ``valid_cameras``. ``shared``: all rigs get the origin of the first one.
     """
     if valid is None:
         valid = valid_cameras(cameras)
@@ -82,6 +83,8 @@ def local_cameras(
     t = where(valid, double.t, 0.0)
     centre = where(valid, Cameras(K, R, t).centre, torch.nan)
     origin = centre.nanmedian(dim=-2).values.nan_to_num(0.0)
+    if shared:
+        origin = origin[:1].expand_as(origin)
     shift = apply(R, origin.unsqueeze(-2))
     return Cameras(K, R, t + shift), origin
 

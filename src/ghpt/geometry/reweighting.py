@@ -41,17 +41,18 @@ def triangulate_robustly(
     key_points: Float[Tensor, "B V J 2"],
     valid: Bool[Tensor, "B V J"],
     scale: Float[Tensor, "B V"],
+    confidence: Float[Tensor, "B V J"],
     weigh: Weigh,
     iterations: int,
     tolerance: float,
 ) -> Triangulation:
     """Return the iteratively reweighted least-squares points of the reprojection error.
 
-    It starts from the linear solution of all valid views. A view's weight is that of its
-    reprojection error in ``scale`` pixels over its squared depth, which turns the rows' residuals
-    into pixels; 0 behind a camera. A joint whose last step is longer than ``tolerance`` (mm) is
-    NOT_CONVERGED; one whose step is far shorter rests. Where a solution fails, the linear one
-    stands.
+    It starts from the linear solution of all valid views. A view's weight is its ``confidence``
+    times that of its reprojection error in ``scale`` pixels over its squared depth, which turns the
+    rows' residuals into pixels; 0 behind a camera. A joint whose last step is longer than
+    ``tolerance`` (mm) is NOT_CONVERGED; one whose step is far shorter rests. Where a solution
+    fails, the linear one stands.
     """
     rig = flat_cameras(cameras, valid.shape[:1])
     settings = _Iteration(weigh, iterations, tolerance)
@@ -59,7 +60,7 @@ def triangulate_robustly(
     def solve(rows: slice) -> Triangulation:
         own = select_frames(rig, rows)
         system = System(own, key_points[rows], valid[rows].permute(1, 2, 0))
-        return settings.triangulate(system, valid[rows], scale[rows])
+        return settings.triangulate(system, valid[rows], scale[rows], confidence[rows])
 
     return solve_in_parts(solve, valid.shape)
 
@@ -76,6 +77,7 @@ class _Iteration:
         system: System,
         valid: Bool[Tensor, "B V J"],
         scale: Float[Tensor, "B V"],
+        confidence: Float[Tensor, "B V J"],
     ) -> Triangulation:
         """Return the robust points of a few frames, and the linear ones where that fails."""
         used = system.used
@@ -83,7 +85,8 @@ class _Iteration:
         start, cond = system.solve(used.double())
         linear = system.assess(start, cond, used, rejected)
         square = torch.where(used, scale.double().mT[:, None] ** 2, 0.0)
-        previous, weight = self._reweight(system, start, square)
+        weights = confidence.permute(1, 2, 0)
+        previous, weight = self._reweight(system, start, square, weights)
         largest = weight.amax(0).clamp(min=_TINY)
         last, cond = system.solve(weight / largest)
         robust = system.assess(last, cond, weight > 0, rejected)
@@ -99,12 +102,13 @@ class _Iteration:
         system: System,
         start: Float[Tensor, "3 J B"],
         square: Float[Tensor, "V J B"],
+        confidence: Float[Tensor, "V J B"],
     ) -> tuple[Float[Tensor, "3 J B"], Float[Tensor, "V J B"]]:
         """Return the solution before the last iteration, and the weights that it gives the views.
 
         Joints and frames are one dimension N, which shrinks to those still moving.
         """
-        all_rows = _stack_rows(system, start, square)
+        all_rows = _stack_rows(system, start, square, confidence)
         rows = all_rows
         equations = form_equations(rows[:, :4].unbind(1), rows[:, 4:8].unbind(1))
         total = rows.new_zeros(3, rows.shape[-1])
@@ -135,7 +139,7 @@ class _Iteration:
     def _step(
         self,
         equations: Float[Tensor, "V 9 N"],
-        rows: Float[Tensor, "V 13 N"],
+        rows: Float[Tensor, "V 14 N"],
         offset: Float[Tensor, "3 N"],
         active: Bool[Tensor, " N"],
     ) -> Float[Tensor, "3 N"]:
@@ -150,13 +154,14 @@ def _stack_rows(
     system: System,
     start: Float[Tensor, "3 J B"],
     square: Float[Tensor, "V J B"],
-) -> Float[Tensor, "V 13 N"]:
-    """Return both rows, the axis, the depth and the squared scale of each view, from ``start``."""
+    confidence: Float[Tensor, "V J B"],
+) -> Float[Tensor, "V 14 N"]:
+    """Return both rows, axis, depth, squared scale and confidence of each view, from ``start``."""
     a = _move_origin(system.a, start)
     b = _move_origin(system.b, start)
     axis = [r.expand_as(system.used) for r in system.views.axis]
     depth = system.views.depth(*start)
-    stacked = torch.stack((*a, *b, *axis, depth, square), dim=1)
+    stacked = torch.stack((*a, *b, *axis, depth, square, confidence), dim=1)
     return stacked.flatten(2)
 
 
@@ -168,11 +173,12 @@ def _move_origin(row: Row, origin: Float[Tensor, "3 J B"]) -> Row:
 
 
 def _weights(
-    rows: Float[Tensor, "V 13 N"],
+    rows: Float[Tensor, "V 14 N"],
     offset: Float[Tensor, "3 N"],
     weigh: Weigh,
 ) -> Float[Tensor, "V N"]:
-    ax, ay, az, right_a, bx, by, bz, right_b, rx, ry, rz, depth, square = rows.unbind(1)
+    ax, ay, az, right_a, bx, by, bz, right_b, *view = rows.unbind(1)
+    rx, ry, rz, depth, square, confidence = view
     x, y, z = offset
     over = right_a.addcmul(ax, x, value=-1)
     over.addcmul_(ay, y, value=-1).addcmul_(az, z, value=-1)
@@ -184,4 +190,4 @@ def _weights(
     square_scale = square_depth * square
     square_error = over.mul_(over).addcmul_(down, down)
     near = square_scale / square_error.add_(square_scale).add_(_TINY)
-    return weigh(near) / square_depth.add_(_TINY)
+    return weigh(near).mul(confidence) / square_depth.add_(_TINY)

@@ -175,16 +175,20 @@ def select_frames(rig: Cameras, rows: slice) -> Cameras:
 
 
 class System:
-    """The equations of a few frames, made once for any weights; arrays are [V, J, B]."""
+    """The equations of a few frames, made once for any weights; arrays are [V, J, B].
+
+    ``shared_origin``: the local worlds of all frames are one.
+    """
 
     def __init__(
         self,
         cameras: Cameras,
         key_points: Float[Tensor, "B V J 2"],
         valid: Bool[Tensor, "V J B"],
+        shared_origin: bool = False,
     ) -> None:
         camera_valid = valid_cameras(cameras)
-        self.local, self.origin = local_cameras(cameras, camera_valid)
+        self.local, self.origin = local_cameras(cameras, camera_valid, shared_origin)
         u_bounded, v_bounded = (key_points.abs() <= LARGEST).permute(3, 1, 2, 0)
         self.used = valid & u_bounded & v_bounded & camera_valid.mT[:, None]
         self.views = view_components(self.local, key_points, self.used)

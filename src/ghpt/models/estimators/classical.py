@@ -9,8 +9,8 @@ hard joints out.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal, Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,6 +20,7 @@ from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
 from ghpt.geometry.triangulation import Triangulation, triangulate
+from ghpt.models.estimators.confidence import confidence_exponent, confidence_weights
 from ghpt.observations import Observations, PoseEstimate
 
 
@@ -65,6 +66,10 @@ class Estimator(ABC):
     def triangulate(self, batch: Observations) -> Triangulation:
         """Return the batch's joints with their states."""
 
+    def fitted(self, batch: Observations) -> Self:
+        """Return the same estimator with what it takes from these frames of a recording."""
+        return self
+
     def inlier_threshold(
         self, batch: Observations, points: Float[Tensor, "B J 3"]
     ) -> Float[Tensor, " B"] | None:
@@ -100,6 +105,28 @@ class Estimator(ABC):
         return as_poses(self.triangulate(batch), batch)
 
 
+@dataclass(frozen=True)
+class ConfidenceWeighted(Estimator):
+    """An estimator that weights the views that it takes by their confidence to a power.
+
+    ``confidence_exponent``: the power; 0 counts them alike. ``fitted`` measures it on a recording.
+    """
+
+    confidence_exponent: float = field(default=0.0, kw_only=True)
+
+    def fitted(self, batch: Observations) -> Self:
+        result = self.triangulate(batch)
+        scale = person_scale(batch.key_points, batch.valid).clamp(min=1e-12)
+        error = reprojection_error(batch.cameras, batch.key_points, result.points)
+        measured = batch.valid & result.has_position[:, None]
+        exponent = confidence_exponent(error / scale[..., None], batch.confidence, measured)
+        return replace(self, confidence_exponent=exponent)
+
+    def confidence_weights(self, batch: Observations) -> Float[Tensor, "B V J"]:
+        """Return the weights of the squared residuals."""
+        return confidence_weights(batch.confidence, self.confidence_exponent)
+
+
 class Linear(Estimator):
     """All valid views with equal weights."""
 
@@ -128,7 +155,7 @@ class WeightedLinear(Estimator):
 
 
 @dataclass(frozen=True)
-class MEstimator(Estimator):
+class MEstimator(ConfidenceWeighted):
     """Iteratively reweighted least squares on the reprojection error, from the linear estimate.
 
     ``scale``: where the loss turns robust, as a fraction of the person's size in each view. Each
@@ -164,6 +191,7 @@ class MEstimator(Estimator):
             batch.key_points,
             batch.valid,
             scale.clamp(min=1e-12),
+            self.confidence_weights(batch),
             WEIGHTS[self.loss],
             self.iterations,
             self.tolerance,

@@ -15,7 +15,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.estimators.classical import (
-    Estimator,
+    ConfidenceWeighted,
     Linear,
     fall_back,
     fill_frames,
@@ -25,7 +25,7 @@ from ghpt.observations import Observations
 
 
 @dataclass(frozen=True)
-class LoRansac(Estimator):
+class LoRansac(ConfidenceWeighted):
     """pycolmap's LO-RANSAC over views for each joint, and its inliers triangulated together.
 
     ``threshold``: an inlier's largest reprojection error, as a fraction of the person's scale in
@@ -52,7 +52,7 @@ class LoRansac(Estimator):
         key_points = batch.key_points.double() / scale.clamp(min=1e-12)[..., None, None]
         rig = Cameras(K, batch.cameras.R, batch.cameras.t).to("cpu", torch.float64)
         inliers = self._find_inliers(rig, key_points.cpu().numpy(), valid.cpu().numpy())
-        weights = inliers.to(batch.key_points)
+        weights = inliers.to(batch.key_points.device) * self.confidence_weights(batch)
         robust = triangulate(batch.cameras, batch.key_points, weights)
         return fall_back(robust, Linear().triangulate(batch))
 

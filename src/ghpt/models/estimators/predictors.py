@@ -62,13 +62,16 @@ class Classical:
         self.reject = reject
 
     def fitted(self, batch: Observations) -> Classical:
-        prepared = _prepare(batch, self.flips, self.estimator)
-        clean = prepared.batch
-        result = prepared.triangulation
-        views, _ = self.estimator.inlier_views(clean, result.points, result.has_position)
+        clean = _prepare(batch, self.flips, self.estimator).batch
+        estimator = self.estimator.fitted(clean)
+        result = estimator.triangulate(clean)
+        views, _ = estimator.inlier_views(clean, result.points, result.has_position)
         uncertainty = self.uncertainty.fitted(clean, result.points, views)
         reject = self.reject and self.reject.fitted(clean, result.points, result.has_position)
-        return Classical(self.estimator, uncertainty, self.flips, reject)
+        flips = self.flips
+        if flips is not None and flips.estimator == self.estimator:
+            flips = replace(flips, estimator=estimator)
+        return Classical(estimator, uncertainty, flips, reject)
 
     def rejecting_nothing(self) -> Classical:
         """Return the same with all its joints: what it is compared with others by."""

@@ -22,13 +22,13 @@ from ghpt.geometry.triangulation import (
     solve_in_parts,
     triangulate_subsets,
 )
-from ghpt.models.estimators.classical import Estimator, fill_frames, person_scale
+from ghpt.models.estimators.classical import ConfidenceWeighted, fill_frames, person_scale
 from ghpt.observations import Observations
 from ghpt.randomness import key, uniform
 
 
 @dataclass(frozen=True)
-class Ransac(Estimator):
+class Ransac(ConfidenceWeighted):
     """For each joint the pair of views whose point has the most inliers, then the inliers together.
 
     Among equals the pair with the least residuals is taken.
@@ -54,6 +54,7 @@ class Ransac(Estimator):
         rig = flat_cameras(batch.cameras, batch.valid.shape[:1])
         scale = person_scale(batch.key_points, batch.valid)
         pairs = self._pairs(batch)
+        weights = self.confidence_weights(batch)
 
         def solve(rows: slice) -> Triangulation:
             candidates = _Candidates(
@@ -63,7 +64,8 @@ class Ransac(Estimator):
                 scale=scale[rows],
                 pairs=pairs[rows],
             )
-            return candidates.assess(self._inliers(candidates))
+            weight = weights[rows].permute(1, 2, 0)
+            return candidates.assess(self._inliers(candidates), weight)
 
         frames, views, joints = batch.valid.shape
         shape = torch.Size((frames, max(views, pairs.shape[1]), joints))
@@ -229,10 +231,15 @@ class _Candidates:
         fallback, _ = self.full
         return torch.where(fixed, point, fallback)
 
-    def assess(self, inlier: Bool[Tensor, "V J B"]) -> Triangulation:
-        """Return the Triangulation of the inliers; of all views where those have no point."""
+    def assess(
+        self, inlier: Bool[Tensor, "V J B"], weight: Float[Tensor, "V J B"]
+    ) -> Triangulation:
+        """Return the Triangulation of the inliers; of all views where those have no point.
+
+        ``weight``: of the squared residuals, > 0.
+        """
         system = self.system
-        point, cond = system.solve(inlier.double())
+        point, cond = system.solve(inlier * weight)
         robust = system.assess(point, cond, inlier, torch.zeros_like(inlier[0]))
         if robust.ok.all():
             return robust

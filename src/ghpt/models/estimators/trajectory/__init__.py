@@ -1,0 +1,1 @@
+"""A person's trajectory: robust reprojection, smooth motion and constant bones, solved at once."""

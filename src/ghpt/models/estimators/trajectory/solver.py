@@ -1,0 +1,228 @@
+"""Rounds of reweighted least squares for the trajectory of one person."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from ghpt.errors import check_positive
+from ghpt.models.estimators.trajectory.groups import (
+    BodyGroups,
+    Bones,
+    body_groups,
+    spanning_bones,
+)
+from ghpt.models.estimators.trajectory.normal_matrix import (
+    ConjugateGradients,
+    NormalEquations,
+    TimeCoupling,
+    solve,
+)
+from ghpt.models.estimators.trajectory.priors import (
+    BonePrior,
+    MotionPrior,
+    TimeAxis,
+    bone_equations,
+)
+from ghpt.models.estimators.trajectory.rows import ReprojectionRows
+
+_MEDIAN_LENGTH = 1.1774
+"""Median length of a 2D vector whose coordinates are normal with deviation 1: sqrt(2 ln 2)."""
+_START_DEVIATION = 10.0
+"""Of the points that the solver starts from, mm, where they are first joined through time."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """What a recording says of its person and of the detector: the same in all of its frames."""
+
+    scale: Float[Tensor, " J"]
+    """Deviation of a key point's coordinate, mm at the body's depth."""
+    length: Float[Tensor, " B"]
+    """Of the bones, mm; 0 where unknown."""
+    precision: Float[Tensor, " B"]
+    """Of their lengths, mm^-2; 0 where unknown."""
+
+
+@dataclass(frozen=True)
+class Frames:
+    """T successive frames of one person."""
+
+    rows: ReprojectionRows
+    weight: Float[Tensor, "V J T"]
+    """What the detector's confidence makes of each key point."""
+    start: Float[Tensor, "3 J T"]
+    """Points of the local world to start from; 0 where not ``placed``."""
+    placed: Bool[Tensor, "J T"]
+    axis: TimeAxis
+
+    @cached_property
+    def seen(self) -> Bool[Tensor, "J T"]:
+        """Whether any view sees the joint."""
+        return self.rows.used.any(0)
+
+
+@dataclass(frozen=True)
+class Solution:
+    """The trajectory of one person."""
+
+    points: Float[Tensor, "3 J T"]
+    """Local world, mm."""
+    body: Body
+    precision: Float[Tensor, "V J T"]
+    """Weight of each key point, mm^-2."""
+    equations: NormalEquations
+    """Of the last round."""
+
+
+@dataclass(frozen=True)
+class TrajectorySolver:
+    """Robust reprojection, smooth motion and constant bones.
+
+    ``noise``: a key point's deviation is this multiple of the one that the median residual of its
+    joint says. A residual r weighs ``(1 + (r / (kernel x deviation))^2)^-2`` (Geman-McClure), with
+    a kernel for each round: ``kernels`` without bones, then ``bone_kernels`` with them. The motion
+    prior is adapted to the current estimate before every second round. ``group``: joints that are
+    solved at once.
+    """
+
+    motion: MotionPrior
+    bones: BonePrior
+    noise: float
+    kernels: tuple[float, ...]
+    bone_kernels: tuple[float, ...]
+    group: int
+    tolerance: float
+    iterations: int
+
+    def __post_init__(self) -> None:
+        check_positive(noise=self.noise, group=self.group, tolerance=self.tolerance)
+        check_positive(iterations=self.iterations, rounds=len(self.kernels))
+
+    def __call__(self, frames: Frames, bones: Bones, body: Body | None = None) -> Solution:
+        """Return the trajectory of frames.
+
+        ``bones``: of the skeleton; those that close a circle are not used. ``body``: of the whole
+        recording; None: these frames tell.
+        """
+        state = _Rounds(self, frames, bones, body)
+        for number, kernel in enumerate(self.kernels):
+            state.update(kernel, adapt=number in (2, 4), with_bones=False)
+        for number, kernel in enumerate(self.bone_kernels):
+            state.update(kernel, adapt=number % 2 == 0, with_bones=True)
+        return state.solution()
+
+
+class _Rounds:
+    """The state of the rounds."""
+
+    def __init__(
+        self, solver: TrajectorySolver, frames: Frames, bones: Bones, body: Body | None
+    ) -> None:
+        self.solver = solver
+        self.frames = frames
+        joints = len(frames.placed)
+        kept = spanning_bones(joints, bones)
+        self.bones: Bones = tuple(bones[index] for index in kept)
+        self.single = body_groups(joints, (), 1)
+        self.groups = body_groups(joints, self.bones, solver.group)
+        self.ends = (
+            torch.tensor([start for start, _ in self.bones], dtype=torch.int64),
+            torch.tensor([end for _, end in self.bones], dtype=torch.int64),
+        )
+        start, end = self.ends
+        self.both_placed = frames.placed[start] & frames.placed[end]
+        self.near = solver.bones.near(self.both_placed, frames.axis)
+        self.given = body
+        self.deviation = solver.motion.initial(frames.axis, joints)
+        self.points = self._join_start()
+        self.body = body or self._measure(self.points)
+
+    def update(self, kernel: float, adapt: bool, with_bones: bool) -> None:
+        """Go one round."""
+        solver = self.solver
+        frames = self.frames
+        residual = frames.rows.residuals(self.points)
+        if self.given is None:
+            self.body = self._measure(self.points, residual)
+        if adapt:
+            self.deviation = solver.motion.adapted(self.points, frames.axis)
+        scale = self.body.scale[:, None]
+        robust = (1 + (residual / (kernel * scale)).square()).square().reciprocal()
+        self.precision = frames.weight * robust / scale.square()
+        blocks, right = frames.rows.sums(self.precision)
+        weighted = blocks.new_zeros(3, 0, blocks.shape[-1])
+        groups = self.single
+        bones: Bones = ()
+        if with_bones:
+            groups = self.groups
+            bones = self.bones
+            directions, _ = self._directions(self.points)
+            precision = self.near * self.body.precision[:, None]
+            weighted = bone_equations(
+                directions, self.body.length, precision, self.ends, blocks, right
+            )
+        self.equations = NormalEquations(blocks, right, self._coupling(), weighted)
+        self.points = self._solve(self.equations, bones, groups)
+
+    def solution(self) -> Solution:
+        return Solution(self.points, self.body, self.precision, self.equations)
+
+    def _join_start(self) -> Float[Tensor, "3 J T"]:
+        """Return the start with what is missing in it carried over through time."""
+        frames = self.frames
+        precision = frames.placed / _START_DEVIATION**2
+        none = torch.zeros_like(precision)
+        blocks = torch.stack((precision, none, none, precision, none, precision))
+        right = precision * frames.start
+        bones = blocks.new_zeros(3, 0, blocks.shape[-1])
+        equations = NormalEquations(blocks, right, self._coupling(), bones)
+        return self._solve(equations, (), self.single)
+
+    def _coupling(self) -> TimeCoupling:
+        return self.solver.motion.coupling(self.deviation, self.frames.seen, self.frames.axis)
+
+    def _solve(
+        self, equations: NormalEquations, bones: Bones, groups: BodyGroups
+    ) -> Float[Tensor, "3 J T"]:
+        limit = ConjugateGradients(self.solver.tolerance, self.solver.iterations)
+        start = self.points if bones else equations.right
+        return solve(equations, bones, groups, start, limit)
+
+    def _directions(
+        self, points: Float[Tensor, "3 J T"]
+    ) -> tuple[Float[Tensor, "3 B T"], Float[Tensor, "B T"]]:
+        """Return the directions and the lengths of the bones."""
+        start, end = self.ends
+        across = points[:, start] - points[:, end]
+        length = torch.linalg.vector_norm(across, dim=0)
+        return across / length.clamp(min=1e-9), length
+
+    def _measure(
+        self, points: Float[Tensor, "3 J T"], residual: Float[Tensor, "V J T"] | None = None
+    ) -> Body:
+        """Return what the current estimate says of the body."""
+        if residual is None:
+            residual = self.frames.rows.residuals(points)
+        _, lengths = self._directions(points)
+        length, precision = self.solver.bones.measure(lengths, self.both_placed)
+        return Body(self._noise(residual), length, precision)
+
+    def _noise(self, residual: Float[Tensor, "V J T"]) -> Float[Tensor, " J"]:
+        """Return the deviation of each joint's key points, mm.
+
+        That of a joint that nobody sees is the median joint's.
+        """
+        measured = torch.where(self.frames.rows.used, residual, torch.nan)
+        median = measured.transpose(0, 1).flatten(1).nanmedian(-1).values
+        typical = median.nanmedian()
+        median = torch.where(median.isnan(), typical, median).nan_to_num(1.0)
+        return self.solver.noise * (median / _MEDIAN_LENGTH).clamp(min=_LEAST_NOISE)
+
+
+_LEAST_NOISE = 1e-3
+"""mm. Key points without any error would have an infinite weight."""
