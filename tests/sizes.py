@@ -45,6 +45,10 @@ BATCHED_FRAMES = _size(3, 64)
 """C4: frames that are computed one by one."""
 ADJUSTMENTS = _size(75, 10_000)
 """D5: starts of the bundle adjustment."""
+SCENE_FRAMES = _size(28, 64)
+"""C4: frames of their batch."""
+CALIBRATED_RIGS = _size(8, 24)
+"""Rigs whose uncertainty is compared with their error."""
 GOOD_RIGS = _size(2, 100)
 """D6: recordings that give a good rig."""
 SCALED_RIGS = _size(8, 300)
