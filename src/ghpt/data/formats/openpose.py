@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,12 +29,10 @@ _MOST_FILES = 2_000_000
 def read_openpose(root: Path, skeleton: str | None) -> Detections:
     """Return everybody in OpenPose's files, or those of other detectors in its layout.
 
-    A ``person_id`` that all people of all views have, from 0 on, is taken as the person's number in
-    all views; OpenPose itself writes -1. Raises GhptDataError.
+    A ``person_id`` from 0 on is the number that the view's tracker gave; OpenPose itself writes -1
+    unless it tracks. Raises GhptDataError.
     """
     found = [read_view(folder) for folder in camera_folders(root)]
-    if not all((view.identity >= 0).all() for view in found):
-        found = [replace(view, identity=np.full_like(view.identity, -1)) for view in found]
     return merge_views(root, found, skeleton)
 
 

@@ -39,7 +39,9 @@ class Detections:
     view: Int[np.ndarray, " N"]
     """Index into ``views``; detections are in the order of views, then of frames."""
     identity: Int[np.ndarray, " N"]
-    """Number of the person, the same in all views; -1 where the files do not say."""
+    """Number that a tracker of the view gave the person, -1 where none did. It means nothing in
+    another view.
+    """
     points: KeyPoints
     """[N K]."""
     rate_hz: float | None = None
