@@ -10,6 +10,14 @@ from matplotlib.figure import Figure
 from ghpt.report import pair_tensorboard, rig_files, tensorboard
 
 
+FIGURES = (
+    (tensorboard, "skeletons"),
+    (tensorboard, "pose_prior_bars"),
+    (pair_tensorboard, "rig_figure"),
+    (rig_files, "rig_figure"),
+)
+
+
 @contextmanager
 def blank_figures() -> Iterator[None]:
     """Within the block TensorBoard's figures, and those of rigs, have nothing on them."""
@@ -17,5 +25,6 @@ def blank_figures() -> Iterator[None]:
     with ExitStack() as stack:
         for module in (tensorboard, pair_tensorboard):
             stack.enter_context(patch.object(module, "image", lambda figure: image))
-        stack.enter_context(patch.object(rig_files, "rig_figure", lambda *args: Figure((1, 1))))
+        for module, name in FIGURES:
+            stack.enter_context(patch.object(module, name, lambda *args: Figure((1, 1))))
         yield
