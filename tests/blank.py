@@ -9,7 +9,6 @@ from matplotlib.figure import Figure
 
 from ghpt.report import pair_tensorboard, rig_files, tensorboard
 
-
 FIGURES = (
     (tensorboard, "skeletons"),
     (tensorboard, "pose_prior_bars"),

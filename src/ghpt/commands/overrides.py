@@ -24,6 +24,9 @@ _SWEEP = {"-m", "--multirun"}
 _FORMER_NAMES = {
     "doctor": "camera_check",
     "swaps": "flips",
+    "triangulation": "estimator",
+    "estimator.classical": "predictor.classical",
+    "estimator.learned": "predictor.learned",
     "model.spread": "model.logit_std_cap",
 }
 """Settings by the names that scripts written for earlier versions give."""
@@ -150,11 +153,17 @@ def _chosen_groups(source: Source, overrides: Sequence[Override]) -> dict[str, s
 
 def _choices(loader: ConfigLoader, source: Source, group: str, search_path: list[str]) -> list[str]:
     """Return what a group of the configuration offers; nothing for what is no group of ours."""
-    is_setting = not search_path and not (source.folder / group).is_dir()
-    if is_setting or group.startswith("hydra/"):  # to ask Hydra costs as much as to read a file
+    is_ours = (source.folder / group).is_dir() or search_path or _names_more_folders(source)
+    if not is_ours or group.startswith("hydra/"):  # to ask Hydra costs as much as to read a file
         return []
     names = loader.get_group_options(group, config_name=source.name, overrides=search_path)
     return sorted(name for name in names if not name.startswith("_"))
+
+
+def _names_more_folders(source: Source) -> bool:
+    """Return whether the first yaml file itself says where else groups are."""
+    first = source.folder / f"{source.name}.yaml"
+    return first.is_file() and "searchpath" in first.read_text(encoding="utf-8")
 
 
 def _values(override: Override) -> list[Any]:

@@ -16,7 +16,7 @@ from ghpt.data.people.association import associate
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.following import follow_views
 from ghpt.data.people.matching import match_views
-from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels
+from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels, scale_to_images
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -65,6 +65,7 @@ def detector_sequence(
     points of images of another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
+    people = scale_to_images(people, ordered, at)
     ideal = undistort_detections(people, ordered, at)
     if person is None:
         chosen = follow_views(people)[:, at]
