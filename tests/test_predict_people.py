@@ -21,7 +21,11 @@ WORDS = ("rate_hz=50", "estimator=linear", "'formats=[npz,html]'".strip("'"))
 def truths() -> list[torch.Tensor]:
     """Two walkers side by side, and one farther off who comes in for the last six frames."""
     first = walk()[:FRAMES]
-    return [first, first.flip(0) + torch.tensor([0.0, 1400.0, 0.0]), first + 900.0 * torch.eye(3)[0]]
+    return [
+        first,
+        first.flip(0) + torch.tensor([0.0, 1400.0, 0.0]),
+        first + 900.0 * torch.eye(3)[0],
+    ]
 
 
 def key_points(folder: Path) -> Path:

@@ -72,6 +72,19 @@ _NOT_OF_SHARDS = ("command", "seed")
 """What shards do not depend on; where an estimator draws by the seed, its identity holds it."""
 _LEAST_FRAMES = 10
 """Of a person beside the first, seen by two views: fewer tell nothing of the noise."""
+_DEFAULTS = {
+    "person": None,
+    "ckpt": None,
+    "joints": "detector",
+    "world": "cameras",
+    "floor": None,
+    "markers": None,
+}
+"""Of conf/predict.yaml, which the commands to type next repeat where they are others."""
+_FEW_JOINTS = (
+    "%s: the key points give too few of the 17 joints by name: the size of the person, the cameras "
+    "and exchanged sides are not checked (docs/skeletons.md)."
+)
 _log = logging.getLogger(__name__)
 
 
@@ -123,6 +136,11 @@ class PredictSettings(InputSettings):
     verdict: Target
     strict: bool
     seed: int
+
+    def changed(self) -> dict[str, object]:
+        """Return what says whose joints are written how, where it is not the default."""
+        values = {name: getattr(self, name) for name in _DEFAULTS}
+        return {name: value for name, value in values.items() if value != _DEFAULTS[name]}
 
     def __post_init__(self) -> None:
         for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
@@ -328,8 +346,8 @@ def _judged(
     measures = _measures(result)
     asked = not person and setup.camera_check.is_worthwhile(measures.view_errors)
     mistakes = check_cameras(sequence.as_joints(), setup.camera_check) if asked else ()
-    number = person if settings.person is None else settings.person
-    commands = commands_on(settings, number, settings.ckpt, output)
+    own = settings.changed() | ({"person": person} if person else {})
+    commands = commands_on(settings, own, output)
     verdict = setup.judge(measures, mistakes, result.unit_mm, commands)
     return replace(result, verdict=verdict)
 
@@ -458,6 +476,8 @@ def needed_key_points(settings: PredictSettings, sequence: Sequence) -> Sequence
     skeleton = sequence.skeleton
     if settings.ckpt or settings.joints == "human36m":
         skeleton.require_joints(sequence.source)
+    if not skeleton.has_joints:
+        _log.warning(_FEW_JOINTS, sequence.source)
     if settings.joints == "detector":
         return sequence
     parts = np.flatnonzero(skeleton.joint_weights.any(0))

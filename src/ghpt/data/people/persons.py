@@ -114,7 +114,7 @@ def _sequence(
         cameras=cameras,
         frame=people.frame.astype(np.int64),
         rate_hz=people.rate_hz,
-        points=KeyPointArrays(ideal.take(chosen[:, at]), raw),
+        points=KeyPointArrays(ideal.take(chosen[:, at]), raw.masked()),
         skeleton=people.skeleton,
     )
 
