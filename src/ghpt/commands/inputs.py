@@ -130,7 +130,7 @@ def own_detector_sequences(
 def own_title(inputs: InputSettings) -> str:
     """Return what a report calls the user's files."""
     name = _required_path(inputs).resolve().name
-    return f"{name} with {Path(inputs.cameras or '').name}"
+    return f"{name} with {Path(inputs.cameras).name}" if inputs.cameras else name
 
 
 def _required_path(inputs: InputSettings) -> Path:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from collections.abc import Sequence as Items
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int
@@ -139,6 +140,15 @@ def undistort_detections(people: Detections, cameras: CameraSet, at: Items[int])
         pixels[indices] = points.pixels
         valid[indices] = points.valid
     return KeyPoints(pixels, people.points.confidence, valid).masked()
+
+
+def with_lenses(sequence: Sequence, cameras: CameraSet) -> Sequence:
+    """Return the sequence before the same cameras with other intrinsics and lenses, in memory."""
+    detected = sequence.detected()
+    views = [undistort_view(detected[:, view], cameras, view) for view in range(len(cameras))]
+    return replace(
+        sequence, cameras=cameras, points=KeyPointArrays(KeyPoints.stack(views), detected)
+    )
 
 
 def undistort_view(points: KeyPoints, cameras: CameraSet, camera: int) -> KeyPoints:
