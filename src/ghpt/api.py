@@ -171,7 +171,8 @@ class Predictor:
         rig = as_camera_set(cameras)
         people = as_detections(key_points, rig, confidence, rate_hz)
         wanted = self.settings
-        sequence = detector_sequence(people, rig, wanted.match, wanted.views, wanted.person)
+        person = wanted.person or 0
+        sequence = detector_sequence(people, rig, wanted.match, wanted.views, person)
         sequence = needed_key_points(wanted, sequence)
         sequence.cameras.check_calibrated(sequence.source)
         sequence = resolve_unit(
