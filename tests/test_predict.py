@@ -117,7 +117,7 @@ def test_a_folder_and_cameras_give_poses_in_every_format(command, tmp_path):
         (tmp_path / "out" / "report.md").read_text(),
         json.dumps(about.provenance),
     ):
-        assert "classical" in text
+        assert "the trajectory of the whole recording" in text
 
 
 def test_without_a_rate_the_formats_that_need_one_are_left_out_or_refused(command, tmp_path):
