@@ -1,4 +1,4 @@
-"""caliscope's CSV of MediaPipe's landmarks: a row for each point, camera and synchronised frame."""
+"""caliscope's CSV of a tracker's points: a row for each point, camera and synchronised frame."""
 
 from __future__ import annotations
 
@@ -13,18 +13,24 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.formats.skeletons import SKELETONS, joints_of, recognise_beginning
+from ghpt.data.formats.source import Source
 from ghpt.data.formats.validate import open_input
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
-COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
+_CAMERAS = ("port", "cam_id")
+"""What the column of the camera's number is called, until 2025 and since."""
+_FRAME = "sync_index"
+_POINT = ("point_id", "img_loc_x", "img_loc_y")
 _LARGEST = 2 << 30
 _LONGEST_LINE = 1 << 12
 _MOST_PORTS = 1000
 _WRITE = "It must be an xy_*.csv that caliscope wrote."
-_JOINTS = len(SKELETONS["mediapipe_33"])
+_BODY = len(SKELETONS["mediapipe_33"])
+_HANDS = 100
+"""From this number on MediaPipe's tracker counts the points of hands and face."""
 
 _LARGEST_NUMBER = 1e12
 
@@ -36,40 +42,69 @@ def is_caliscope(text: str) -> bool:
     """
     header = text.splitlines()[0] if text else ""
     names = {name.strip().strip('"') for name in re.split("[,;\t]", header)}
-    return set(COLUMNS) <= names
+    return {_FRAME, *_POINT} <= names and not names.isdisjoint(_CAMERAS)
 
 
-def read_caliscope(path: Path) -> Detections:
-    """Return the one person of the table: 33 landmarks in the views ``cam_<port>``.
+def read_caliscope(source: Source) -> Detections:
+    """Return the one person of the table, in the views ``cam_<number>``.
 
-    The frame numbers are ``sync_index``. Points beyond the body's (hands, face) are left out. There
-    is no confidence in these files. Raises GhptDataError for a table that is damaged, or that has a
-    point twice.
+    The frame numbers are ``sync_index``; there is no confidence in these files. What a point's
+    number means depends on the tracker, which the file does not name: it is the skeleton of as many
+    points, or more, whose bones fit. MediaPipe's numbers leave a gap before hands and face, which
+    are left out. Raises GhptDataError for a table that is damaged, or that has a point twice.
     """
+    path = source.path
     table = _table(path)
-    landmark = table[:, 2]
-    body = (landmark >= 0) & (landmark < _JOINTS)
-    table = table[body & np.isfinite(table).all(1)]
-    if not len(table):
-        problem = f"has no body landmark (0 to {_JOINTS - 1})"
-        raise GhptDataError(path, "point_id", problem, _WRITE)
+    table = table[np.isfinite(table).all(1) & (table[:, 2] >= 0)]
+    count, name = _body(path, table, source.skeleton)
+    table = table[table[:, 2] < count]
     frame, port, joint = table[:, :3].astype(np.int64).T
     frames, row = np.unique(frame, return_inverse=True)
     ports, view = np.unique(port, return_inverse=True)
     if len(ports) > _MOST_PORTS:
         raise GhptDataError(path, "port", f"names {len(ports)} cameras", _WRITE)
-    cell = (row * len(ports) + view) * _JOINTS + joint
+    cell = (row * len(ports) + view) * count + joint
     if len(np.unique(cell)) != len(cell):
         problem = "a point is there twice in a frame of a camera"
         raise GhptDataError(path, "point_id", problem, _WRITE)
-    shape = (len(frames), len(ports), _JOINTS)
+    shape = (len(frames), len(ports), count)
     points = np.zeros((*shape, 2))
     valid = np.zeros(shape, np.bool_)
     points.reshape(-1, 2)[cell] = table[:, 3:5]
     valid.reshape(-1)[cell] = True
+    people = valid.reshape(-1, count)
+    if name is None:
+        name = recognise_beginning(path, points.reshape(-1, count, 2), people)
+    joints = joints_of(path, name)
+    missing = len(joints) - count
+    points = np.pad(points, ((0, 0), (0, 0), (0, missing), (0, 0)))
+    valid = np.pad(valid, ((0, 0), (0, 0), (0, missing)))
     views = tuple(f"cam_{port}" for port in ports)
     key_points = KeyPoints(points, valid.astype(np.float64), valid)
-    return Detections.of_person(path, views, SKELETONS["mediapipe_33"], frames, key_points)
+    return Detections.of_person(path, views, joints, frames, key_points)
+
+
+def _body(
+    path: Path, table: Float[np.ndarray, "N 5"], skeleton: str | None
+) -> tuple[int, str | None]:
+    """Return how many points the body has, and the skeleton's name where that is known."""
+    points = np.unique(table[:, 2])
+    body = points[points < _HANDS]
+    if not len(body):
+        problem = f"has no point below {_HANDS}, and so none of a body"
+        raise GhptDataError(path, "point_id", problem, _WRITE)
+    of_mediapipe = body[-1] < _BODY and points[-1] >= _HANDS
+    count = int(body[-1] if of_mediapipe else points[-1]) + 1
+    if skeleton is not None:
+        joints = len(joints_of(path, skeleton))
+        if count > joints:
+            problem = f"has a point of number {count - 1}, and {skeleton} has {joints} points"
+            raise GhptDataError(path, "point_id", problem, "Name the skeleton of this tracker.")
+        return count, skeleton
+    if count > max(map(len, SKELETONS.values())):
+        problem = f"has points up to number {count - 1}, more than any known skeleton"
+        raise GhptDataError(path, "point_id", problem, "Name it: skeleton=.")
+    return count, "mediapipe_33" if of_mediapipe else None
 
 
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:
@@ -116,7 +151,8 @@ def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
         raise GhptDataError(path, "", "has columns that commas do not part", hint)
     try:
         header = [name.strip() for name in next(csv.reader([line]))]
-        columns = [header.index(name) for name in COLUMNS]
+        camera = next((name for name in _CAMERAS if name in header), _CAMERAS[0])
+        columns = [header.index(name) for name in (_FRAME, camera, *_POINT)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a table without rows
             table = np.loadtxt(
@@ -128,4 +164,4 @@ def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
             )
     except (ValueError, StopIteration, csv.Error) as error:
         raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
-    return table.reshape(-1, len(COLUMNS))
+    return table.reshape(-1, len(columns))
