@@ -86,17 +86,17 @@ class CalibrateSettings(InputSettings):
     calibration: Target
     baselines: dict[str, Target]
     camera_check: Target
+    estimator: str
     start_times: Target
-    triangulation: str
     evaluated_frames: int
     seed: int
 
     def __post_init__(self) -> None:
         frames = self.evaluated_frames
         check(frames >= 1, "evaluated_frames", f"is {frames}", "Give 1 or more.")
-        name = self.triangulation
+        name = self.estimator
         hint = suggest(name, self.baselines)
-        check(name in self.baselines, "triangulation", f"is {name!r}", hint)
+        check(name in self.baselines, "estimator", f"is {name!r}", hint)
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     are none. Returns what calibration.json holds.
     """
     calibration: RigCalibration = build(settings.calibration, "calibration")
-    name = settings.triangulation
+    name = settings.estimator
     estimator: Estimator = build(settings.baselines[name], f"baselines.{name}")
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
     case = in_one_time(settings, open_case(settings, estimator), calibration, camera_check)
@@ -213,7 +213,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         scale=scale,
         world=solution.world,
         reference=None if reference is None else case.reference,
-        triangulation=settings.triangulation,
+        triangulation=settings.estimator,
         converged=estimate.converged,
         usable=tuple(cameras.names[view] for view in usable),
         cameras=calibrated_cameras(estimate, change, cameras),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,8 +15,10 @@ from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d
 from scipy.special import ndtr
 
+from ghpt.config import check_arguments
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
+from ghpt.data.synthetic.actions import action_names
 from ghpt.data.synthetic.body import CAPSULES, random_body
 from ghpt.data.synthetic.detector import Detector, SimulatedDetections
 from ghpt.data.synthetic.motion import synthesize_motion
@@ -49,9 +52,9 @@ class Stay:
 
     action: str
     """Of ``actions.yaml``."""
-    place: tuple[float, float]
+    place: Sequence[float]
     """Where the motion has its middle on the floor, mm."""
-    there: tuple[tuple[float, float], ...] = ((0.0, 1.0),)
+    there: Sequence[Sequence[float]] = ((0.0, 1.0),)
     """When the person is in the scene, as shares of its length."""
     stature: float | None = None
     """mm; None: drawn as all bodies are."""
@@ -99,17 +102,21 @@ class PeopleRecording:
         return count
 
 
-def scene_of(settings: Mapping[str, object]) -> Scene:
-    """Return a scene from plain settings."""
-    values = dict(settings)
-    people = values.pop("people")
-    assert isinstance(people, list)
+def scene_of(settings: Mapping[str, Any], where: str) -> Scene:
+    """Return a scene from plain settings. Raises GhptConfigError, which names them by ``where``."""
+    check_arguments(Scene, settings, where)
     stays = []
-    for person in people:
-        there = tuple((start, end) for start, end in person.get("there", [(0.0, 1.0)]))
-        x, y = person["place"]
-        stays.append(Stay(person["action"], (x, y), there, person.get("stature")))
-    return Scene(people=tuple(stays), **values)  # type: ignore[arg-type]
+    for number, person in enumerate(settings["people"]):
+        check_arguments(Stay, person, f"{where}.people.{number}")
+        action = person["action"]
+        known = action_names()
+        check(action in known, f"{where}.people.{number}.action", f"is {action!r}", _choose(known))
+        stays.append(Stay(**person))
+    return Scene(**{**settings, "people": tuple(stays)})
+
+
+def _choose(names: Sequence[str]) -> str:
+    return f"Choose from {', '.join(names)}."
 
 
 def record_people(name: str, scene: Scene, detector: Detector, seed: int) -> PeopleRecording:
