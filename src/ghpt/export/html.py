@@ -26,12 +26,16 @@ from ghpt.export.scene import (
     upward,
 )
 from ghpt.export.stream import Chunks, extent, local_points, pieces
+from ghpt.export.together import persons_of
 from ghpt.files import atomic_write
 from ghpt.geometry.masking import where
 from ghpt.reconstruction import About, Reconstruction
 
 MOST_FRAMES = 6000
-"""A page holds no more: 2.5 MB. Of longer recordings it has every n-th frame, and says so."""
+"""A page holds no more: 2.5 MB with 17 joints. Of longer recordings it has every n-th frame, and
+says so."""
+_MOST_JOINTS = 300_000
+"""In all frames of a page: those of 50 joints at the most frames, 7 MB."""
 _FRUSTUM = 300.0
 """Depth at which cameras are drawn, mm."""
 
@@ -58,7 +62,8 @@ def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = N
     ``about.origin``, which the page tells.
     """
     whole = extent(path, about, chunks)
-    stride = math.ceil(whole.count / MOST_FRAMES)
+    most = min(MOST_FRAMES, max(1, _MOST_JOINTS // max(len(about.joints), 1)))
+    stride = math.ceil(whole.count / most)
     parts = []
     up = torch.zeros(3, dtype=torch.float64)
     count = 0
@@ -76,6 +81,7 @@ def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = N
         "rate_hz": about.rate_hz,
         "joints": about.joints,
         "bones": bones_of(about),
+        "people": persons_of(about.joints),
         "sides": [side_of(joint) for joint in about.joints],
         "stride": int(np.median(intervals)) if len(intervals) else 1,
         "frame": _base64(frames.frame, "<f8"),

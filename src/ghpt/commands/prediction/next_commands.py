@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ghpt.commands.display import display_path, shell_override
+from ghpt.commands.display import as_started, display_path, shell_override
 from ghpt.commands.inputs import InputSettings
 from ghpt.commands.prediction.verdict import Commands
 
@@ -16,8 +16,11 @@ _HEIGHT = 1750
 """mm: stands for the person's own."""
 
 
-def commands_on(inputs: InputSettings, person: int, ckpt: str | None, output: Path) -> Commands:
-    """Return the commands for what predict.py was given; each writes beside ``output``."""
+def commands_on(inputs: InputSettings, own: Mapping[str, object], output: Path) -> Commands:
+    """Return the commands for what predict.py was given; each writes beside ``output``.
+
+    ``own``: the settings of predict.py alone that are to stay as they are.
+    """
     keys = [key for key in InputSettings.__annotations__ if key != "data"]
     values = {key: getattr(inputs, key) for key in keys}
     given = {key: value for key, value in values.items() if value is not None}
@@ -25,18 +28,14 @@ def commands_on(inputs: InputSettings, person: int, ckpt: str | None, output: Pa
         del given["time"]
     if not inputs.keypoints:
         given |= {"data": inputs.data["name"]}
-    own: dict[str, object] = {"person": person} if person else {}
-    if ckpt:
-        own["ckpt"] = ckpt
 
     def command(script: str, suffix: str, values: Mapping[str, Any]) -> str:
         words = [setting(key, value) for key, value in values.items()]
-        return " ".join(
-            ["python", script, *words, shell_override("output", display_path(output) + suffix)]
-        )
+        beside = shell_override("output", display_path(output) + suffix)
+        return " ".join([as_started(f"python {script}"), *words, beside])
 
     def predict(**more: Any) -> str:
-        return command("predict.py", "_again", given | own | more)
+        return command("predict.py", "_again", {**given, **own, **more})
 
     return Commands(
         cameras=command("cameras.py", "_checked", given),

@@ -8,10 +8,11 @@ import io
 import re
 import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ghpt.data.formats.skeletons import SKELETONS, joints_of, recognise_beginning
 from ghpt.data.formats.source import Source
@@ -31,8 +32,14 @@ _WRITE = "It must be an xy_*.csv that caliscope wrote."
 _BODY = len(SKELETONS["mediapipe_33"])
 _HANDS = 100
 """From this number on MediaPipe's tracker counts the points of hands and face."""
+_PLACES = np.full(221, -1)
+"""The place in ``mediapipe_75`` of a ``point_id``: of the body, the right and the left hand."""
+_PLACES[:33] = np.arange(33)
+_PLACES[100:121] = np.arange(33, 54)
+_PLACES[200:221] = np.arange(54, 75)
 
 _LARGEST_NUMBER = 1e12
+_LARGEST_POINT = 1 << 20
 
 
 def is_caliscope(text: str) -> bool:
@@ -50,15 +57,18 @@ def read_caliscope(source: Source) -> Detections:
 
     The frame numbers are ``sync_index``; there is no confidence in these files. What a point's
     number means depends on the tracker, which the file does not name: it is the skeleton of as many
-    points, or more, whose bones fit. MediaPipe's numbers leave a gap before hands and face, which
-    are left out. Raises GhptDataError for a table that is damaged, or that has a point twice.
+    points, or more, whose bones fit. MediaPipe's numbers leave a gap before hands and face; the
+    body has 33 points, with hands 75, and the face is left out. Raises GhptDataError for a table
+    that is damaged, or that has a point twice.
     """
     path = source.path
     table = _table(path)
     table = table[np.isfinite(table).all(1) & (table[:, 2] >= 0)]
-    count, name = _body(path, table, source.skeleton)
-    table = table[table[:, 2] < count]
-    frame, port, joint = table[:, :3].astype(np.int64).T
+    numbering = _number_joints(path, table[:, 2], source.skeleton)
+    count = numbering.count
+    table = table[numbering.joint >= 0]
+    joint = numbering.joint[numbering.joint >= 0]
+    frame, port = table[:, :2].astype(np.int64).T
     frames, row = np.unique(frame, return_inverse=True)
     ports, view = np.unique(port, return_inverse=True)
     if len(ports) > _MOST_PORTS:
@@ -73,6 +83,7 @@ def read_caliscope(source: Source) -> Detections:
     points.reshape(-1, 2)[cell] = table[:, 3:5]
     valid.reshape(-1)[cell] = True
     people = valid.reshape(-1, count)
+    name = numbering.skeleton
     if name is None:
         name = recognise_beginning(path, points.reshape(-1, count, 2), people)
     joints = joints_of(path, name)
@@ -84,27 +95,41 @@ def read_caliscope(source: Source) -> Detections:
     return Detections.of_person(path, views, joints, frames, key_points)
 
 
-def _body(
-    path: Path, table: Float[np.ndarray, "N 5"], skeleton: str | None
-) -> tuple[int, str | None]:
-    """Return how many points the body has, and the skeleton's name where that is known."""
-    points = np.unique(table[:, 2])
-    body = points[points < _HANDS]
+@dataclass(frozen=True)
+class _Numbering:
+    """Which joint each row of the table is of."""
+
+    joint: Int[np.ndarray, " N"]
+    """-1 for one that is left out."""
+    count: int
+    """Of joints; the last of the skeleton may never have been seen."""
+    skeleton: str | None
+    """Its name, where that is known."""
+
+
+def _number_joints(path: Path, point: Float[np.ndarray, " N"], skeleton: str | None) -> _Numbering:
+    """Return the joints of points by their numbers. Raises GhptDataError."""
+    there = np.unique(point)
+    body = there[there < _HANDS]
     if not len(body):
         problem = f"has no point below {_HANDS}, and so none of a body"
         raise GhptDataError(path, "point_id", problem, _WRITE)
-    of_mediapipe = body[-1] < _BODY and points[-1] >= _HANDS
-    count = int(body[-1] if of_mediapipe else points[-1]) + 1
-    if skeleton is not None:
-        joints = len(joints_of(path, skeleton))
-        if count > joints:
-            problem = f"has a point of number {count - 1}, and {skeleton} has {joints} points"
-            raise GhptDataError(path, "point_id", problem, "Name the skeleton of this tracker.")
-        return count, skeleton
-    if count > max(map(len, SKELETONS.values())):
-        problem = f"has points up to number {count - 1}, more than any known skeleton"
-        raise GhptDataError(path, "point_id", problem, "Name it: skeleton=.")
-    return count, "mediapipe_33" if of_mediapipe else None
+    name = skeleton
+    if body[-1] < _BODY and there[-1] >= _HANDS:
+        known = point < len(_PLACES)
+        joint = np.where(known, _PLACES[np.where(known, point, 0).astype(np.int64)], -1)
+        has_hands = bool((joint >= _BODY).any())
+        name = name or ("mediapipe_75" if has_hands else "mediapipe_33")
+        if name == "mediapipe_33":
+            joint[joint >= _BODY] = -1
+    else:
+        joint = np.minimum(point, _LARGEST_POINT).astype(np.int64)
+    count = int(joint.max()) + 1
+    most = len(joints_of(path, name)) if name else max(map(len, SKELETONS.values()))
+    if count > most:
+        problem = f"has a point of number {there[-1]:.0f}, and {name or 'a skeleton'} has {most}"
+        raise GhptDataError(path, "point_id", problem, "Name the tracker's skeleton: skeleton=.")
+    return _Numbering(joint, count, name)
 
 
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:
