@@ -17,7 +17,7 @@ from ghpt.data.people.association import associate
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.following import follow_views
 from ghpt.data.people.matching import match_views
-from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels, scale_to_images
+from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -66,24 +66,56 @@ def detector_sequence(
     points of images of another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
-    people = scale_to_images(people, ordered, at)
     ideal = undistort_detections(people, ordered, at)
     if person is None:
-        chosen = follow_views(people)[:, at]
+        chosen = follow_views(people)
     else:
         told_apart_by = _association_points(people, ideal)
-        chosen = select_person(people, ordered, at, told_apart_by, person)[:, at]
-    raw = people.points.take(chosen)
-    check_pixels(people.path, raw, ordered)
+        chosen = select_person(people, ordered, at, told_apart_by, person)
+    return _sequence(people, ordered, at, ideal, chosen, title, check_sizes)
+
+
+def detector_sequences(
+    people: Detections,
+    cameras: CameraSet,
+    match: Mapping[Name, Name] | None = None,
+    views: Items[Name] | None = None,
+    title: str = "",
+) -> list[Sequence]:
+    """Return everybody of `tell_apart`, the most visible first, each as `detector_sequence` does.
+
+    All have the same frames. The most visible person tells whether key points are of images of
+    another size. Raises GhptDataError.
+    """
+    at, ordered = match_views(people.path, people.views, cameras, match, views)
+    ideal = undistort_detections(people, ordered, at)
+    found = tell_apart(people, ordered, at, _association_points(people, ideal))
+    return [
+        _sequence(people, ordered, at, ideal, chosen, title, check_sizes=not person)
+        for person, chosen in enumerate(found)
+    ]
+
+
+def _sequence(
+    people: Detections,
+    cameras: CameraSet,
+    at: Items[int],
+    ideal: KeyPoints,
+    chosen: Chosen,
+    title: str,
+    check_sizes: bool,
+) -> Sequence:
+    raw = people.points.take(chosen[:, at])
+    check_pixels(people.path, raw, cameras)
     if check_sizes:
-        check_image_sizes(people.path, raw, ordered)
+        check_image_sizes(people.path, raw, cameras)
     return Sequence(
         title=title,
         source=people.path,
-        cameras=ordered,
+        cameras=cameras,
         frame=people.frame.astype(np.int64),
         rate_hz=people.rate_hz,
-        points=KeyPointArrays(ideal.take(chosen), raw.masked()),
+        points=KeyPointArrays(ideal.take(chosen[:, at]), raw.masked()),
         skeleton=people.skeleton,
     )
 
