@@ -285,6 +285,8 @@ def _predict_person(
         cut_off_hz=settings.smooth,
         rate_hz=sequence.rate_hz,
     )
+    if settings.smooth and estimator.name == TRAJECTORY:
+        _log.info("smooth: a trajectory is smooth already; it is filtered once more.")
     joints = joints_of(settings, sequence.skeleton)
     about = _about(sequence, joints, estimator, gaps, setup.origin)
     if settings.markers:
