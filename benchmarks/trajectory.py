@@ -3,10 +3,10 @@
     python benchmarks/trajectory.py [--takes 20] [--split test] [--motion cmu.npz]
 
 Synthetic Human3.6M, 320 successive frames of each take. ``w``: what is spoilt is drawn anew for
-every frame; ``p``: it lasts. Prints a Markdown table: pelvis-relative MPJPE (mm) and the share of the
-joints that are estimated; then the error of velocities, coverage of the covariances against the
+every frame; ``p``: it lasts. Prints a Markdown table: pelvis-relative MPJPE (mm), the share of the
+joints that are estimated and the error of velocities; then coverage of the covariances against the
 detector's own definition of the joints, and frames per second of processor time. ``--motion``: real
-motion instead, [N 17 3] in mm with ``clip_start``, before Human3.6M's rig of the validation subject.
+motion instead, [N 17 3] in mm with ``clip_start``, before Human3.6M's rig of the validation person.
 """
 
 from __future__ import annotations
@@ -259,8 +259,11 @@ def main() -> None:
     settings = default_settings()
     trajectory: Trajectory = build_estimator(settings).predictor.trajectory
     frame: Estimator = build(settings.baselines["adaptive_ransac"], "baselines")
-    print("| condition | adaptive RANSAC mm (median) | placed % | velocity mm/frame |")
-    print("| trajectory mm (median) | placed % | velocity | |\n|---|---|---|---|---|---|---|")
+    header = ["mm (median)", "placed %", "velocity, mm/frame"]
+    columns = [
+        f"{name}, {column}" for name in ("adaptive RANSAC", "trajectory") for column in header
+    ]
+    print("|", " | ".join(["condition", *columns]), "|\n|" + "---|" * 7)
     names = [name for name in CONDITIONS if arguments.conditions in name]
     rows: dict[str, tuple[Row, Row]] = {}
     distances = []
@@ -275,6 +278,8 @@ def main() -> None:
             first = frame(batch)
             alone.add(first, one, time.process_time() - start)
             fitted = trajectory.at_rate(batch, one.rate_hz).fitted(batch)
+            if condition == "as it is":
+                fitted = fitted.calibrated(batch)
             start = time.process_time()
             found = fitted.complete(batch)
             whole.add(found, one, time.process_time() - start)

@@ -34,7 +34,7 @@ def codes(findings: tuple[Finding, ...]) -> Said:
 
 def said_by_calibrate(words: tuple[str, ...]) -> Said:
     settings = calibrate_settings(*words)
-    estimator = build(settings.baselines[settings.triangulation], "baselines")
+    estimator = build(settings.baselines[settings.estimator], "baselines")
     check = build(settings.camera_check, "camera_check")
     return codes(check_reference(open_case(settings, estimator), check))
 
@@ -104,8 +104,8 @@ MISTAKES = {
 }
 
 
-TRIED = tuple(MISTAKES) if NIGHTLY else ("none", "exchanged", "moved")
-"""Of the mistakes; the others are tried at night."""
+TRIED = tuple(MISTAKES) if NIGHTLY else ("none", "exchanged")
+"""Of the mistakes; the others are tried at night. A real recording below has a moved camera."""
 
 
 @pytest.mark.parametrize("name", TRIED)

@@ -406,7 +406,7 @@ OFF = Mistake(
 NOTHING_AGREES = Mistake(
     "nothing_agrees",
     "no two views agree, and no mistake that is known explains it",
-    "calibrate again: python calibrate.py",
+    "calibrate the rig again",
 )
 UNIT = Mistake(
     "unit",

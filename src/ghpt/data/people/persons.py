@@ -62,15 +62,15 @@ def detector_sequence(
     """Return one person with their cameras, the lens distortion undone, and all their key points.
 
     Views and cameras are matched as `match_views` says. ``person`` chooses as `select_person` says;
-    None follows the most prominent person of each view by itself. ``check_sizes`` refuses key
+    None is whoever shows what the cameras are (`follow_anybody`). ``check_sizes`` refuses key
     points of images of another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
     ideal = undistort_detections(people, ordered, at)
+    told_apart_by = _association_points(people, ideal)
     if person is None:
-        chosen = follow_views(people)
+        chosen = follow_anybody(people, ordered, at, told_apart_by)
     else:
-        told_apart_by = _association_points(people, ideal)
         chosen = select_person(people, ordered, at, told_apart_by, person)
     return _sequence(people, ordered, at, ideal, chosen, title, check_sizes)
 
@@ -213,6 +213,36 @@ def tell_apart(
             cameras.path,
         )
     return [follow_views(people)]
+
+
+def follow_anybody(
+    people: Detections, cameras: CameraSet, at: Items[int], ideal: KeyPoints
+) -> Chosen:
+    """Return the detections of one person in each frame, by whom the cameras can be judged.
+
+    The arguments are those of `tell_apart`.
+
+    1. It is the most visible of the persons on whom two views agree in this frame.
+    2. A view that agrees in less than half of the frames in which it has anybody may be off: it
+       follows the person whom it tracks best (`follow_views`), as all views do without extrinsics
+       and where nobody is ever beside another.
+    """
+    own = follow_views(people)
+    counts = people.counts()[:, at]
+    if not cameras.calibrated or not (counts > 1).any():
+        return own
+    chosen = np.full_like(own, -1)
+    for person in _across_views(people, cameras, at, ideal):
+        free = (chosen < 0).all(1)
+        chosen[free] = person[free]
+    together = (chosen >= 0).any(1)
+    if 2 * together.sum() < ((counts > 0).sum(1) >= 2).sum():
+        return own
+    for place, view in enumerate(at):
+        there = together & (counts[:, place] > 0)
+        if 2 * (chosen[there, view] >= 0).sum() < there.sum():
+            chosen[:, view] = own[:, view]
+    return chosen
 
 
 def _one_by_one(people: Detections, found: Items[Chosen]) -> list[Chosen]:

@@ -28,7 +28,6 @@ from ghpt.models.estimators.trajectory.windows import Clock, dense
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import HUMAN36M, Skeleton
 
-
 _LEAST_EXPONENT = 0.0
 """Of the confidences: any that is surely positive counts, since many frames are averaged."""
 
@@ -115,7 +114,7 @@ class Trajectory:
         return replace(self, clock=clock)
 
     def fitted(self, batch: Observations) -> Trajectory:
-        """Return the same with the body, and the inflation, that these frames show.
+        """Return the same with the body that these frames show, and the worth of confidences.
 
         They are of one recording, in the order of time; there may be gaps between them.
         """
@@ -130,13 +129,16 @@ class Trajectory:
         )
         weighted = replace(self, exponent=min(exponent, self.largest_exponent))
         frames, _ = weighted._frames(batch, first)
-        fitted = replace(weighted, body=self.solver(frames, self.skeleton).body)
+        return replace(weighted, body=self.solver(frames, self.skeleton).body)
+
+    def calibrated(self, batch: Observations) -> Trajectory:
+        """Return the same with the inflation of the covariances that these frames show."""
         views = int(batch.valid.any(-1).any(0).sum())
-        fitted = replace(fitted, inflation=self.inflation * LEAST_VIEWS / max(views, 2))
-        test = fitted.test_halves(batch)
+        prior = replace(self, inflation=self.inflation * LEAST_VIEWS / max(views, 2))
+        test = prior.test_halves(batch)
         if not test.is_decidable:
-            return fitted
-        return replace(fitted, inflation=fitted.inflation * test.inflation())
+            return prior
+        return replace(prior, inflation=prior.inflation * test.inflation())
 
     def test_halves(self, batch: Observations) -> DisjointTest:
         """Return how far the trajectories of two halves of the views are from each other.
