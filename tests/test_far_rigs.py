@@ -306,7 +306,7 @@ def test_a_file_of_the_first_version_is_still_read(tmp_path):
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"format_version": 3}, "is 3; this ghpt reads 1 and 2"),
+        ({"format_version": 4}, "is 4; this ghpt reads 1 and 2 and 3"),
         ({"format_version": True}, "is True"),
         ({"format_version": [2]}, "meta.format_version"),
         ({"format_version": 1}, "points: is not <f4"),

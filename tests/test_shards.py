@@ -171,7 +171,7 @@ def test_the_manifest_says_what_its_shards_are_of_and_their_digests(tmp_path, wh
     folder = tmp_path / "not" / "there"
     filled(folder, whole).close()
     header, *entries = lines_of(folder)
-    assert header == {"version": 3, "key": "key", "frames": 25, "shard_frames": 10}
+    assert header == {"version": 4, "key": "key", "frames": 25, "shard_frames": 10}
     for shard, entry in enumerate(entries):
         data = (folder / f"{shard:06d}.npz").read_bytes()
         digest = hashlib.sha256(data).hexdigest()

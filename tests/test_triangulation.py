@@ -253,7 +253,8 @@ def test_a_narrow_baseline_keeps_the_digits_that_squaring_would_cost():
 
 
 def test_the_numbers_of_the_states_are_those_of_the_files():
-    names = ("OBSERVED", "FILLED", "FEW_VIEWS", "PARALLEL", "BEHIND", "BAD_INPUT", "REJECTED")
+    placed = ("OBSERVED", "SUPPORTED", "FILLED")
+    names = (*placed, "FEW_VIEWS", "PARALLEL", "BEHIND", "BAD_INPUT", "REJECTED")
     assert {state.name: state.value for state in FILE_STATES} == {
         name: i for i, name in enumerate(names)
     }

@@ -125,7 +125,7 @@ def check_c3d(path, who, made):
     """
     worst = 0.0
     expected = truth(made)
-    observed = (made.state == State.OBSERVED).numpy()
+    observed = made.is_measured.numpy()
     residual = np.where(
         observed, np.clip(np.round(made.error.numpy() / RESIDUAL_STEP), 1, 255) * RESIDUAL_STEP, 0
     )
@@ -222,7 +222,7 @@ def test_e1_npz_by_numpy_and_by_its_own_reader(tmp_path):
     with np.load(path, allow_pickle=False) as stored:
         assert difference(stored["points"], truth(made)) == 0
         np.testing.assert_array_equal(stored["state"], made.state.numpy())
-        assert np.isnan(stored["error"])[(made.state != State.OBSERVED).numpy()].all()
+        assert np.isnan(stored["error"])[(~made.is_measured).numpy()].all()
         assert (str(stored["unit"]), float(stored["rate_hz"])) == ("mm", 29.97)
         assert tuple(stored["joints"]) == JOINTS
         assert json.loads(str(stored["meta"]))["provenance"] == {"seed": 3, "commit": "abc"}
