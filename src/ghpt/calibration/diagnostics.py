@@ -45,27 +45,33 @@ _SUSPICIOUS = ("resolution", "unlinked", "disagreement")
 
 
 @dataclass(frozen=True)
+class Joints:
+    """The 17 joints of the rows that a rig was calibrated from, in its world."""
+
+    points: Float[Tensor, "R 17 3"]
+    estimated: Bool[Tensor, "R 17"]
+
+
+@dataclass(frozen=True)
 class Case:
     """All that is known of a rig when it is judged."""
 
     names: tuple[str, ...]
     K: Float[Tensor, "V 3 3"]
-    key_points: Float[Tensor, "T V J 2"]
-    valid: Bool[Tensor, "T V J"]
+    key_points: Float[Tensor, "T V 17 2"]
+    valid: Bool[Tensor, "T V 17"]
     sizes: Int[Tensor, "V 2"] | None
     frames: Int[Tensor, " F"]
+    """The rows that are used."""
     observed: Correspondences
+    """The detector's own key points of these rows."""
+    joints: Joints
     table: PairTable
     adjusted: Adjusted | None
     resection: Resection
     noise: float
     """First guess of the key points' noise, in sizes of the person."""
     seed: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """The numbers of frames used and of joints."""
-        return len(self.frames), self.key_points.shape[2]
 
     @property
     def rig(self) -> PlacedRig | None:
@@ -140,7 +146,7 @@ class Diagnostics:
         if case.rig is not None and uncertainty is not None and determined:
             findings += self._agreement(case, case.rig)
             findings += self._geometry(case, case.rig)
-            findings += self._proportions(case, case.rig)
+            findings += self._proportions(case)
             findings += self._determined(case, case.rig, uncertainty)
         return (*findings, *self._repairs(case, findings))
 
@@ -253,11 +259,9 @@ class Diagnostics:
             shape = "a line" if values[1] < self.flat * values[0] else "a plane"
             yield FLAT.finding((), float(values[2] / values[0]), self.flat, shape=shape)
 
-    def _proportions(self, case: Case, rig: PlacedRig) -> Iterator[Finding]:
+    def _proportions(self, case: Case) -> Iterator[Finding]:
         lengths = torch.tensor(average_lengths(), dtype=torch.float64)
-        points = rig.points.unflatten(0, case.shape)
-        known = rig.inlier.any(0).unflatten(0, case.shape)
-        scales = bone_scales(points, known, lengths)
+        scales = bone_scales(case.joints.points, case.joints.estimated, lengths)
         scales = scales[torch.isfinite(scales)]
         if len(scales) > 1 and scales.max() > self.proportions * scales.min():
             ratio = float(scales.max() / scales.min())
