@@ -14,12 +14,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from torch import Tensor
 
-from ghpt.calibration.comparison import Similarity, align_robustly, upright
+from ghpt.calibration.comparison import align_robustly
 from ghpt.calibration.rig import RigEstimate
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.files import atomic_write, finite, remove, write_json
 from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.lens import is_fisheye
+from ghpt.geometry.similarity import Similarity
+from ghpt.geometry.upright import upright
 from ghpt.observations import Recording
 from ghpt.report.calibration import (
     CalibratedCamera,
