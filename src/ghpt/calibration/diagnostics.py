@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ghpt.calibration.bundle import Adjusted
 from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.independence import Evidence
 from ghpt.calibration.mistakes import (
     DISAGREEMENT,
     FEW_FRAMES,
@@ -18,6 +19,7 @@ from ghpt.calibration.mistakes import (
     ILL_CONDITIONED,
     LARGE_RESIDUALS,
     LITTLE_MOTION,
+    NO_MOTION,
     NOT_CONVERGED,
     NOTHING_LINKED,
     OUTSIDE_IMAGE,
@@ -68,6 +70,8 @@ class Case:
     joints: Joints
     table: PairTable
     adjusted: Adjusted | None
+    evidence: Evidence | None
+    """None without a rig."""
     resection: Resection
     noise: float
     """First guess of the key points' noise, in sizes of the person."""
@@ -106,7 +110,8 @@ class Diagnostics:
     in sizes of the rig.
 
     ``few_frames``: fewer are a finding. ``motion``: least motion of a joint in the image, in sizes
-    of the person; an error below half of it. ``flat``: least thickness of the cloud of all points,
+    of the person. ``rotation_wanted``: a larger standard deviation of a rotation is a finding that
+    says how much recording would do, and an error from ``rotation_useless`` on. ``flat``: least thickness of the cloud of all points,
     in its length. ``inliers``: least share of a view's key points that agree. ``noise``: largest
     noise of the key points that the residuals show, in sizes of the person; ``contrast``: and in
     the median of the views. ``distance``: least distance of two cameras, in sizes of the rig.
@@ -123,6 +128,8 @@ class Diagnostics:
     noise: float
     contrast: float
     distance: float
+    rotation_wanted: float
+    rotation_useless: float
     rotation_std: float
     centre_std: float
     proportions: float
@@ -147,6 +154,7 @@ class Diagnostics:
             findings += self._agreement(case, case.rig)
             findings += self._geometry(case, case.rig)
             findings += self._proportions(case)
+            findings += self._evidence(case)
             findings += self._determined(case, case.rig, uncertainty)
         return (*findings, *self._repairs(case, findings))
 
@@ -183,8 +191,7 @@ class Diagnostics:
         count = len(case.frames)
         motion = _motion(case.key_points[case.frames], case.valid[case.frames])
         if count > 1 and motion < self.motion:
-            severity = Severity.ERROR if motion < self.motion / 2 else Severity.WARNING
-            yield LITTLE_MOTION.finding((), motion, self.motion, severity, count=count)
+            yield NO_MOTION.finding((), motion, self.motion, count=count)
 
     def _resolution(self, case: Case) -> Iterator[Finding]:
         """Yield the views whose key points lie outside the image, or leave much of it unused."""
@@ -266,6 +273,22 @@ class Diagnostics:
         if len(scales) > 1 and scales.max() > self.proportions * scales.min():
             ratio = float(scales.max() / scales.min())
             yield PROPORTIONS.finding((), ratio, self.proportions)
+
+    def _evidence(self, case: Case) -> Iterator[Finding]:
+        """Yield that the recording is too short, or too much alike, for a rig to rely on."""
+        evidence = case.evidence
+        if evidence is not None and evidence.rotation_sd_deg > self.rotation_wanted:
+            useless = evidence.rotation_sd_deg > self.rotation_useless
+            yield LITTLE_MOTION.finding(
+                (),
+                evidence.rotation_sd_deg,
+                self.rotation_wanted,
+                Severity.ERROR if useless else Severity.WARNING,
+                used=evidence.used,
+                independent=evidence.independent,
+                turned=evidence.turned_deg,
+                needed=evidence.frames_for(self.rotation_wanted),
+            )
 
     def _determined(
         self, case: Case, rig: PlacedRig, uncertainty: Uncertainty

@@ -154,9 +154,33 @@ def turning(points: Float[Tensor, "R 17 3"], estimated: Bool[Tensor, "R 17"]) ->
     return Turning(_range(angle), full[before])
 
 
+@dataclass(frozen=True)
+class Evidence:
+    """What a recording is worth for its rig."""
+
+    frames: int
+    """Frames of the recording."""
+    used: int
+    """Of which the rig was calibrated from so many."""
+    independent: float
+    """The number of independent frames that these are worth."""
+    turned_deg: float
+    """By how much people turn."""
+    rotation_sd_deg: float
+    """The largest standard deviation of a camera's rotation, the angle about whatever axis."""
+    repeatability: float
+    """See ``ghpt.calibration.uncertainty.Uncertainty``."""
+
+    def frames_for(self, rotation_sd_deg: float) -> int:
+        """Return how many frames like these would give a smaller standard deviation: it falls with
+        the square root of their number.
+        """
+        return math.ceil(self.frames * (self.rotation_sd_deg / rotation_sd_deg) ** 2)
+
+
 def _range(angle: Float[Tensor, " N"]) -> float:
     """Return the part of the circle, degrees, that headings cover: all but the largest gap."""
-    low, high = angle.quantile(torch.tensor([0.01, 0.99], dtype=angle.dtype)).tolist()
+    low, high = angle.quantile(torch.tensor([0.05, 0.95], dtype=angle.dtype)).tolist()
     ordered = angle[(angle >= low) & (angle <= high)].sort().values
     if len(ordered) < 2:
         return 0.0

@@ -14,7 +14,7 @@ from torch import Tensor
 from ghpt.calibration.bundle import Adjusted, BundleAdjustment
 from ghpt.calibration.diagnostics import Case, Diagnostics, Joints
 from ghpt.calibration.findings import Finding, Severity
-from ghpt.calibration.independence import turning
+from ghpt.calibration.independence import Evidence, turning
 from ghpt.calibration.mistakes import size_finding
 from ghpt.calibration.observations import (
     Correspondences,
@@ -27,7 +27,7 @@ from ghpt.calibration.observations import (
 )
 from ghpt.calibration.pairs import PairEstimation, PairTable
 from ghpt.calibration.resection import PlacedRig, Resection
-from ghpt.calibration.uncertainty import uncertainty
+from ghpt.calibration.uncertainty import Uncertainty, uncertainty
 from ghpt.errors import GhptDataError, check_positive
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.scale import stature
@@ -68,12 +68,14 @@ class RigEstimate:
     estimated: Bool[Tensor, "T 17"]
     converged: bool
     iterations: int
+    evidence: Evidence | None
+    """What the recording is worth; None without a rig."""
     findings: tuple[Finding, ...]
 
     @property
     def rotation_std_deg(self) -> Float64[Tensor, " V"]:
         """Root mean square over the axes of the standard deviation of a camera's rotation."""
-        return torch.rad2deg((self.covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(-1)).sqrt())
+        return _rotation_std_deg(self.covariance)
 
     @property
     def centre_std(self) -> Float64[Tensor, " V"]:
@@ -182,22 +184,38 @@ class RigCalibration:
         adjusted = None
         if rig is not None:
             observed, adjusted = self.refine(observed, table, rig, seed)
+        shown = self.joints(K, joints[frames], joints_valid[frames], adjusted, seed)
+        spread = None
+        evidence = None
+        if adjusted is not None:
+            facing = turning(shown.points, shown.estimated)
+            final = adjusted.final
+            spread = uncertainty(observed, adjusted.rig, final, self.blocks, facing.sector)
+            evidence = Evidence(
+                frames=len(frame.unique()),
+                used=observed.frames,
+                independent=spread.persistence.independent,
+                turned_deg=facing.degrees,
+                rotation_sd_deg=3**0.5 * float(_rotation_std_deg(spread.covariance).max()),
+                repeatability=spread.repeatability,
+            )
         case = Case(
-            tuple(names),
-            K,
-            joints,
-            joints_valid,
-            sizes,
-            frames,
-            observed,
-            self.joints(K, joints[frames], joints_valid[frames], adjusted, seed),
-            table,
-            adjusted,
-            self.resection,
-            self.noise,
-            seed,
+            names=tuple(names),
+            K=K,
+            key_points=joints,
+            valid=joints_valid,
+            sizes=sizes,
+            frames=frames,
+            observed=observed,
+            joints=shown,
+            table=table,
+            adjusted=adjusted,
+            evidence=evidence,
+            resection=self.resection,
+            noise=self.noise,
+            seed=seed,
         )
-        return self._estimate(case)
+        return self._estimate(case, spread)
 
     def joints(
         self,
@@ -258,7 +276,7 @@ class RigCalibration:
         final = self.bundle.state(observed, adjusted.rig)
         return observed, replace(adjusted, final=final)
 
-    def _estimate(self, case: Case) -> RigEstimate:
+    def _estimate(self, case: Case, spread: Uncertainty | None) -> RigEstimate:
         views = len(case.names)
         eye = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
         rig = case.rig or PlacedRig(
@@ -271,11 +289,6 @@ class RigCalibration:
         placed = rig.placed
         nothing = torch.zeros(views, dtype=torch.float64)
         reprojection, inliers = case.agreement(rig) if placed.any() else (nothing, nothing)
-        spread = None
-        if case.adjusted is not None:
-            facing = turning(case.joints.points, case.joints.estimated)
-            final = case.adjusted.final
-            spread = uncertainty(case.observed, rig, final, self.blocks, facing.sector)
         return RigEstimate(
             names=case.names,
             cameras=Cameras(
@@ -295,8 +308,13 @@ class RigCalibration:
             estimated=case.joints.estimated,
             converged=case.adjusted is not None and case.adjusted.converged,
             iterations=0 if case.adjusted is None else case.adjusted.iterations,
+            evidence=case.evidence,
             findings=self.diagnostics(case, spread),
         )
+
+
+def _rotation_std_deg(covariance: Float64[Tensor, "V 6 6"]) -> Float64[Tensor, " V"]:
+    return torch.rad2deg(covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(-1).sqrt())
 
 
 def unitised(rig: PlacedRig) -> PlacedRig:

@@ -20,6 +20,10 @@ _LEAST_BLOCKS = 4
 """Of frames."""
 _LEAST_SECTORS = 3
 """That people face; fewer show nothing of how their sides differ."""
+_SECTOR_SHARE = 0.61
+"""The share of the variance that blocks of 60 degrees show of errors whose correlation falls with
+the turn as a Gaussian of 30 degrees does.
+"""
 
 
 @dataclass(frozen=True)
@@ -70,13 +74,14 @@ def uncertainty(
 
     It has the shape of the inverse normal matrix, and the size of a delete-a-block jackknife
     (Tukey; with unequal blocks): each block is left out in turn, and the rig is solved again with
-    one Gauss-Newton step. The largest of three sizes counts:
+    one Gauss-Newton step.
 
-    1. of at most ``blocks`` blocks of neighbouring frames, each as long as errors last. What blocks
-       of this length do not show of errors that last longer is added by the errors' correlation;
-    2. of the sectors that people face, where they are enough: a detector errs alike whenever it
-       sees the same side of somebody, however much time is between;
-    3. of independent errors with the residuals' variance.
+    1. Of at most ``blocks`` blocks of neighbouring frames, each as long as errors last. What blocks
+       of this length do not show of errors that last longer is added by the errors' correlation.
+       It counts at least as much as independent errors with the residuals' variance.
+    2. Of the sectors that people face, where they are enough: a detector errs alike whenever it
+       sees the same side of somebody, however much time is between. What they show beyond the
+       first is added, and what sectors of this width do not show of it.
     """
     views = torch.nonzero(rig.placed)[:, 0]
     lasting = persistence(observed, rig)
@@ -101,7 +106,8 @@ def uncertainty(
     of_time = max(of_time, _residual_variance(observed, rig, state))
     inflation = of_time
     if int(sector.max()) + 1 >= _LEAST_SECTORS:
-        inflation = max(inflation, jackknife(sector[observed.row]))
+        of_sides = max(jackknife(sector[observed.row]) - of_time, 0.0)
+        inflation += of_sides / _SECTOR_SHARE
     full = basis @ inverse @ basis.T * inflation / _curvature(observed, rig, state) ** 2
     covariance[views] = torch.stack(
         [full[6 * i : 6 * i + 6, 6 * i : 6 * i + 6] for i in range(len(views))]

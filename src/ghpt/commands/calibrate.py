@@ -37,15 +37,15 @@ from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
+    own_detector_sequence,
     own_people,
-    own_sequence,
     recording_sequence,
     resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.detections import Detections
-from ghpt.data.people.sequence import Sequence
+from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
@@ -99,6 +99,9 @@ class Case:
     """What is calibrated, and what it can be compared with."""
 
     sequence: Sequence
+    """The 17 joints."""
+    evidence: Sequence
+    """All key points of the detector, which the rig is calibrated from."""
     reference: str
     """What the extrinsics of the sequence's cameras, where there are any, are, in words.
 
@@ -193,12 +196,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     change = solution.change
     rig = solution.rig
     reference = case.reference_cameras
-    rigs = {_ESTIMATED: rig} if reference is None else {_ESTIMATED: rig, case.reference: reference}
-    recordings = {
-        name: _spread(case.recording(placed, own), settings.evaluated_frames)
-        for name, own in rigs.items()
-        if placed
-    }
+    halves = _halves(case, solution, calibration, settings)
     result = CalibrationResult(
         data=case.sequence.title,
         source=case.sequence.source,
@@ -212,8 +210,9 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         converged=estimate.converged,
         usable=tuple(cameras.names[view] for view in usable),
         cameras=calibrated_cameras(estimate, change, cameras),
+        evidence=estimate.evidence,
         difference=_difference(estimate, rig, reference, placed),
-        explains=explain(recordings, estimator),
+        explains=explain(halves, estimator),
         findings=_findings(case, solution, camera_check),
         provenance=provenance(settings.seed),
     )
@@ -244,7 +243,7 @@ def solve_rig(
     seed: int,
 ) -> RigSolution:
     """Return the rig that a recording shows, with the length that ``source`` gives it."""
-    estimate = _estimate(calibration, case.sequence, seed)
+    estimate = _estimate(calibration, case.evidence, seed)
     placed = _placed_views(estimate)
 
     def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
@@ -256,6 +255,39 @@ def solve_rig(
     usable = _indices(usable_cameras(estimate))
     world, change = _choose_world(estimate, placed, case)
     return RigSolution(estimate, scale, placed, usable, world, change)
+
+
+def _halves(
+    case: Case, solution: RigSolution, calibration: RigCalibration, settings: CalibrateSettings
+) -> dict[str, list[Recording]]:
+    """Return both halves of the recording, as each calibration sees them, by its name.
+
+    The rig of a half is calibrated from the *other* one: of the key points that it was fitted to
+    any rig explains too much. Nothing is returned unless both halves place the same cameras.
+    """
+    count = len(case.sequence)
+    placed = solution.placed
+    rows = [np.arange(count // 2), np.arange(count // 2, count)]
+    seen = [_spread_rows(half, settings.evaluated_frames // 2) for half in rows]
+    if not placed or not all(len(half) for half in seen):
+        return {}
+    rigs = []
+    for other in reversed(rows):
+        estimate = _estimate(calibration, case.evidence, settings.seed, other)
+        if not bool(estimate.calibrated[placed].all()):
+            return {}
+        own = estimate.cameras.index(placed)
+        similarity = align(own, solution.rig.index(placed))
+        rigs.append(similarity.cameras(estimate.cameras))
+    found = {_ESTIMATED: rigs}
+    if case.reference_cameras is not None:
+        found[case.reference] = [case.reference_cameras] * 2
+    return {
+        name: [
+            case.recording(placed, rig).frames(half) for rig, half in zip(own, seen, strict=True)
+        ]
+        for name, own in found.items()
+    }
 
 
 def _raise_errors(result: CalibrationResult, report: str) -> None:
@@ -284,15 +316,18 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     Extrinsics are in mm where the person tells their unit.
     """
     if not settings.keypoints:
-        return Case(recording_sequence(settings), "the truth", is_own=False)
+        recording = recording_sequence(settings)
+        return Case(recording, recording, "the truth", is_own=False)
     cameras = own_cameras(settings, "intrinsics.toml")
     if cameras.unposed:
         cameras = cameras.without_extrinsics()
     people = own_people(settings)
-    sequence = own_sequence(settings, people, cameras, person=None)
-    sequence = resolve_unit(sequence, estimator, ask=False)
+    people.skeleton.require_joints(people.path)
+    evidence = own_detector_sequence(settings, people, cameras, person=None)
+    sequence = resolve_unit(evidence.as_joints(), estimator, ask=False)
     notes = people_findings(people)
-    return Case(sequence, "the file's own calibration", is_own=True, notes=notes)
+    own = "the file's own calibration"
+    return Case(sequence, evidence, own, is_own=True, notes=notes)
 
 
 def people_findings(people: Detections) -> tuple[Finding, ...]:
@@ -318,8 +353,10 @@ def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
     return usable if int(usable.sum()) >= 2 else torch.zeros_like(usable)
 
 
-def _estimate(calibration: RigCalibration, sequence: Sequence, seed: int) -> RigEstimate:
-    points = sequence.undistorted()
+def _estimate(
+    calibration: RigCalibration, sequence: Sequence, seed: int, rows: Rows | None = None
+) -> RigEstimate:
+    points = sequence.undistorted(rows)
     cameras = sequence.cameras
     return calibration(
         cameras.names,
@@ -329,6 +366,7 @@ def _estimate(calibration: RigCalibration, sequence: Sequence, seed: int) -> Rig
         torch.from_numpy(points.valid),
         cameras.size,
         seed,
+        skeleton=sequence.skeleton,
     )
 
 
@@ -344,9 +382,15 @@ def _indices(mask: Bool[Tensor, " V"]) -> list[int]:
 
 def _spread(recording: Recording, frames: int) -> Recording:
     """Return at most so many frames of a recording, evenly spread."""
-    count = min(frames, len(recording))
-    rows = np.linspace(0, len(recording) - 1, count).astype(int)
-    return recording.frames(np.unique(rows))
+    return recording.frames(_spread_rows(np.arange(len(recording)), frames))
+
+
+def _spread_rows(rows: Rows, count: int) -> Rows:
+    """Return at most so many of some rows, evenly spread."""
+    if not len(rows):
+        return rows
+    at = np.linspace(0, len(rows) - 1, min(max(count, 1), len(rows)))
+    return rows[np.unique(at.astype(int))]
 
 
 def _choose_world(estimate: RigEstimate, placed: list[int], case: Case) -> tuple[str, Similarity]:

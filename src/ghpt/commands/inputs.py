@@ -87,7 +87,7 @@ def own_sequence(
 
 
 def own_detector_sequence(
-    inputs: InputSettings, people: Detections, cameras: CameraSet, person: int
+    inputs: InputSettings, people: Detections, cameras: CameraSet, person: int | None
 ) -> Sequence:
     """Return one person with all key points of the detector, as `own_sequence` else."""
     title = own_title(inputs)
