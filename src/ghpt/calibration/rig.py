@@ -175,10 +175,10 @@ class RigCalibration:
         apart = spread_key_points(key_points, mask, self.spacing)
         most = max(self.observations // max(mask.shape[1] * len(apart), 1), 1)
         joints, joints_valid = joints_of(skeleton, key_points, mask)
-        evidence = key_points[:, :, apart]
+        used = key_points[:, :, apart]
         mask = mask[:, :, apart]
-        frames = choose_frames(evidence, confidence[:, :, apart], mask, min(self.frames, most))
-        observed = observe(K, evidence[frames], mask[frames], self.noise, frame[frames])
+        frames = choose_frames(used, confidence[:, :, apart], mask, min(self.frames, most))
+        observed = observe(K, used[frames], mask[frames], self.noise, frame[frames])
         table = self.pairs(observed, seed)
         rig = self.begin(observed, table, seed)
         adjusted = None

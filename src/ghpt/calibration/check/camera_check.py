@@ -27,6 +27,7 @@ from ghpt.calibration.mistakes import (
     Candidate,
     size_finding,
 )
+from ghpt.calibration.time.estimation import TimeEstimation
 from ghpt.errors import check, check_positive
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import stature
@@ -58,8 +59,9 @@ class CameraCheck:
     ``rounds``: most mistakes in one recording. ``astray``: a view with a larger error, which
     nothing mends, is off. ``clean``: where the error of every view is smaller, predict.py does not
     ask. ``contrast``: the repair of a view is kept if it leaves at most so many times the median
-    error of the others, or ``repaired``. ``many``: of more views it asks only if a view's error exceeds ``suspicious``, because the
-    time grows with their square. ``consensus``: estimator that the person is measured with.
+    error of the others, or ``repaired``. ``many``: of more views it asks only if a view's error
+    exceeds ``suspicious``, because the time grows with their square. ``consensus``: estimator that the person is measured with.
+    ``time``: of the views, which is looked at before anything else.
     """
 
     frames: int
@@ -73,6 +75,7 @@ class CameraCheck:
     suspicious: float
     thresholds: Thresholds
     consensus: Estimator
+    time: TimeEstimation
 
     def __post_init__(self) -> None:
         check_positive(
