@@ -112,13 +112,13 @@ class Diagnostics:
     ``few_frames``: fewer are a finding. ``motion``: least motion of a joint in the image, in sizes
     of the person. ``rotation_wanted``: a larger standard deviation of a rotation is a finding that
     says how much recording would do, and an error from ``rotation_useless`` on. ``flat``: least
-    thickness of the cloud of all points, in its length. ``inliers``: least share of a view's key points that agree. ``noise``: largest
-    noise of the key points that the residuals show, in sizes of the person; ``contrast``: and in
-    the median of the views. ``distance``: least distance of two cameras, in sizes of the rig.
-    ``proportions``: largest ratio of the bones' lengths, in an average adult's, to each other.
-    ``outside``: largest share of key points outside the image. ``unused``: share of the width and
-    of the height of the image beyond which some key points must lie. ``repair``: when a mistake
-    explains a finding.
+    thickness of the cloud of all points, in its length. ``inliers``: least share of a view's key
+    points that agree. ``noise``: largest noise of the key points that the residuals show, in sizes
+    of the person; ``contrast``: and in the median of the views. ``distance``: least distance of two
+    cameras, in sizes of the rig. ``proportions``: largest ratio of the bones' lengths, in an
+    average adult's, to each other. ``outside``: largest share of key points outside the image.
+    ``unused``: share of the width and of the height of the image beyond which some key points must
+    lie. ``repair``: when a mistake explains a finding.
     """
 
     few_frames: int

@@ -89,7 +89,7 @@ def _series(
     observed: Correspondences, rig: PlacedRig, frames: int
 ) -> tuple[Float[Tensor, "T S"], Bool[Tensor, "T S"]]:
     """Return the errors (units of noise) of S coordinates of views and joints over the frames, and
-    where there are any. Of several people in a frame the last counts.
+    where there are any.
     """
     x = rig.points @ rig.R.mT + rig.t[:, None]
     ahead = rig.inlier & (x[..., 2] > 0)

@@ -195,9 +195,11 @@ def observe(
     valid: Bool[Tensor, "T V J"],
     noise: float,
     frame: Int[Tensor, " T"] | None = None,
+    person: Int[Tensor, " T"] | None = None,
 ) -> Correspondences:
     """The chosen rows' key points, with ``noise`` x the median size of the person in the view as
     their noise. ``frame``: the number of each row's frame; None for a row a frame.
+    ``person``: of each row; None for one person. Everybody's joints have numbers of their own.
     """
     key_points = torch.where(valid[..., None], key_points.double(), 0.0)
     size = typical_size(key_points, valid)
@@ -213,12 +215,15 @@ def observe(
     of_row = torch.arange(rows)
     if frame is not None:
         of_row = torch.unique(frame, return_inverse=True)[1]
+    joint = torch.arange(joints).repeat(rows)
+    if person is not None:
+        joint = joint + joints * person[row]
     return Correspondences(
         torch.where(mask[..., None], xy, 0.0),
         unit[:, None].expand_as(mask).clone(),
         mask,
         of_row[row],
-        torch.arange(joints).repeat(rows),
+        joint,
         row,
     )
 

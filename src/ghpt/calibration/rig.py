@@ -115,7 +115,7 @@ class RigEstimate:
 class RigCalibration:
     """Key points and known intrinsics to the extrinsics of all cameras.
 
-    ``frames``: most frames used, and fewer where they have more key points than ``observations``
+    ``frames``: most frames of a person used, and fewer where they have more key points than ``observations``
     in all views together. ``spacing``: of key points that are nearer to each other, in sizes of the
     person, one is used. ``noise``: first guess of the key points' noise, in sizes of the
     person in the image. ``seeds``: best-conditioned pairs that the rig is begun from in turn, until
@@ -160,25 +160,32 @@ class RigCalibration:
         sizes: Int[Tensor, "V 2"] | None,
         seed: int,
         frame: Int[Tensor, " T"] | None = None,
+        person: Int[Tensor, " T"] | None = None,
         skeleton: Skeleton = HUMAN36M,
     ) -> RigEstimate:
         """Calibrate; ``key_points`` are undistorted pixels of the ``skeleton``. Never raises on
         values: what is wrong is among the findings. Raises GhptDataError for fewer than two
         cameras, a name that occurs twice, or arrays that do not belong together.
 
-        ``frame``: the number of each row's frame, where several people are in one; rising.
+        ``frame`` and ``person``: the numbers of each row's, where there are several people; frames
+        rise.
         """
         _check(names, K, key_points)
         if frame is None:
             frame = torch.arange(len(key_points))
+        if person is None:
+            person = torch.zeros_like(frame)
         mask = usable(K, key_points, valid)
         apart = spread_key_points(key_points, mask, self.spacing)
         most = max(self.observations // max(mask.shape[1] * len(apart), 1), 1)
         joints, joints_valid = joints_of(skeleton, key_points, mask)
         used = key_points[:, :, apart]
         mask = mask[:, :, apart]
-        frames = choose_frames(used, confidence[:, :, apart], mask, min(self.frames, most))
-        observed = observe(K, used[frames], mask[frames], self.noise, frame[frames])
+        if len(person):
+            most = min(most, self.frames * (int(person.max()) + 1))
+        frames = choose_frames(used, confidence[:, :, apart], mask, most)
+        numbers = (frame[frames], person[frames])
+        observed = observe(K, used[frames], mask[frames], self.noise, *numbers)
         table = self.pairs(observed, seed)
         rig = self.begin(observed, table, seed)
         adjusted = None

@@ -45,14 +45,16 @@ from ghpt.commands.inputs import (
     resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.time import calibrate_sequence, clock_of, log_time, time_of_rig
+from ghpt.commands.time import calibrate_people, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
+from ghpt.data.formats.names import Name
 from ghpt.data.people.detections import Detections
+from ghpt.data.people.persons import everybody
 from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.similarity import Similarity
 from ghpt.geometry.upright import upright
 from ghpt.models.estimators.classical import Estimator
@@ -100,6 +102,19 @@ class CalibrateSettings(InputSettings):
 
 
 @dataclass(frozen=True)
+class Crowd:
+    """Detections of several people, who are told apart once a rig is known."""
+
+    people: Detections
+    match: dict[Name, Name] | None
+    views: list[Name] | None
+
+    def persons(self, cameras: CameraSet) -> list[Sequence]:
+        """Return everybody whom calibrated cameras tell apart, the most visible first."""
+        return everybody(self.people, cameras, self.match, self.views)
+
+
+@dataclass(frozen=True)
 class Case:
     """What is calibrated, and what it can be compared with."""
 
@@ -115,6 +130,8 @@ class Case:
     is_own: bool
     """Whether they are the user's, which may be wrong."""
     notes: tuple[Finding, ...] = ()
+    crowd: Crowd | None = None
+    """Everybody's detections, where the views show several people."""
 
     @property
     def reference_cameras(self) -> Cameras | None:
@@ -146,6 +163,8 @@ class RigSolution:
 
     estimate: RigEstimate
     """In a world of its own."""
+    people: tuple[Sequence, ...]
+    """Those whom it was calibrated from."""
     scale: RigScale
     placed: list[int]
     """The calibrated views; none if they are fewer than two."""
@@ -248,7 +267,7 @@ def solve_rig(
     seed: int,
 ) -> RigSolution:
     """Return the rig that a recording shows, with the length that ``source`` gives it."""
-    estimate = calibrate_sequence(calibration, case.evidence, seed)
+    people, estimate = _from_everybody(case, calibration, seed)
     placed = _placed_views(estimate)
 
     def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
@@ -259,7 +278,29 @@ def solve_rig(
     estimate, scale = in_millimetres(estimate, source, measure)
     usable = _indices(usable_cameras(estimate))
     world, change = _choose_world(estimate, placed, case)
-    return RigSolution(estimate, scale, placed, usable, world, change)
+    return RigSolution(estimate, people, scale, placed, usable, world, change)
+
+
+def _from_everybody(
+    case: Case, calibration: RigCalibration, seed: int
+) -> tuple[tuple[Sequence, ...], RigEstimate]:
+    """Return the rig from the person who was followed, or from everybody whom that rig tells apart;
+    and who it was.
+    """
+    followed = (case.evidence,)
+    estimate = calibrate_people(calibration, followed, seed)
+    cameras = case.evidence.cameras
+    in_one_time = cameras.clock is None or cameras.clock.is_synchronised
+    whole = estimate.converged and bool(estimate.calibrated.all())
+    if case.crowd is None or not in_one_time or not whole:
+        return followed, estimate
+    people = tuple(case.crowd.persons(cameras.with_cameras(estimate.cameras)))
+    if len(people) < 2:
+        return followed, estimate
+    of_all = calibrate_people(calibration, people, seed)
+    if not bool(of_all.calibrated.all()):
+        return followed, estimate
+    return people, of_all
 
 
 def _halves(
@@ -278,7 +319,7 @@ def _halves(
         return {}
     rigs = []
     for other in reversed(rows):
-        estimate = calibrate_sequence(calibration, case.evidence, settings.seed, other)
+        estimate = calibrate_people(calibration, solution.people, settings.seed, other)
         if not bool(estimate.calibrated[placed].all()):
             return {}
         own = estimate.cameras.index(placed)
@@ -332,7 +373,8 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     sequence = resolve_unit(evidence.as_joints(), estimator, ask=False)
     notes = people_findings(people)
     own = "the file's own calibration"
-    return Case(sequence, evidence, own, is_own=True, notes=notes)
+    crowd = Crowd(people, settings.match, settings.views) if notes else None
+    return Case(sequence, evidence, own, is_own=True, notes=notes, crowd=crowd)
 
 
 def in_one_time(
@@ -431,7 +473,10 @@ def _difference(
 
 def _findings(case: Case, solution: RigSolution, camera_check: CameraCheck) -> tuple[Finding, ...]:
     """Return what is wrong with the recording, the rig, and the extrinsics in the user's file."""
-    own = (*case.notes, *solution.findings)
+    notes = case.notes
+    if len(solution.people) > 1:  # nobody had to be chosen
+        notes = tuple(found for found in notes if found.code != SEVERAL_PEOPLE.code)
+    own = (*notes, *solution.findings)
     said = {(found.code, frozenset(found.cameras)) for found in own}
     of_file = [
         found

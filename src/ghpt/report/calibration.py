@@ -200,7 +200,8 @@ def _explanation_blocks(result: CalibrationResult) -> Iterator[Block]:
         "Each joint is triangulated from the other views and projected into the one left out, on "
         f"the same joints for all; pixels. Triangulation: {result.triangulation}. The estimated "
         "rig is calibrated from one half of the recording and measured on the other, and the "
-        "reverse. Small numbers are no proof of a rig: what a detector always gets wrong, both halves share."
+        "reverse. Small numbers are no proof of a rig: what a detector always gets wrong, both "
+        "halves share."
     )
     yield Table(["view", *header], _held_out_rows(result))
     yield Heading("Segments")

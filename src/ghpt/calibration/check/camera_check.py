@@ -60,8 +60,8 @@ class CameraCheck:
     nothing mends, is off. ``clean``: where the error of every view is smaller, predict.py does not
     ask. ``contrast``: the repair of a view is kept if it leaves at most so many times the median
     error of the others, or ``repaired``. ``many``: of more views it asks only if a view's error
-    exceeds ``suspicious``, because the time grows with their square. ``consensus``: estimator that the person is measured with.
-    ``time``: of the views, which is looked at before anything else.
+    exceeds ``suspicious``, because the time grows with their square. ``consensus``: estimator that
+    the person is measured with. ``time``: of the views, which is looked at before anything else.
     """
 
     frames: int

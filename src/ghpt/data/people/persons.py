@@ -87,6 +87,32 @@ def detector_sequence(
     )
 
 
+def everybody(
+    people: Detections,
+    cameras: CameraSet,
+    match: Mapping[Name, Name] | None = None,
+    views: Items[Name] | None = None,
+) -> list[Sequence]:
+    """Return everybody who can be told apart (`tell_apart`), the most visible person first, each as
+    `detector_sequence` does. Raises GhptDataError where views and cameras do not match.
+    """
+    at, ordered = match_views(people.path, people.views, cameras, match, views)
+    ideal = undistort_detections(people, ordered, at)
+    persons = tell_apart(people, ordered, at, _association_points(people, ideal))
+    return [
+        Sequence(
+            title="",
+            source=people.path,
+            cameras=ordered,
+            frame=people.frame.astype(np.int64),
+            rate_hz=people.rate_hz,
+            points=KeyPointArrays(ideal.take(chosen[:, at]), people.points.take(chosen[:, at])),
+            skeleton=people.skeleton,
+        )
+        for chosen in persons
+    ]
+
+
 def _association_points(people: Detections, ideal: KeyPoints) -> KeyPoints:
     """Return by what people are told apart: the 17 joints, or all key points without them."""
     if not people.skeleton.has_joints:
