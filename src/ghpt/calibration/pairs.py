@@ -78,7 +78,7 @@ class PairEstimation:
         check_positive(**vars(self))
 
     def __call__(self, observed: Correspondences, seed: int) -> PairTable:
-        found = (self._pair(observed, a, b, seed) for a, b in self._partners(observed.valid))
+        found = (self.pair(observed, a, b, seed) for a, b in self._partners(observed.valid))
         rows = [row for row in found if row is not None]
         return (
             PairTable(*map(torch.stack, zip(*rows, strict=True))) if rows else PairTable(*_NOTHING)
@@ -97,9 +97,10 @@ class PairEstimation:
         chosen = torch.zeros(views, views, dtype=torch.bool).scatter_(1, best, True)
         return torch.nonzero((chosen | chosen.T).triu(1)).tolist()
 
-    def _pair(
+    def pair(
         self, observed: Correspondences, a: int, b: int, seed: int
     ) -> tuple[Tensor, ...] | None:
+        """Return two views' row of a `PairTable`; None where they have too little in common."""
         both = observed.valid[a] & observed.valid[b]
         common = int(both.sum())
         if common < self.least:

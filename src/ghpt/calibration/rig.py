@@ -115,13 +115,13 @@ class RigEstimate:
 class RigCalibration:
     """Key points and known intrinsics to the extrinsics of all cameras.
 
-    ``frames``: most frames of a person used, and fewer where they have more key points than ``observations``
-    in all views together. ``spacing``: of key points that are nearer to each other, in sizes of the
-    person, one is used. ``noise``: first guess of the key points' noise, in sizes of the
-    person in the image. ``seeds``: best-conditioned pairs that the rig is begun from in turn, until
-    one places every linked view with a share of ``good`` inliers; the best is kept. ``rounds``:
-    bundle adjustments, each with the noise of views and joints that the one before has shown and
-    points triangulated anew. ``blocks``: see ``uncertainty``.
+    ``frames``: most frames of a person used, and fewer where they have more key points than
+    ``observations`` in all views together. ``spacing``: of key points that are nearer to each
+    other, in sizes of the person, one is used. ``noise``: first guess of the key points' noise, in
+    sizes of the person in the image. ``seeds``: best-conditioned pairs that the rig is begun from
+    in turn, until one places every linked view with a share of ``good`` inliers; the best is kept.
+    ``rounds``: bundle adjustments, each with the noise of views and joints that the one before has
+    shown and points triangulated anew. ``blocks``: see ``uncertainty``.
     """
 
     frames: int

@@ -33,6 +33,7 @@ from ghpt.calibration.millimetres import (
 from ghpt.calibration.mistakes import SEVERAL_PEOPLE
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.uncalibrated import UncalibratedShifts
+from ghpt.calibration.whose import one_person
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
@@ -49,7 +50,7 @@ from ghpt.commands.time import calibrate_people, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
 from ghpt.data.formats.names import Name
 from ghpt.data.people.detections import Detections
-from ghpt.data.people.persons import everybody
+from ghpt.data.people.persons import everybody, tracks_of_views
 from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.errors import GhptDataError, check
@@ -108,6 +109,11 @@ class Crowd:
     people: Detections
     match: dict[Name, Name] | None
     views: list[Name] | None
+
+    def follow(self, cameras: CameraSet, calibration: RigCalibration, seed: int) -> Sequence:
+        """Return one person, the same in all views, whose cameras need no extrinsics."""
+        tracks = tracks_of_views(self.people, cameras, self.match, self.views)
+        return one_person(tracks, calibration.pairs, calibration.noise, seed)
 
     def persons(self, cameras: CameraSet) -> list[Sequence]:
         """Return everybody whom calibrated cameras tell apart, the most visible first."""
@@ -205,7 +211,8 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     name = settings.estimator
     estimator: Estimator = build(settings.baselines[name], f"baselines.{name}")
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
-    case = in_one_time(settings, open_case(settings, estimator), calibration, camera_check)
+    case = of_one_person(open_case(settings, estimator), calibration, settings.seed)
+    case = in_one_time(settings, case, calibration, camera_check)
     cameras = case.sequence.cameras
     source = read_scale(settings.scale, cameras.names)
     sweep_temporaries(output)
@@ -375,6 +382,17 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     own = "the file's own calibration"
     crowd = Crowd(people, settings.match, settings.views) if notes else None
     return Case(sequence, evidence, own, is_own=True, notes=notes, crowd=crowd)
+
+
+def of_one_person(case: Case, calibration: RigCalibration, seed: int) -> Case:
+    """Return the case with a person whom all views follow, where there are several."""
+    if case.crowd is None:
+        return case
+    given = case.evidence
+    found = case.crowd.follow(given.cameras, calibration, seed)
+    evidence = replace(given, points=found.points)
+    joints = evidence.as_joints()
+    return replace(case, evidence=evidence, sequence=replace(case.sequence, points=joints.points))
 
 
 def in_one_time(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from collections.abc import Sequence as Items
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int
@@ -99,18 +100,50 @@ def everybody(
     at, ordered = match_views(people.path, people.views, cameras, match, views)
     ideal = undistort_detections(people, ordered, at)
     persons = tell_apart(people, ordered, at, _association_points(people, ideal))
-    return [
-        Sequence(
-            title="",
-            source=people.path,
-            cameras=ordered,
-            frame=people.frame.astype(np.int64),
-            rate_hz=people.rate_hz,
-            points=KeyPointArrays(ideal.take(chosen[:, at]), people.points.take(chosen[:, at])),
-            skeleton=people.skeleton,
+    return [_sequence(people, ordered, ideal, chosen[:, at]) for chosen in persons]
+
+
+def tracks_of_views(
+    people: Detections,
+    cameras: CameraSet,
+    match: Mapping[Name, Name] | None = None,
+    views: Items[Name] | None = None,
+    most: int = 4,
+) -> list[Sequence]:
+    """Return those whom each view follows by itself: of each the most prominent person, then the
+    most prominent of the rest, ``most`` times. Those of one rank need not be one person.
+
+    Raises GhptDataError where views and cameras do not match.
+    """
+    at, ordered = match_views(people.path, people.views, cameras, match, views)
+    ideal = undistort_detections(people, ordered, at)
+    left = np.arange(len(people))
+    tracks = []
+    while len(left) and len(tracks) < most:
+        rest = replace(
+            people,
+            row=people.row[left],
+            view=people.view[left],
+            identity=people.identity[left],
+            points=people.points[left],
         )
-        for chosen in persons
-    ]
+        followed = follow_views(rest)
+        chosen = np.where(followed >= 0, left[followed], -1)
+        tracks.append(_sequence(people, ordered, ideal, chosen[:, at]))
+        left = np.setdiff1d(left, chosen)
+    return tracks
+
+
+def _sequence(people: Detections, cameras: CameraSet, ideal: KeyPoints, chosen: Chosen) -> Sequence:
+    return Sequence(
+        title="",
+        source=people.path,
+        cameras=cameras,
+        frame=people.frame.astype(np.int64),
+        rate_hz=people.rate_hz,
+        points=KeyPointArrays(ideal.take(chosen), people.points.take(chosen)),
+        skeleton=people.skeleton,
+    )
 
 
 def _association_points(people: Detections, ideal: KeyPoints) -> KeyPoints:
