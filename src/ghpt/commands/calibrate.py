@@ -22,6 +22,7 @@ from ghpt.calibration.comparison import (
     triangulate_recording,
 )
 from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.intrinsics import IntrinsicsEstimation
 from ghpt.calibration.millimetres import (
     RigScale,
     ScaleSettings,
@@ -40,8 +41,8 @@ from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
-    own_detector_sequence,
     own_people,
+    own_title,
     recording_sequence,
     resolve_unit,
 )
@@ -50,7 +51,12 @@ from ghpt.commands.time import calibrate_people, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
 from ghpt.data.formats.names import Name
 from ghpt.data.people.detections import Detections
-from ghpt.data.people.persons import everybody, tracks_of_views
+from ghpt.data.people.persons import (
+    detector_sequence,
+    detector_sequences,
+    tracks_of_views,
+    with_lenses,
+)
 from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.errors import GhptDataError, check
@@ -91,12 +97,20 @@ class CalibrateSettings(InputSettings):
     camera_check: Target
     estimator: str
     start_times: Target
+    intrinsics: Target
+    image_size: list[int] | None
     evaluated_frames: int
     seed: int
 
     def __post_init__(self) -> None:
         frames = self.evaluated_frames
         check(frames >= 1, "evaluated_frames", f"is {frames}", "Give 1 or more.")
+        if self.image_size is not None:
+            sane = len(self.image_size) == 2 and min(self.image_size) > 0
+            example = "Give width and height: image_size=[1920,1080]."
+            check(sane, "image_size", f"is {self.image_size}", example)
+            hint = "Give the image size or the cameras' file."
+            check(not self.cameras, "image_size", "is given beside cameras", hint)
         name = self.estimator
         hint = suggest(name, self.baselines)
         check(name in self.baselines, "estimator", f"is {name!r}", hint)
@@ -117,7 +131,7 @@ class Crowd:
 
     def persons(self, cameras: CameraSet) -> list[Sequence]:
         """Return everybody whom calibrated cameras tell apart, the most visible first."""
-        return everybody(self.people, cameras, self.match, self.views)
+        return detector_sequences(self.people, cameras, self.match, self.views)
 
 
 @dataclass(frozen=True)
@@ -138,6 +152,8 @@ class Case:
     notes: tuple[Finding, ...] = ()
     crowd: Crowd | None = None
     """Everybody's detections, where the views show several people."""
+    intrinsics: str | None = None
+    """What was estimated of the intrinsics, in words; None where they were given."""
 
     @property
     def reference_cameras(self) -> Cameras | None:
@@ -213,6 +229,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
     case = of_one_person(open_case(settings, estimator), calibration, settings.seed)
     case = in_one_time(settings, case, calibration, camera_check)
+    case = with_intrinsics(settings, case, calibration)
     cameras = case.sequence.cameras
     source = read_scale(settings.scale, cameras.names)
     sweep_temporaries(output)
@@ -235,6 +252,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         frames=len(case.sequence),
         seed=settings.seed,
         scale=scale,
+        intrinsics=case.intrinsics,
         world=solution.world,
         reference=None if reference is None else case.reference,
         triangulation=settings.estimator,
@@ -371,12 +389,12 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     if not settings.keypoints:
         recording = recording_sequence(settings)
         return Case(recording, recording, "the truth", is_own=False)
-    cameras = own_cameras(settings, "intrinsics.toml")
-    if cameras.unposed:
-        cameras = cameras.without_extrinsics()
     people = own_people(settings)
+    cameras = _given_cameras(settings, people)
     people.skeleton.require_joints(people.path)
-    evidence = own_detector_sequence(settings, people, cameras, person=None)
+    wanted = (settings.match, settings.views, None, own_title(settings))
+    evidence = detector_sequence(people, cameras, *wanted)
+    evidence = replace(evidence, source=str(Path(str(settings.keypoints)).resolve()))
     sequence = resolve_unit(evidence.as_joints(), estimator, ask=False)
     notes = people_findings(people)
     own = "the file's own calibration"
@@ -393,6 +411,41 @@ def of_one_person(case: Case, calibration: RigCalibration, seed: int) -> Case:
     evidence = replace(given, points=found.points)
     joints = evidence.as_joints()
     return replace(case, evidence=evidence, sequence=replace(case.sequence, points=joints.points))
+
+
+def _given_cameras(settings: CalibrateSettings, people: Detections) -> CameraSet:
+    """Return the user's cameras, or without a file first guesses by the size of the images."""
+    if settings.image_size is None:
+        cameras = own_cameras(settings, "intrinsics.toml, or image_size=[1920,1080]")
+        return cameras.without_extrinsics() if cameras.unposed else cameras
+    estimation: IntrinsicsEstimation = build(settings.intrinsics, "intrinsics")
+    return estimation.guessed(people.views, torch.tensor(settings.image_size))
+
+
+def with_intrinsics(settings: CalibrateSettings, case: Case, calibration: RigCalibration) -> Case:
+    """Return the case with estimated focal lengths where only the image size is known."""
+    if settings.image_size is None:
+        return case
+    estimation: IntrinsicsEstimation = build(settings.intrinsics, "intrinsics")
+    sequence = case.sequence
+    points = sequence.detected()
+    found = estimation(
+        calibration,
+        sequence.cameras,
+        torch.from_numpy(points.pixels).double(),
+        torch.from_numpy(points.confidence).double(),
+        torch.from_numpy(points.valid),
+        settings.seed,
+    )
+    cameras = replace(sequence.cameras, K=found.K, distortion=found.distortion)
+    notes = (*case.notes, *found.findings)
+    return replace(
+        case,
+        sequence=with_lenses(sequence, cameras),
+        evidence=with_lenses(case.evidence, cameras),
+        notes=notes,
+        intrinsics=found.text,
+    )
 
 
 def in_one_time(

@@ -19,6 +19,7 @@ from ghpt.config import build, locate, suggest
 from ghpt.errors import GhptConfigError
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
+from ghpt.models.pose.authors import AuthorsScorer, WorldPoses
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.models.problem import Problem
 from ghpt.models.relative_pose.problem import RelativePose
@@ -66,9 +67,9 @@ def register(part: str, *classes: type) -> None:
 
 
 register("model", StochasticEstimator)
-register("model.problem", PoseTriangulation, RelativePose)
+register("model.problem", PoseTriangulation, WorldPoses, RelativePose)
 register("model.problem.scale", KnownScale, BodyHeight, BoneLengths)
-register("model.scorer", Scorer)
+register("model.scorer", Scorer, AuthorsScorer)
 register("model.loss", StochasticLoss)
 for _name, _one in vars(optim).items():
     if isinstance(_one, type) and issubclass(_one, optim.Optimizer) and _one is not optim.Optimizer:

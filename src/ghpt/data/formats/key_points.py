@@ -10,12 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from ghpt.data.formats.authors_npy import is_authors_file, read_authors
+from ghpt.data.formats.caliscope import is_caliscope, read_caliscope
+from ghpt.data.formats.freemocap import is_freemocap_file, read_freemocap
 from ghpt.data.formats.hdf5_files import ENDINGS as HDF5_ENDINGS
 from ghpt.data.formats.hdf5_files import read_hdf5
 from ghpt.data.formats.json_content import looks_like_people
 from ghpt.data.formats.json_people import read_json_people
 from ghpt.data.formats.layout import find_files
-from ghpt.data.formats.mediapipe import is_caliscope, read_caliscope
 from ghpt.data.formats.movement_files import (
     read_deeplabcut_csv,
     read_lightning_pose,
@@ -96,7 +97,8 @@ FORMATS: dict[str, Callable[[Source], Detections]] = {
     "rtmlib": read_json_people,
     "easymocap": read_json_people,
     "yolo": read_yolo,
-    "caliscope": lambda source: read_caliscope(source.path),
+    "caliscope": read_caliscope,
+    "freemocap": read_freemocap,
     "npz": lambda source: read_own(source.path, source.skeleton),
     "authors": lambda source: read_authors(source.path, source.skeleton),
     "deeplabcut": lambda source: _of_own_or_hdf5(source, ".csv", read_deeplabcut_csv),
@@ -104,7 +106,7 @@ FORMATS: dict[str, Callable[[Source], Detections]] = {
     "sleap": lambda source: _of_own_or_hdf5(source, ".slp", read_sleap_labels),
     "lightningpose": read_lightning_pose,
 }
-_ONE_RECORDING = ("caliscope", "npz", "authors")
+_ONE_RECORDING = ("caliscope", "freemocap", "npz", "authors")
 
 
 def _of_own_or_hdf5(
@@ -137,6 +139,8 @@ def _format_of(path: Path) -> str:
 def _format_of_file(path: Path) -> str | None:
     with open_input(path) as handle:
         start = handle.read(4096)
+    if is_freemocap_file(path):
+        return "freemocap"
     for magic, form in _MAGIC.items():
         if start.startswith(magic):
             return form

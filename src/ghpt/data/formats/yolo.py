@@ -23,7 +23,7 @@ _BOX = 5
 """Columns before the key points: class, centre and size of the box."""
 _MOST_EXTRA = 2
 """Columns after them: the box's confidence (save_conf) and the track (track)."""
-_LINE = re.compile(r"\d+(?:\.0+)?(?: -?\d+(?:\.\d+)?(?:e-?\d+)?){14,}\s*$")
+_LINE = re.compile(r"\d+(?:\.0+)?(?: -?\d+(?:\.\d+)?(?:e-?\d+)?){14,}")
 _HINT = "It must be a file that yolo pose wrote with save_txt=True."
 
 

@@ -30,6 +30,7 @@ NAMES = (
     "best",
     "worst",
     "view_weights",
+    "trajectory",
     "linear",
     "weighted_linear",
     "ransac",

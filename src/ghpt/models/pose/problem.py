@@ -130,11 +130,13 @@ class PoseTriangulation(Problem):
     def baselines(
         self, settings: BaselineSettings, model: Any
     ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
-        """Return the model's view weights, where there are settings for them, and the rest."""
-        learned = {}
+        """Return view weights and trajectories, where there are settings for them, and the rest."""
+        learned: dict[str, Callable[[Observations], PoseEstimate]] = {}
         if settings.view_weights:
             view_weights = build(settings.view_weights, "view_weights")
             learned["view_weights"] = view_weights(model)
+        if settings.trajectory:
+            learned["trajectory"] = build(settings.trajectory, "trajectory")
         return learned | build(settings.baselines, "baselines")
 
     def record(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
