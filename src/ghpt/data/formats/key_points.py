@@ -32,7 +32,14 @@ from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
-__all__ = ["FORMATS", "Detections", "KeyPoints", "read_key_points", "write_key_points"]
+__all__ = [
+    "FORMATS",
+    "Detections",
+    "KeyPoints",
+    "format_of",
+    "read_key_points",
+    "write_key_points",
+]
 
 _HINT = (
     "Known: JSON files of OpenPose, AlphaPose, MMPose, rtmlib, EasyMocap and COCO results; "
@@ -69,7 +76,7 @@ def read_key_points(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
     source = Source(path, skeleton, session, format)
-    form = format or _format_of(path)
+    form = format or format_of(path)
     if session is not None and form in _ONE_RECORDING:
         problem = "files of this format hold one recording"
         raise GhptDataError(path, "session", problem, "Leave session= out.")
@@ -116,8 +123,11 @@ def _of_own_or_hdf5(
     return read(source) if find_files(source.path, (ending,)) else read_hdf5(source)
 
 
-def _format_of(path: Path) -> str:
-    """Return the name of the format, by how the files of a folder, or a file, begin."""
+def format_of(path: Path) -> str:
+    """Return the name of the format, by how the files of a folder, or a file, begin.
+
+    It is ``json`` for those that are told apart by their structure. Raises GhptDataError for none.
+    """
     files = find_files(path, _ENDINGS)
     if path.is_dir() and any(is_authors_file(file) for file in files):
         return "authors"

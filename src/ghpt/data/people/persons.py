@@ -17,7 +17,7 @@ from ghpt.data.people.association import associate
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.following import follow_views
 from ghpt.data.people.matching import match_views
-from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels
+from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels, scale_to_images
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -66,6 +66,7 @@ def detector_sequence(
     points of images of another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
+    people = scale_to_images(people, ordered, at)
     ideal = undistort_detections(people, ordered, at)
     told_apart_by = _association_points(people, ideal)
     if person is None:
@@ -88,6 +89,7 @@ def detector_sequences(
     another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
+    people = scale_to_images(people, ordered, at)
     ideal = undistort_detections(people, ordered, at)
     found = tell_apart(people, ordered, at, _association_points(people, ideal))
     return [
