@@ -122,6 +122,37 @@ def _sequence(
     )
 
 
+def tracks_of_views(
+    people: Detections,
+    cameras: CameraSet,
+    match: Mapping[Name, Name] | None = None,
+    views: Items[Name] | None = None,
+    most: int = 4,
+) -> list[Sequence]:
+    """Return those whom each view follows by itself: of each the most prominent person, then the
+    most prominent of the rest, ``most`` times. Those of one rank need not be one person.
+
+    Raises GhptDataError where views and cameras do not match.
+    """
+    at, ordered = match_views(people.path, people.views, cameras, match, views)
+    ideal = undistort_detections(people, ordered, at)
+    left = np.arange(len(people))
+    tracks: list[Sequence] = []
+    while len(left) and len(tracks) < most:
+        rest = replace(
+            people,
+            row=people.row[left],
+            view=people.view[left],
+            identity=people.identity[left],
+            points=people.points[left],
+        )
+        followed = follow_views(rest)
+        chosen = np.where(followed >= 0, left[followed], -1)
+        tracks.append(_sequence(people, ordered, at, ideal, chosen, "", False))
+        left = np.setdiff1d(left, chosen)
+    return tracks
+
+
 def _association_points(people: Detections, ideal: KeyPoints) -> KeyPoints:
     """Return by what people are told apart: the 17 joints, or all key points without them."""
     if not people.skeleton.has_joints:
