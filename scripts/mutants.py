@@ -58,7 +58,7 @@ TESTS = {
     "src/ghpt/commands/prediction/gaps.py": ["test_gaps.py"],
     "src/ghpt/files.py": ["test_files.py", "test_outputs.py"],
     "src/ghpt/commands/outputs.py": ["test_outputs.py"],
-    "src/ghpt/data/formats/openpose.py": ["test_openpose.py"],
+    "src/ghpt/data/formats/json_people.py": ["test_openpose.py", "test_json_key_points.py"],
 }
 """What may be mutated, and for each file the tests that must notice it."""
 

@@ -11,7 +11,8 @@ import hostile
 
 from ghpt.errors import GhptDataError
 
-TEXTS = [name for name in hostile.FORMATS if name not in ("npz", "npy", "colmap")]
+BINARY = ("npz", "npy", "freemocap", "colmap", "opencap", "sleap", "deeplabcut")
+TEXTS = [name for name in hostile.FORMATS if name not in BINARY]
 ENCODED = {
     "UTF-8 with a mark": lambda text: b"\xef\xbb\xbf" + text.encode(),
     "CRLF": lambda text: text.replace("\n", "\r\n").encode(),
