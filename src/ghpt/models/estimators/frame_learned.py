@@ -1,0 +1,58 @@
+"""Frames by learned key-point weights: one triangulation of each joint, by weights that ship."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghpt.geometry.triangulation import Triangulation, concatenate
+from ghpt.models.estimators.classical import Estimator
+from ghpt.models.key_points.problem import KeyPoints, KeyPointWeights
+from ghpt.models.weights import load_shipped
+from ghpt.observations import Observations, PoseEstimate
+
+_PAIRS_AT_ONCE = 2**18
+"""Pairs of key points of one joint that are looked at together."""
+
+
+@dataclass(frozen=True)
+class FrameLearned(Estimator):
+    """Weights each key point by a small network that sees how it stands beside the others.
+
+    ``weights``: of a model of ``ghpt/weights``. The first estimate is that of the model's own
+    AdaptiveRansac, which also stands where the weights leave a joint without a point; a view counts
+    as one that made a joint as it does there.
+    """
+
+    weights: str
+
+    def triangulate(self, batch: Observations) -> Triangulation:
+        frames, views, joints = batch.valid.shape
+        size = max(1, _PAIRS_AT_ONCE // max(views * views * joints, 1))
+        starts = range(0, max(frames, 1), size)
+        return concatenate([self._triangulate(batch.rows(slice(s, s + size))) for s in starts])
+
+    @torch.no_grad()
+    def _triangulate(self, batch: Observations) -> Triangulation:
+        model = load_shipped(self.weights)
+        problem = self._problem
+        start = problem.start.triangulate(batch)
+        key_points = KeyPoints(batch, PoseEstimate(start.points, start.has_position))
+        logits = model.scorer(problem.featurize(key_points))
+        result = problem.triangulate(key_points, logits.softmax(dim=-1))
+        return result.with_fallback(result.ok, start)
+
+    def inlier_threshold(
+        self, batch: Observations, points: Float[Tensor, "B J 3"]
+    ) -> Float[Tensor, " B"]:
+        return self._problem.start.inlier_threshold(batch, points)
+
+    @property
+    def _problem(self) -> KeyPointWeights:
+        problem = load_shipped(self.weights).problem
+        if not isinstance(problem, KeyPointWeights):
+            raise TypeError(f"{self.weights} are no weights of key points")
+        return problem
