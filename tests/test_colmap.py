@@ -11,6 +11,7 @@ from damage import damage
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
+from ghpt.geometry.lens import distort
 
 CAMERAS = [
     ("SIMPLE_PINHOLE", [500, 320, 240], [500, 500, 0, 0, 0, 0, 0]),
@@ -95,12 +96,7 @@ def test_images_called_alike_are_told_apart_by_their_folders(tmp_path):
 @pytest.mark.parametrize(
     ("kind", "parameters", "says"),
     [
-        (
-            "OPENCV_FISHEYE",
-            [500, 510, 320, 240, 0, 0, 0, 0],
-            "is of the model .* with .*undistort the images first",
-        ),
-        ("FULL_OPENCV", [500, 510, 320, 240, 0, 0, 0, 0, 0, 0.1, 0, 0], "has k4, k5 or k6"),
+        ("FOV", [500, 510, 320, 240, 0.1], "is of the model .* with .*undistort the images first"),
     ],
 )
 @pytest.mark.parametrize("form", ["binary", "text"])
@@ -116,6 +112,58 @@ def test_a_damaged_model_is_read_or_named(form, file, tmp_path):
     model(tmp_path, form, points=2)
     path = tmp_path / f"{file}.{'bin' if form == 'binary' else 'txt'}"
     assert damage(path, lambda _: read_cameras(tmp_path, unit_mm=1), 150) == {"read", "named"}
+
+
+LENSES = {
+    "OPENCV_FISHEYE": [500, 510, 320, 240, 0.02, -0.01, 0.003, -0.001],
+    "SIMPLE_RADIAL_FISHEYE": [500, 320, 240, 0.05],
+    "RADIAL_FISHEYE": [500, 320, 240, 0.05, -0.01],
+    "FULL_OPENCV": [500, 510, 320, 240, 0.1, 0.02, 0.003, 0.004, 0.005, 0.06, 0.01, 0.002],
+}
+
+
+def test_other_lenses_show_what_the_library_shows(tmp_path):
+    scene = model(tmp_path, cameras=list(LENSES.items()))
+    found = read_cameras(tmp_path, unit_mm=1)
+    in_camera = np.random.default_rng(0).uniform((-1, -1, 3), (1, 1, 5), (20, 3))
+    for i in range(len(LENSES)):
+        theirs = np.array([scene.cameras[i + 1].img_from_cam(point) for point in in_camera])
+        ideal = torch.from_numpy(in_camera / in_camera[:, 2:]) @ found.K[i].T
+        ours = distort(ideal[:, :2], found.K[i], found.distortion[i])
+        np.testing.assert_allclose(ours, theirs - 0.5, atol=1e-9)
+
+
+def frames_of_a_rig(folder, name, moved=0.0):
+    """Three images of each of two cameras; the last image is ``moved`` away."""
+    rng = np.random.default_rng(1)
+    scene = pycolmap.Reconstruction()
+    for number in (1, 2):
+        camera = pycolmap.Camera(
+            model="PINHOLE", width=640, height=480, params=[500, 500, 320, 240], camera_id=number
+        )
+        scene.add_camera_with_trivial_rig(camera)
+        wxyz = rng.normal(size=4)
+        turn, t = pycolmap.Rotation3d(wxyz / np.linalg.norm(wxyz)), rng.normal(size=3)
+        for frame in range(3):
+            image = pycolmap.Image(
+                name=name.format(number, frame), camera_id=number, image_id=3 * number + frame
+            )
+            last = (number, frame) == (2, 2)
+            scene.add_image_with_trivial_frame(image, pycolmap.Rigid3d(turn, t + last * moved))
+    folder.mkdir(exist_ok=True)
+    scene.write_binary(folder)
+
+
+@pytest.mark.parametrize("name", ["cam{}/{:04}.png", "cam{}_{:04}.png", "{1:04}/cam{0}.png"])
+def test_images_of_a_camera_that_stands_still_are_one(name, tmp_path):
+    frames_of_a_rig(tmp_path, name)
+    assert read_cameras(tmp_path, unit_mm=1).names == ("cam1", "cam2")
+
+
+def test_a_camera_that_moves_is_named(tmp_path):
+    frames_of_a_rig(tmp_path, "cam{}/{:04}.png", moved=0.1)
+    with pytest.raises(GhptDataError, match=r"are of 3 places with names that tell no cameras"):
+        read_cameras(tmp_path, unit_mm=1)
 
 
 def test_human36m_s_camera_parameters(shared_data, tmp_path):

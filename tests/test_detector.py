@@ -23,10 +23,14 @@ PERFECT = {
     "noise_white": 0.3,
     "noise_slow": 0.3,
     "noise_slow_seconds": 1.0,
+    "neighbours": 0.0,
+    "noise_spread": 0.0,
     "joints": dict.fromkeys(KINDS, 1.0),
     "bias": 0.0,
     "bias_seed": 0,
     "bias_of_subject": 0.3,
+    "view_bias": 0.0,
+    "view_bias_degrees": 30.0,
     "drift": 0.0,
     "drift_seconds": 1.0,
     "occluded_noise": 1.0,
@@ -36,6 +40,7 @@ PERFECT = {
     "outlier_seconds": 0.5,
     "swap_rate": 0.0,
     "swap_seconds": 0.4,
+    "swap_together": 0.0,
     "miss_rate": 0.0,
     "miss_rate_occluded": 0.0,
     "miss_seconds": 0.3,
@@ -181,6 +186,77 @@ def test_outliers_are_as_frequent_and_large_as_asked_for_and_last():
     assert np.nanmax(np.abs(np.diff(length, axis=0))) < 0.2
 
 
+def view_biases(points: np.ndarray, degrees: float = 30.0) -> np.ndarray:
+    """Of all views [T V J 2]."""
+    numbers = {"view_bias": 0.01, "view_bias_degrees": degrees}
+    detector = Detector(**PERFECT | numbers)
+    views = range(len(RIG.names))
+    return np.stack([detector.draw_view_bias(points, RIG, v, 0, "S9") for v in views], axis=1)
+
+
+def turned(points: np.ndarray, degrees: float) -> np.ndarray:
+    """Points turned about the vertical through the pelvis."""
+    angle = np.deg2rad(degrees)
+    rotation = np.array(
+        [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]]
+    )
+    pelvis = points[:, [JOINT["pelvis"]]]
+    return (points - pelvis) @ rotation.T + pelvis
+
+
+def test_the_bias_of_a_view_lasts_until_the_body_turns():
+    points = take(frames=1)
+    still = view_biases(points)
+    correlation = [
+        np.corrcoef(still.ravel(), view_biases(turned(points, angle)).ravel())[0, 1]
+        for angle in (5.0, 30.0, 120.0)
+    ]
+    assert correlation[0] > 0.95
+    assert 0.3 < correlation[1] < 0.8
+    assert abs(correlation[2]) < 0.35
+    views = still[0].reshape(4, -1)
+    assert np.abs(np.corrcoef(views)[np.triu_indices(4, 1)]).max() < 0.5
+    assert still.std() == pytest.approx(1.0, rel=0.25)
+
+
+def test_the_bias_of_a_view_is_in_its_key_points():
+    points = take(frames=50)
+    error = residual(points, detect(points, view_bias=0.01))
+    expected = 0.01 * view_biases(points)
+    measured = np.isfinite(error)
+    np.testing.assert_allclose(error[measured], expected[measured], atol=1e-3)
+
+
+def test_spread_noise_has_the_same_size_and_heavier_tails():
+    points = take(frames=3000)
+    plain = np.abs(residual(points, detect(points, noise=0.005)))
+    spread = np.abs(residual(points, detect(points, noise=0.005, noise_spread=0.6)))
+    rms = [np.sqrt(np.nanmean(error**2)) for error in (plain, spread)]
+    assert rms[1] == pytest.approx(rms[0], rel=0.05)
+    assert np.nanquantile(spread, 0.999) > 1.5 * np.nanquantile(plain, 0.999)
+
+
+def test_neighbours_share_errors():
+    points = take(frames=2000)
+    error = residual(points, detect(points, noise=0.005, neighbours=0.5))
+
+    def correlation(one: str, other: str) -> float:
+        a, b = error[:, :, JOINT[one]].ravel(), error[:, :, JOINT[other]].ravel()
+        both = np.isfinite(a) & np.isfinite(b)
+        return float(np.corrcoef(a[both], b[both])[0, 1])
+
+    assert correlation("left_knee", "left_ankle") == pytest.approx(0.5, abs=0.08)
+    assert correlation("left_hip", "left_ankle") == pytest.approx(0.25, abs=0.08)
+    assert correlation("left_wrist", "left_ankle") == pytest.approx(0.0, abs=0.08)
+
+
+def test_legs_and_arms_are_swapped_together():
+    detector = Detector(**PERFECT | {"swap_together": 0.9})
+    flip = detector.draw_processes(4000, 50.0, generator(0, "camera")).flip
+    assert np.corrcoef(flip.T)[0, 1] == pytest.approx(0.9, abs=0.05)
+    np.testing.assert_allclose(flip.std(axis=0), 1.0, atol=0.15)
+
+
 def test_swaps_exchange_the_sides_of_legs_or_arms():
     points = take(frames=3000)
     found = detect(points, swap_rate=0.05)
@@ -240,7 +316,7 @@ def test_processes_are_stationary_unit_gaussians(persistence):
         assert abs(np.corrcoef(values[0], values[lag])[0, 1]) < 0.1
 
 
-@pytest.mark.parametrize("name", ["human36m", "panoptic"])
+@pytest.mark.parametrize("name", ["human36m", "panoptic", "field"])
 def test_the_fitted_numbers_make_a_detector(name):
     detector = Detector(**yaml.safe_load((CONF / f"{name}.yaml").read_text()))
     found = detector(take(), RIG, 50.0, 0, "S9", "S9/Greeting-1")

@@ -151,8 +151,10 @@ def test_the_joints_are_those_that_mmpose_names(tmp_path):
     write(tmp_path / "a.json", mmpose([(1, [0.0])], names=h36m))
     assert set(read_key_points(tmp_path).joints) == set(SKELETONS["human36m"])
     write(tmp_path / "a.json", mmpose([(1, [0.0])], names=[f"paw {i}" for i in range(17)]))
+    paws = read_key_points(tmp_path)
+    assert paws.joints == tuple(f"paw_{i}" for i in range(17))
     with pytest.raises(GhptDataError, match=r"joints: lack right_ankle.*right_knee"):
-        read_key_points(tmp_path)
+        paws.skeleton.require_joints(paws.path)
     assert read_key_points(tmp_path, "coco_17").joints == COCO
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import real_layout as layout
-from ghpt.data.datasets import labels as module
 from ghpt.data.datasets.labels import read_labels
+from ghpt.data.formats import restricted_pickle
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 
@@ -236,7 +236,7 @@ def test_a_plain_array_is_no_labels_file(tmp_path: Path) -> None:
 
 
 def test_what_a_pickle_names_is_new_in_each_load() -> None:
-    unpickler = module._Unpickler(__import__("io").BytesIO(pickle.dumps(None)))
+    unpickler = restricted_pickle._Unpickler(__import__("io").BytesIO(pickle.dumps(None)))
     first, second = (unpickler.find_class("numpy", "dtype") for _ in range(2))
     assert first is not second
     assert first is not np.dtype

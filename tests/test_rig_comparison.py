@@ -10,15 +10,15 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from ghpt.calibration.comparison import (
-    Similarity,
     align,
     bone_variation,
     held_out_errors,
     rig_difference,
     triangulate_recording,
-    upright,
 )
 from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.similarity import Similarity
+from ghpt.geometry.upright import upright
 from ghpt.models.estimators.classical import Linear
 from ghpt.observations import LabelledRecording
 from ghpt.skeleton import BONES, JOINT, JOINTS

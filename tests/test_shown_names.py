@@ -8,7 +8,7 @@ import torch
 from markdown_it import MarkdownIt
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from ghpt.calibration.comparison import BoneVariation, Quantiles, Similarity, ViewErrors
+from ghpt.calibration.comparison import BoneVariation, Quantiles, ViewErrors
 from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.millimetres import RigScale
 from ghpt.commands.prediction.report import (
@@ -25,6 +25,7 @@ from ghpt.commands.prediction.statistics import (
 )
 from ghpt.commands.prediction.verdict import Verdict
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.similarity import Similarity
 from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.report.calibration import (
     CalibratedCamera,

@@ -5,6 +5,7 @@ real cameras.
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.skeletons import (
@@ -17,10 +18,10 @@ from ghpt.data.formats.skeletons import (
 )
 from ghpt.data.people.persons import person_sequence
 from ghpt.data.points import KeyPoints
-from ghpt.errors import GhptDataError
+from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.triangulation import triangulate
-from ghpt.skeleton import JOINT, JOINTS, MIRROR, PELVIS, THORAX
+from ghpt.skeleton import BONES, HUMAN36M, JOINT, JOINTS, MIRROR, PELVIS, THORAX
 from single_person import read_person
 
 REAL = {
@@ -195,3 +196,82 @@ def median_error(cameras, key_points, valid):
     )
     error = reprojection_error(rig, torch.from_numpy(key_points), points)
     return float(error[torch.from_numpy(valid) & ok[:, None]].median())
+
+
+def write_skeleton(folder, **changed):
+    content = {
+        "key_points": ["snout", "left_paw", "right_paw", "tail"],
+        "bones": [["snout", "tail"]],
+    }
+    (folder / "mouse.yaml").write_text(yaml.safe_dump(content | changed), encoding="utf-8")
+    return str(folder / "mouse.yaml")
+
+
+def test_a_skeleton_of_one_s_own_is_a_yaml(tmp_path):
+    mouse = find_skeleton("x", write_skeleton(tmp_path))
+    assert mouse.key_points == ("snout", "left_paw", "right_paw", "tail")
+    assert mouse.bones == ((0, 3),)
+    assert mouse.mirror == (0, 2, 1, 3)
+    assert not mouse.has_joints
+
+
+def test_a_yaml_says_how_the_17_are_made(tmp_path):
+    weights = {"snout": 3.0, "tail": 1}
+    mouse = find_skeleton("x", write_skeleton(tmp_path, joints={"nose": weights}))
+    assert mouse.joints[JOINT["nose"]] == (0.75, 0.0, 0.0, 0.25)
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"key_points": ["snout", "tail", "snout"]}, "key_points: snout is there twice"),
+        ({"bones": [["snout", "wing"]]}, "bones: wing is no key point"),
+        ({"bones": [["snout", "snout"]]}, "bones: snout, snout names one twice"),
+        ({"pairs": [["snout", "left_paw"]]}, "pairs: are no pairs of different key points"),
+        ({"pairs": [["snout"]]}, "pairs: are no pairs"),
+        ({"joints": {"beak": {"snout": 1}}}, "joints: beak is none of the 17"),
+        ({"joints": {"nose": {"beak": 1}}}, "joints.nose: beak is no key point"),
+        ({"joints": {"nose": {"snout": -1}}}, "joints.nose: is no weighted mean"),
+        ({"key_points": "snout"}, "key_points"),
+        ({"eyes": 2}, "eyes: no such setting"),
+    ],
+)
+def test_a_yaml_that_is_no_skeleton_is_named(changed, named, tmp_path):
+    path = write_skeleton(tmp_path, **changed)
+    with pytest.raises(GhptDataError) as error:
+        find_skeleton("x", path)
+    assert str(error.value).startswith(f"{path}: {named}")
+
+
+def test_a_yaml_that_is_missing_or_damaged_is_named(tmp_path):
+    with pytest.raises(GhptConfigError, match=r"none\.yaml cannot be read"):
+        find_skeleton("x", str(tmp_path / "none.yaml"))
+    (tmp_path / "bad.yaml").write_text("key_points: [a, b")
+    with pytest.raises(GhptConfigError, match=r"bad\.yaml cannot be read"):
+        find_skeleton("x", str(tmp_path / "bad.yaml"))
+
+
+def test_the_17_are_a_skeleton_as_every_other():
+    assert find_skeleton("x", "human36m") == HUMAN36M
+    assert HUMAN36M.mirror == MIRROR
+    assert HUMAN36M.bones == BONES
+
+
+@pytest.mark.parametrize("name", SKELETONS)
+def test_the_sides_of_a_known_skeleton_are_named_alike(name):
+    skeleton = find_skeleton("x", name)
+    for left, right in skeleton.pairs:
+        names = (skeleton.key_points[left], skeleton.key_points[right])
+        assert all("face" in one for one in names) or names[0].replace("left", "right") == names[1]
+    sided = sum("left" in one or "right" in one for one in skeleton.key_points)
+    assert sum("face" not in skeleton.key_points[a] for a, _ in skeleton.pairs) == sided // 2
+
+
+def test_some_key_points_are_a_skeleton_with_the_joints_that_they_give():
+    coco = find_skeleton("x", "coco_17")
+    part = coco.select([coco.key_points.index(name) for name in ("right_hip", "left_hip", "nose")])
+    assert part.pairs == ((1, 0),)
+    assert part.joints[PELVIS] == (0.5, 0.5, 0.0)
+    assert part.missing_joints == tuple(
+        name for name in JOINTS if name not in ("right_hip", "left_hip", "pelvis", "nose")
+    )

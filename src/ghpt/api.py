@@ -31,7 +31,7 @@ from ghpt.arrays import (
 from ghpt.commands.overrides import Source, compose
 from ghpt.config import CONF, build, plain, settings
 from ghpt.data.people.detections import Detections
-from ghpt.data.people.persons import person_sequence
+from ghpt.data.people.persons import detector_sequence, person_sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError, check
 from ghpt.geometry.cameras import CameraSet
@@ -163,24 +163,31 @@ class Predictor:
         """Return the poses of one person in millimetres, in the world of the cameras.
 
         ``key_points`` are what `read_key_points` returns, or [T V 17 2] in the order of
-        `ghpt.skeleton.JOINTS`, with the views in the order of the cameras. Raises GhptDataError.
+        `ghpt.skeleton.JOINTS`, with the views in the order of the cameras. The joints are all that
+        the detector gives and the 17, or with ``joints="human36m"`` these alone. Raises
+        GhptDataError.
         """
         from ghpt.commands.inputs import resolve_unit
+        from ghpt.commands.predict import joints_of, needed_key_points
 
         rig = as_camera_set(cameras)
         people = as_detections(key_points, rig, confidence, rate_hz)
         wanted = self.settings
-        sequence = person_sequence(people, rig, wanted.match, wanted.views, wanted.person)
+        sequence = detector_sequence(people, rig, wanted.match, wanted.views, wanted.person)
+        sequence = needed_key_points(wanted, sequence)
         sequence.cameras.check_calibrated(sequence.source)
         sequence = resolve_unit(
             sequence, build(wanted.camera_check, "camera_check").consensus, ask=True
         )
         chunks = Chunks(wanted.fitted_frames, wanted.batch)
-        part = _estimate(self.estimator.predictor, sequence.read, len(sequence), chunks)
+        predictor = self.estimator.predictor.for_skeleton(sequence.skeleton)
+        part = _estimate(predictor, sequence.read, len(sequence), chunks)
+        joints = joints_of(wanted, sequence.skeleton)
         names = sequence.cameras.names
-        about = _about(self.estimator.name, JOINTS, names, sequence.rate_hz)
+        about = _about(self.estimator.name, joints.joints, names, sequence.rate_hz)
         x, y, z = sequence.origin.tolist()
-        return Poses(replace(about, origin=(x, y, z)), sequence.to_world(part))
+        about = replace(about, origin=(x, y, z), bones=joints.bones)
+        return Poses(about, joints(sequence.to_world(part)))
 
 
 def calibrate_rig(
@@ -204,6 +211,7 @@ def calibrate_rig(
     scale = defaults["scale"] | {"height": height}
     wanted = settings(CalibrateSettings, defaults | {"scale": scale} | changes)
     rig = as_camera_set(cameras)
+    rig = rig.without_extrinsics() if rig.unposed else rig
     people = as_detections(key_points, rig, confidence)
     sequence = person_sequence(people, rig, wanted.match, wanted.views, person=None)
     case = Case(sequence, "the given calibration", is_own=True)

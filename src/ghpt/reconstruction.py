@@ -5,7 +5,7 @@ missing.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from ghpt.geometry.state import FILE_STATES, State
+from ghpt.skeleton import HUMAN36M, NamePair
 
 __all__ = ["FILE_STATES", "About", "Reconstruction", "State", "concatenate", "move_to_cpu"]
 
@@ -34,6 +35,10 @@ class About:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """The point of the world (mm) that formats of single precision take for their zero: near the
     rig where that is far away."""
+    world: str = "the cameras' own"
+    """Whose axes the positions have, in words."""
+    bones: tuple[NamePair, ...] = HUMAN36M.bone_names
+    """What pictures draw between joints, by name; those without both ends are not there."""
 
 
 @dataclass(frozen=True)
@@ -64,10 +69,29 @@ class Reconstruction:
     def __len__(self) -> int:
         return len(self.frame)
 
+    def frames(self, rows: Int[Tensor, " N"]) -> Reconstruction:
+        """Return the frames at these positions."""
+        values = {field.name: getattr(self, field.name)[rows] for field in fields(self)}
+        return Reconstruction(**values)
+
+    def select_joints(self, joints: Int[Tensor, " j"]) -> Reconstruction:
+        """Return some of the joints, in this order."""
+        chosen = {name: getattr(self, name).index_select(axis, joints) for name, axis in _AXIS}
+        return replace(self, **chosen)
+
+    def with_joints(self, other: Reconstruction) -> Reconstruction:
+        """Return the joints of both, of the same frames."""
+        pairs = [(name, (getattr(self, name), getattr(other, name)), axis) for name, axis in _AXIS]
+        return replace(self, **{name: torch.cat(both, axis) for name, both, axis in pairs})
+
     @property
     def has_position(self) -> Bool[Tensor, "T J"]:
         """Joints that have a position."""
         return self.state <= State.FILLED
+
+
+_AXIS = (("points", 1), ("state", 1), ("error", 1), ("views", 2), ("covariance", 1))
+"""The fields with a value for each joint, and the dimension that the joints are."""
 
 
 def move_to_cpu(part: Reconstruction) -> Reconstruction:

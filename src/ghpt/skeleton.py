@@ -133,6 +133,12 @@ class Skeleton:
     def __len__(self) -> int:
         return len(self.key_points)
 
+    @property
+    def bone_names(self) -> tuple[NamePair, ...]:
+        """The bones, by the names of their ends."""
+        names = self.key_points
+        return tuple((names[start], names[end]) for start, end in self.bones)
+
     @cached_property
     def mirror(self) -> tuple[int, ...]:
         """For each key point, the one on the other side of the body."""
@@ -152,6 +158,20 @@ class Skeleton:
         """The names of those of the 17 joints that the key points do not give."""
         rows = zip(JOINTS, self.joints, strict=True)
         return tuple(name for name, weights in rows if not any(weights))
+
+    def select(self, chosen: Sequence[int]) -> Skeleton:
+        """Return the skeleton of some of the key points, in this order."""
+        place = {key_point: i for i, key_point in enumerate(chosen)}
+        bones = [bone for bone in self.bones if place.keys() >= set(bone)]
+        pairs = [pair for pair in self.pairs if place.keys() >= set(pair)]
+        rows = [row if _uses_only(row, place) else (0.0,) * len(self) for row in self.joints]
+        return Skeleton(
+            name=self.name,
+            key_points=tuple(self.key_points[i] for i in chosen),
+            bones=tuple((place[start], place[end]) for start, end in bones),
+            pairs=tuple((place[left], place[right]) for left, right in pairs),
+            joints=tuple(tuple(row[i] for i in chosen) for row in rows),
+        )
 
     @property
     def has_joints(self) -> bool:
@@ -207,6 +227,10 @@ def make_skeleton(
         pairs=tuple((left, right) for left, right in sides),
         joints=_joint_weights(where, index, joints or {}),
     )
+
+
+def _uses_only(weights: Sequence[float], places: Mapping[int, int]) -> bool:
+    return all(place in places for place, weight in enumerate(weights) if weight)
 
 
 def _is_left(name: str) -> bool:

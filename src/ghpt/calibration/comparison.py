@@ -11,11 +11,12 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.rotations import nearest_rotation
+from ghpt.geometry.similarity import Similarity
 from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.observations import Observations, Recording
-from ghpt.skeleton import BONES, JOINT, PELVIS, THORAX
+from ghpt.skeleton import HUMAN36M, Skeleton
 
 _FRAMES = 256
 """Frames that are triangulated at once."""
@@ -24,31 +25,6 @@ _SMALLEST_ANGLE = 1e-4
 """Radians; a rotation that differs by less weighs no more in `align_robustly`."""
 _SMALLEST_SHARE = 1e-5
 """Of the rig's size; a centre that differs by less weighs no more in `align_robustly`."""
-_ANKLES = [JOINT["left_ankle"], JOINT["right_ankle"]]
-
-
-@dataclass(frozen=True)
-class Similarity:
-    """From one world to another: ``X' = scale R X + t``; mm."""
-
-    R: Float[Tensor, "3 3"]
-    scale: float
-    t: Float[Tensor, " 3"]
-
-    def points(self, points: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3"]:
-        """Return points in the other world."""
-        return self.scale * (points @ self.R.mT) + self.t
-
-    def cameras(self, cameras: Cameras) -> Cameras:
-        """Return the same cameras in the other world: their images stay as they are."""
-        R = cameras.R @ self.R.mT
-        origin = (R @ self.t[:, None])[..., 0]
-        return Cameras(cameras.K, R, self.scale * cameras.t - origin)
-
-    def covariance(self, covariance: Float[Tensor, "V 6 6"]) -> Float[Tensor, "V 6 6"]:
-        """Return covariances of rotations (radians, about the world's axes) and centres (mm)."""
-        change = torch.block_diag(self.R, self.scale * self.R)
-        return change @ covariance @ change.T
 
 
 def align(cameras: Cameras, reference: Cameras, rigid: bool = False) -> Similarity:
@@ -205,14 +181,17 @@ def quantiles(errors: Float[Tensor, " N"]) -> Quantiles:
 
 
 def bone_variations(
-    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]
+    points: Float[Tensor, "T J 3"],
+    estimated: Bool[Tensor, "T J"],
+    skeleton: Skeleton = HUMAN36M,
 ) -> BoneVariation:
     """Return the variation of each bone's length by name; None for one that is never measured."""
-    variation, known = bone_variation(points, estimated)
+    variation, known = bone_variation(points, estimated, skeleton)
     pairs = zip(variation.tolist(), known.tolist(), strict=True)
     each = [value if is_known else None for value, is_known in pairs]
     median = float(variation[known].median()) if known.any() else None
-    return BoneVariation(median, dict(zip(BONE_NAMES, each, strict=True)))
+    names = BONE_NAMES if skeleton == HUMAN36M else map("_".join, skeleton.bone_names)
+    return BoneVariation(median, dict(zip(names, each, strict=True)))
 
 
 def triangulate_recording(
@@ -268,14 +247,16 @@ def held_out_errors(
 
 
 def bone_variation(
-    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"]
+    points: Float[Tensor, "T J 3"],
+    estimated: Bool[Tensor, "T J"],
+    skeleton: Skeleton = HUMAN36M,
 ) -> tuple[Float[Tensor, " L"], Bool[Tensor, " L"]]:
     """Return how much each bone's length varies over the frames, and which bones are known.
 
     The variation is 1.4826 x the median deviation over the median; a bone is known that two frames
     or more show.
     """
-    a, b = torch.tensor(BONES).unbind(1)
+    a, b = torch.tensor(skeleton.bones, dtype=torch.long).reshape(-1, 2).unbind(1)
     both = estimated[:, a] & estimated[:, b]
     length = (points[:, a] - points[:, b]).norm(dim=-1)
     length = torch.where(both, length, torch.nan)
@@ -284,46 +265,3 @@ def bone_variation(
     known = (both.sum(0) >= 2) & (median > 0)
     safe_median = torch.where(known, median, 1.0)
     return torch.where(known, deviation / safe_median, 0.0), known
-
-
-def upright(
-    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"], cameras: Cameras
-) -> Similarity:
-    """Return the way to a world with z along the people's mean direction from hips to neck, the
-    floor at their lowest ankles, the origin below where they mostly are, and x where the first
-    camera looks.
-
-    It is only as true as they stood upright.
-    """
-    z = _unit(_upright_direction(points, estimated, cameras))
-    forward = _across(cameras.R[0, 2], z)
-    if float(forward.norm()) <= 1e-3:  # the first camera looks straight down
-        forward = _across(cameras.R[0, 0], z)
-    x = _unit(forward)
-    R = torch.stack((x, torch.linalg.cross(z, x), z))
-    positions = points[estimated] @ R.mT
-    if not len(positions):
-        return Similarity(R, 1.0, torch.zeros(3, dtype=R.dtype))
-    ankles = points[:, _ANKLES][estimated[:, _ANKLES]] @ R.mT
-    middle = positions.median(0).values
-    lowest = ankles if len(ankles) else positions
-    floor = lowest[:, 2].quantile(0.05)
-    return Similarity(R, 1.0, -torch.stack((middle[0], middle[1], floor)))
-
-
-def _upright_direction(
-    points: Float[Tensor, "T J 3"], estimated: Bool[Tensor, "T J"], cameras: Cameras
-) -> Float[Tensor, " 3"]:
-    both = estimated[:, THORAX] & estimated[:, PELVIS]
-    trunk = (points[:, THORAX] - points[:, PELVIS])[both]
-    direction = torch.nn.functional.normalize(trunk, dim=-1).sum(0)
-    return direction if float(direction.norm()) > 0 else -cameras.R[0, 1]
-
-
-def _across(v: Float[Tensor, " 3"], axis: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
-    """Return the part of ``v`` that is perpendicular to the unit vector ``axis``."""
-    return v - (v @ axis) * axis
-
-
-def _unit(v: Float[Tensor, " 3"]) -> Float[Tensor, " 3"]:
-    return v / v.norm()

@@ -15,12 +15,10 @@ from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.calibration.check.evidence import gather
 from ghpt.calibration.check.setup import setup_of
 from ghpt.calibration.comparison import (
-    Similarity,
     align,
     explain,
     rig_difference,
     triangulate_recording,
-    upright,
 )
 from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.millimetres import (
@@ -51,6 +49,8 @@ from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.similarity import Similarity
+from ghpt.geometry.upright import upright
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.observations import Recording
@@ -286,6 +286,8 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     if not settings.keypoints:
         return Case(recording_sequence(settings), "the truth", is_own=False)
     cameras = own_cameras(settings, "intrinsics.toml")
+    if cameras.unposed:
+        cameras = cameras.without_extrinsics()
     people = own_people(settings)
     sequence = own_sequence(settings, people, cameras, person=None)
     sequence = resolve_unit(sequence, estimator, ask=False)

@@ -20,7 +20,7 @@ from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import Detections, read_key_points
 from ghpt.data.formats.names import Name
-from ghpt.data.people.persons import person_sequence
+from ghpt.data.people.persons import detector_sequence, person_sequence
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptConfigError
@@ -86,6 +86,15 @@ def own_sequence(
     return replace(sequence, source=str(_required_path(inputs).resolve()))
 
 
+def own_detector_sequence(
+    inputs: InputSettings, people: Detections, cameras: CameraSet, person: int
+) -> Sequence:
+    """Return one person with all key points of the detector, as `own_sequence` else."""
+    title = own_title(inputs)
+    sequence = detector_sequence(people, cameras, inputs.match, inputs.views, person, title)
+    return replace(sequence, source=str(_required_path(inputs).resolve()))
+
+
 def own_title(inputs: InputSettings) -> str:
     """Return what a report calls the user's files."""
     name = _required_path(inputs).resolve().name
@@ -141,5 +150,5 @@ def resolve_unit(sequence: Sequence, estimator: Estimator, ask: bool) -> Sequenc
     cameras = sequence.cameras
     if cameras.unit_known or not cameras.calibrated or len(cameras) < 2:
         return sequence
-    observations = sequence.read(sequence.spread(_UNIT_FRAMES))
+    observations = sequence.as_joints().read(sequence.spread(_UNIT_FRAMES))
     return replace(sequence, cameras=decide_unit(cameras, observations, estimator, ask))

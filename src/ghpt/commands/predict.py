@@ -5,10 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -20,8 +20,8 @@ from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
+    own_detector_sequence,
     own_people,
-    own_sequence,
     own_title,
     recording_sequence,
     resolve_unit,
@@ -36,29 +36,32 @@ from ghpt.commands.prediction.run import RunSettings, predict_shards
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.prediction.statistics import (
     Estimate,
+    Evaluation,
     evaluate,
     measure_coverage,
     pose_estimate,
 )
 from ghpt.commands.prediction.verdict import Judge, Level, Measures
+from ghpt.commands.prediction.world import World, choose_world
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
-from ghpt.export import WRITERS, Chunks, Evidence, Scene
+from ghpt.export import WRITERS, Chunks, Evidence, Scene, find_marker_set
 from ghpt.export.scene import origin_note
 from ghpt.files import sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.flips import LeftRightFlips
+from ghpt.models.estimators.joint_means import JointMeans, all_joints, human_joints
 from ghpt.models.estimators.predictors import Classical, Learned
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
-from ghpt.reconstruction import About
+from ghpt.reconstruction import About, Reconstruction
 from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NAMES
 from ghpt.report.terminal import print_document
-from ghpt.skeleton import JOINTS
+from ghpt.skeleton import Skeleton
 
 SHARDS = ".shards"
 """The folder of the shards, within the output. It may be deleted: the next run then starts anew."""
@@ -83,6 +86,7 @@ class PredictSettings(InputSettings):
     """The settings of predict.py."""
 
     person: int
+    joints: Literal["detector", "human36m"]
     ckpt: str | None
     trust: list[str]
     hypotheses: int | None
@@ -92,6 +96,9 @@ class PredictSettings(InputSettings):
     smooth: float | None
     formats: list[str] | None
     trc: dict[str, Any]
+    markers: str | None
+    world: Literal["cameras", "people", "first"]
+    floor: list[str] | None
     compare: list[str]
     evaluated_frames: int
     shard_frames: int
@@ -171,7 +178,10 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         rate_hz=sequence.rate_hz,
     )
     origin = provenance(settings.seed)
-    about = _about(sequence, estimator, gaps, origin)
+    joints = joints_of(settings, sequence.skeleton)
+    about = _about(sequence, joints, estimator, gaps, origin)
+    if settings.markers:
+        find_marker_set(settings.markers).check_joints(about.joints)
     formats = _formats(settings, sequence)
     _warn_of_origin(about, formats)
     _log.info(
@@ -182,8 +192,7 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         estimator.text,
     )
     sweep_temporaries(output)
-    sample = sequence.read(sequence.spread(settings.fitted_frames))
-    predictor = estimator.predictor.fitted(sample)
+    predictor = _fitted(estimator, sequence, settings)
     key = _shard_key(sequence, estimator, origin)
     how = RunSettings(
         settings.shard_frames, settings.batch, settings.progress_bar, settings.trainer
@@ -192,16 +201,14 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     with predict_shards(sequence, predictor, weights, output / SHARDS, key, how) as shards:
         if shards is None:
             return None
-        with apply_gaps(gaps, shards, len(JOINTS), output) as chunks:
-            _write_formats(settings, output, about, chunks, formats, sequence, shards)
+        with apply_gaps(gaps, shards, len(sequence.skeleton), output) as key_points:
+            own = _mapped(key_points, joints)
+            world = _choose_world(settings, sequence, about, own)
+            chunks = _mapped(own, world.reconstruction)
+            _write_formats(settings, output, world, about, chunks, formats, sequence, shards)
             views = about.camera_names
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
-    estimates: dict[str, Estimate] = {estimator.name: pose_estimate(predictor.rejecting_nothing())}
-    for name, other in compared.items():
-        estimates.setdefault(name, other.fitted(sample))
-    evaluation = evaluate(
-        sequence, estimator.flips, estimates, settings.evaluated_frames, settings.batch
-    )
+    evaluation = _evaluate(estimator, compared, sequence, settings)
     result = PredictionResult(
         data=sequence.title,
         source=sequence.source,
@@ -216,11 +223,12 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         unit_mm=sequence.cameras.unit_mm,
         evaluation=evaluation,
         formats=formats,
+        world=world.numbers(),
         provenance=about.provenance,
     )
     measures = _measures(result)
     asked = camera_check.is_worthwhile(measures.view_errors)
-    mistakes = check_cameras(sequence, camera_check) if asked else ()
+    mistakes = check_cameras(sequence.as_joints(), camera_check) if asked else ()
     commands = commands_on(settings, settings.person, settings.ckpt, output)
     verdict = judge(measures, mistakes, result.unit_mm, commands)
     result = replace(result, verdict=verdict)
@@ -310,9 +318,23 @@ def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Seque
     """Return what is predicted: the user's own key points, or a recording of the data set."""
     if not settings.keypoints:
         return recording_sequence(settings)
-    sequence = _files_sequence(settings)
+    sequence = needed_key_points(settings, _files_sequence(settings))
     sequence.cameras.check_calibrated(sequence.source)
     return resolve_unit(sequence, camera_check.consensus, ask=True)
+
+
+def needed_key_points(settings: PredictSettings, sequence: Sequence) -> Sequence:
+    """Return the sequence of those key points that the joints of the files are made of.
+
+    Raises GhptDataError where the 17 joints are needed, and the detector gives too few of them.
+    """
+    skeleton = sequence.skeleton
+    if settings.ckpt or settings.joints == "human36m":
+        skeleton.require_joints(sequence.source)
+    if settings.joints == "detector":
+        return sequence
+    parts = np.flatnonzero(skeleton.joint_weights.any(0))
+    return sequence.select_key_points(parts.tolist())
 
 
 def _files_sequence(settings: PredictSettings) -> Sequence:
@@ -325,7 +347,7 @@ def _files_sequence(settings: PredictSettings) -> Sequence:
             title = own_title(settings)
             return stored_sequence(stored, cameras, settings.match, settings.views, title)
     people = own_people(settings)
-    sequence = own_sequence(settings, people, cameras, settings.person)
+    sequence = own_detector_sequence(settings, people, cameras, settings.person)
     crowded = people.crowded_frames()
     if crowded:
         words = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
@@ -335,8 +357,54 @@ def _files_sequence(settings: PredictSettings) -> Sequence:
     return sequence
 
 
+def _mapped(chunks: Chunks, function: Callable[[Reconstruction], Reconstruction]) -> Chunks:
+    return lambda: map(function, chunks())
+
+
+def _choose_world(
+    settings: PredictSettings, sequence: Sequence, about: About, chunks: Chunks
+) -> World:
+    cameras = sequence.cameras.cameras
+    total = len(sequence)
+    return choose_world(settings.world, settings.floor, cameras, about.joints, chunks, total)
+
+
+def joints_of(settings: PredictSettings, skeleton: Skeleton) -> JointMeans:
+    """Return the joints of the files."""
+    return human_joints(skeleton) if settings.joints == "human36m" else all_joints(skeleton)
+
+
+def _fitted(
+    estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings
+) -> Classical | Learned:
+    """Return the predictor for a sequence's key points, with their noise."""
+    sample = sequence.read(sequence.spread(settings.fitted_frames))
+    return estimator.predictor.for_skeleton(sequence.skeleton).fitted(sample)
+
+
+def _evaluate(
+    estimator: PoseEstimator,
+    compared: Mapping[str, Estimator],
+    sequence: Sequence,
+    settings: PredictSettings,
+) -> Evaluation:
+    """Return what the estimators are worth on the 17 joints, or on all key points without them."""
+    judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
+    sample = judged.read(judged.spread(settings.fitted_frames))
+    own = _fitted(estimator, judged, settings).rejecting_nothing()
+    estimates: dict[str, Estimate] = {estimator.name: pose_estimate(own)}
+    for name, other in compared.items():
+        estimates.setdefault(name, other.fitted(sample))
+    flips = estimator.flips and estimator.flips.for_skeleton(judged.skeleton)
+    return evaluate(judged, flips, estimates, settings.evaluated_frames, settings.batch)
+
+
 def _about(
-    sequence: Sequence, estimator: PoseEstimator, gaps: Gaps, origin: dict[str, Any]
+    sequence: Sequence,
+    joints: JointMeans,
+    estimator: PoseEstimator,
+    gaps: Gaps,
+    origin: dict[str, Any],
 ) -> About:
     made = {
         "estimator": estimator.text,
@@ -351,7 +419,8 @@ def _about(
         name=sequence.title,
         source=sequence.source,
         estimator=estimator.name,
-        joints=JOINTS,
+        joints=joints.joints,
+        bones=joints.bones,
         camera_names=sequence.cameras.names,
         rate_hz=sequence.rate_hz,
         smoothed=gaps.cut_off_hz is not None,
@@ -400,21 +469,30 @@ def _warn_of_origin(about: About, formats: list[str]) -> None:
 def _write_formats(
     settings: PredictSettings,
     output: Path,
+    world: World,
     about: About,
     chunks: Chunks,
     formats: list[str],
     sequence: Sequence,
     shards: Shards,
 ) -> None:
-    scene = Scene(sequence.cameras.cameras, lambda: _evidence(sequence, shards))
+    cameras = world.cameras(sequence.cameras.cameras)
+    scene = Scene(cameras, lambda: _evidence(sequence, shards))
+    up = {"world_up": "z"} if world.name == "people" else {}
+    given = {name: value for name, value in settings.trc.items() if value is not None}
     arguments: dict[str, dict[str, Any]] = {
-        "trc": settings.trc,
+        "trc": up | given,
         "html": {"scene": scene},
         "rerun": {"scene": scene},
     }
+    about = world.about(about)
+    markers = find_marker_set(settings.markers) if settings.markers else None
     for name in formats:
         writer = WRITERS[name]
-        writer.write(output / writer.file, about, chunks, **arguments.get(name, {}))
+        content = (about, chunks)
+        if markers is not None and writer.has_markers:
+            content = markers.rename(about, chunks)
+        writer.write(output / writer.file, *content, **arguments.get(name, {}))
 
 
 def _evidence(sequence: Sequence, shards: Shards) -> Iterator[Evidence]:

@@ -26,6 +26,17 @@ class KeyPoints:
         """Index the leading dimensions."""
         return KeyPoints(self.pixels[index], self.confidence[index], self.valid[index])
 
+    def masked(self) -> KeyPoints:
+        """Return the key points as float32, with zeros where they are not valid."""
+        pixels = np.where(self.valid[..., None], self.pixels, 0).astype(np.float32)
+        confidence = np.where(self.valid, self.confidence, 0).astype(np.float32)
+        return KeyPoints(pixels, confidence, self.valid)
+
+    def select(self, key_points: Sequence[int]) -> KeyPoints:
+        """Return some of the key points, in this order."""
+        at = list(key_points)
+        return KeyPoints(self.pixels[..., at, :], self.confidence[..., at], self.valid[..., at])
+
     def take(self, chosen: Int[np.ndarray, "*S"]) -> KeyPoints:
         """Return the key points of these indices, [*S K]; nothing is valid where one is -1."""
         pixels = _take(self.pixels, chosen)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from ghpt.export.c3d import write_c3d
 from ghpt.export.html import write_html
+from ghpt.export.markers import MarkerSet, find_marker_set
 from ghpt.export.npz import read_reconstruction, write_npz
 from ghpt.export.rerun import write_rerun
 from ghpt.export.scene import Evidence, Scene
@@ -14,7 +15,16 @@ from ghpt.export.stream import Chunks
 from ghpt.export.table import write_csv, write_parquet
 from ghpt.export.trc import write_trc
 
-__all__ = ["WRITERS", "Chunks", "Evidence", "Scene", "Writer", "read_reconstruction"]
+__all__ = [
+    "WRITERS",
+    "Chunks",
+    "Evidence",
+    "MarkerSet",
+    "Scene",
+    "Writer",
+    "find_marker_set",
+    "read_reconstruction",
+]
 
 
 @dataclass(frozen=True)
@@ -31,14 +41,16 @@ class Writer:
     write: Callable[..., None]
     single: bool = False
     """Whether its positions have single precision, and so are relative to ``About.origin``."""
+    has_markers: bool = False
+    """Whether its joints may have the names of a marker set."""
 
 
 WRITERS = {
     "npz": Writer("poses.npz", write_npz),
     "csv": Writer("poses.csv", write_csv),
     "parquet": Writer("poses.parquet", write_parquet),
-    "trc": Writer("poses.trc", write_trc),
-    "c3d": Writer("poses.c3d", write_c3d, single=True),
+    "trc": Writer("poses.trc", write_trc, has_markers=True),
+    "c3d": Writer("poses.c3d", write_c3d, single=True, has_markers=True),
     "html": Writer("poses.html", write_html, single=True),
     "rerun": Writer("poses.rrd", write_rerun, single=True),
 }

@@ -152,6 +152,7 @@ def _groups(
         "SMOOTHED": _text("yes" if about.smoothed else "no"),
         "FIRST_FRAME": _text(str(first)),
         "RESIDUAL_UNIT": _text("px"),
+        "WORLD": _text(about.world),
         "CAMERAS": _texts(cameras),
     }
     if any(about.origin):

@@ -75,7 +75,7 @@ def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = N
         "about": _describe(about, len(frames.frame), whole.count, stride),
         "rate_hz": about.rate_hz,
         "joints": about.joints,
-        "bones": bones_of(about.joints),
+        "bones": bones_of(about),
         "sides": [side_of(joint) for joint in about.joints],
         "stride": int(np.median(intervals)) if len(intervals) else 1,
         "frame": _base64(frames.frame, "<f8"),
@@ -128,6 +128,7 @@ def _describe(about: About, kept: int, count: int, stride: int) -> str:
         f"{len(about.camera_names)} cameras",
         f"{count} frames",
         rate or "rate unknown (played at 30 frames/s)",
+        f"mm, axes: {about.world}",
     ]
     if about.smoothed:
         notes.append("smoothed")

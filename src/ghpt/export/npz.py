@@ -21,6 +21,7 @@ from ghpt.export.stream import PIECE, Chunks, pieces
 from ghpt.files import atomic_write
 from ghpt.geometry.masking import where
 from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
+from ghpt.skeleton import HUMAN36M, NamePair
 
 FORMAT_VERSION = 2
 _POINTS = {1: "<f4", 2: "<f8"}
@@ -68,6 +69,8 @@ class _Meta:
     smoothed: bool
     provenance: dict[str, Any]
     origin: tuple[float, float, float]
+    world: str
+    bones: tuple[NamePair, ...]
     states: dict[str, int]
 
     @classmethod
@@ -83,6 +86,8 @@ class _Meta:
             smoothed=about.smoothed,
             provenance=about.provenance,
             origin=about.origin,
+            world=about.world,
+            bones=about.bones,
             states={state.name.lower(): int(state) for state in FILE_STATES},
         )
 
@@ -159,6 +164,8 @@ def read_reconstruction(
         smoothed=file.meta.smoothed,
         provenance=file.meta.provenance,
         origin=file.meta.origin,
+        world=file.meta.world,
+        bones=file.meta.bones,
     )
     return about, (file.read(start, min(start + size, file.frames)) for start in starts)
 
@@ -242,7 +249,10 @@ _META_TYPES: dict[str, tuple[type, ...]] = {
     "rate_hz": (float, int, type(None)),
     "smoothed": (bool,),
     "provenance": (dict,),
+    "world": (str,),
 }
+_OLD_WORLD = "the cameras' own"
+"""That of files that do not say theirs."""
 
 
 def _parse_meta(path: Path, meta: Any) -> _Meta:
@@ -254,6 +264,7 @@ def _parse_meta(path: Path, meta: Any) -> _Meta:
         known = " and ".join(map(str, _POINTS))
         problem = f"is {version!r}; this ghpt reads {known}"
         raise GhptDataError(path, "meta.format_version", problem, _HINT)
+    content = {"world": _OLD_WORLD} | content
     for field, types in _META_TYPES.items():
         if not isinstance(content.get(field, ...), types):
             raise GhptDataError(path, f"meta.{field}", f"is {content.get(field)!r}", _HINT)
@@ -262,9 +273,18 @@ def _parse_meta(path: Path, meta: Any) -> _Meta:
         format_version=version,
         unit="mm",
         origin=_parse_origin(path, content.get("origin", [0.0, 0.0, 0.0])),
+        bones=_parse_bones(path, content.get("bones", HUMAN36M.bone_names)),
         states={},
         **{field: content[field] for field in _META_TYPES},
     )
+
+
+def _parse_bones(path: Path, bones: Any) -> tuple[NamePair, ...]:
+    listed = bones if isinstance(bones, list | tuple) else [bones]
+    for bone in listed:
+        if not isinstance(bone, list | tuple) or [type(end) for end in bone] != [str, str]:
+            raise GhptDataError(path, "meta.bones", f"holds {bone!r}", _HINT)
+    return tuple((start, end) for start, end in listed)
 
 
 def _parse_origin(path: Path, origin: Any) -> tuple[float, float, float]:

@@ -46,7 +46,7 @@ def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = 
     if scene is not None:
         origin = torch.tensor(about.origin, dtype=torch.float64)
         scene = replace(scene, cameras=scene.cameras.relative_to(origin))
-    names = [title(about), origin_note(about)]
+    names = [title(about), f"mm, axes: {about.world}", origin_note(about)]
     with atomic_write(path) as handle:
         recording = rr.RecordingStream("ghpt")
         recording.save(handle.name)
@@ -121,7 +121,7 @@ class _PieceLog:
 
     def _bones(self) -> None:
         piece = self.piece
-        bones = torch.tensor(bones_of(self.about.joints), dtype=torch.long).reshape(-1, 2)
+        bones = torch.tensor(bones_of(self.about), dtype=torch.long).reshape(-1, 2)
         start, end = bones.unbind(-1)
         strips = piece.points[:, bones]
         present = piece.has_position[:, bones].all(-1)
@@ -160,8 +160,9 @@ class _PieceLog:
             self._points(rr.Points2D, path, pixels[:, v], visible, self.colours, 3.0)
             if evidence is not None:
                 key_points = evidence.key_points[:, v]
-                path = f"{image}/key_points"
-                self._points(rr.Points2D, path, key_points, evidence.valid[:, v], grey, 5.0)
+                valid = evidence.valid[:, v]
+                colours = torch.full_like(valid, _GREY, dtype=torch.long)
+                self._points(rr.Points2D, f"{image}/key_points", key_points, valid, colours, 5.0)
 
     def _points(
         self,

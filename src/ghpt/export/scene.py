@@ -12,7 +12,6 @@ from torch import Tensor
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.epipolar import homogeneous
 from ghpt.reconstruction import About, Reconstruction
-from ghpt.skeleton import BONES, JOINTS
 
 
 @dataclass(frozen=True)
@@ -56,15 +55,11 @@ def origin_note(about: About) -> str:
     return f"zero is at ({position}) mm of the cameras' world"
 
 
-def bones_of(joints: tuple[str, ...]) -> list[tuple[int, int]]:
-    """Return the skeleton's bones whose ends are among these joints."""
-    bones = []
-    for a, b in BONES:
-        start = JOINTS[a]
-        end = JOINTS[b]
-        if start in joints and end in joints:
-            bones.append((joints.index(start), joints.index(end)))
-    return bones
+def bones_of(about: About) -> list[tuple[int, int]]:
+    """Return the bones whose ends are among the joints, as index pairs."""
+    index = {joint: place for place, joint in enumerate(about.joints)}
+    present = [bone for bone in about.bones if index.keys() >= set(bone)]
+    return [(index[start], index[end]) for start, end in present]
 
 
 def side_of(joint: str) -> str:

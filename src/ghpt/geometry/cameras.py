@@ -109,6 +109,9 @@ class CameraSet:
     R: Float[Tensor, "V 3 3"] | None = None
     """World to camera; None, with ``t``, for cameras without extrinsics."""
     t: Float[Tensor, "V 3"] | None = None
+    unposed: tuple[str, ...] = ()
+    """The cameras that have no extrinsics; where two others have them, R and t are NaN for these.
+    """
     other_names: tuple[str, ...] = ()
     """What else the file calls each camera (a TOML table's key), '' where nothing; may be empty."""
     path: str = ""
@@ -146,19 +149,30 @@ class CameraSet:
 
     @property
     def calibrated(self) -> bool:
-        """Whether the cameras have extrinsics."""
-        return self.R is not None and self.t is not None
+        """Whether all cameras have extrinsics."""
+        return self.R is not None and self.t is not None and not self.unposed
 
     @property
     def cameras(self) -> Cameras:
-        """The calibrated cameras. Raises GhptDataError where they have no extrinsics."""
-        if self.R is None or self.t is None:
-            problem = "not all cameras have extrinsics"
-            raise GhptDataError(self.path, "rotation, translation", problem, _CALIBRATE)
+        """The calibrated cameras. Raises GhptDataError where not all have extrinsics."""
+        if self.R is None or self.t is None or self.unposed:
+            raise self._uncalibrated()
         return Cameras(self.K, self.R, self.t)
 
+    def is_posed(self, camera: int) -> bool:
+        """Return whether this camera has extrinsics."""
+        return self.R is not None and self.names[camera] not in self.unposed
+
+    def without_extrinsics(self) -> CameraSet:
+        """Return the same cameras with intrinsics alone."""
+        return replace(self, R=None, t=None)
+
+    def _uncalibrated(self) -> GhptDataError:
+        problem = f"are not there for {', '.join(self.unposed or self.names)}"
+        return GhptDataError(self.path, "rotation, translation", problem, _CALIBRATE)
+
     def check_calibrated(self, where: str) -> None:
-        """Raise GhptDataError unless there are two cameras or more, with extrinsics.
+        """Raise GhptDataError unless two cameras or more have extrinsics.
 
         ``where`` is what the views are of: a file of cameras or of key points.
         """
@@ -166,9 +180,8 @@ class CameraSet:
             problem = f"there is only {', '.join(self.names) or 'none'}"
             hint = "A place in space takes two views or more of the same moment."
             raise GhptDataError(where, "views", problem, hint)
-        if not self.calibrated:
-            problem = "not all cameras have extrinsics"
-            raise GhptDataError(self.path, "rotation, translation", problem, _CALIBRATE)
+        if self.R is None:
+            raise self._uncalibrated()
 
     @property
     def image_size(self) -> Int[Tensor, "V 2"]:
@@ -189,11 +202,12 @@ class CameraSet:
             size=None if self.size is None else self.size[at],
             R=None if self.R is None else self.R[at],
             t=None if self.t is None else self.t[at],
+            unposed=tuple(self.names[i] for i in at if self.names[i] in self.unposed),
         )
 
     def with_cameras(self, cameras: Cameras) -> CameraSet:
         """Return the same lenses and images with other pinhole cameras, in mm."""
-        return replace(self, K=cameras.K, R=cameras.R, t=cameras.t)
+        return replace(self, K=cameras.K, R=cameras.R, t=cameras.t, unposed=())
 
     def without_distortion(self) -> CameraSet:
         """Return the cameras as the ideal pinholes that undistorted key points are of."""

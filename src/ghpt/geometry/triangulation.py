@@ -79,6 +79,14 @@ class Triangulation:
         """Return a copy with ``fallback`` where ``mask`` is False."""
         return _map_fields(lambda x, y: where(mask, x, y), self, fallback)
 
+    def with_joints(self, joints: Int[Tensor, " j"], part: Triangulation) -> Triangulation:
+        """Return a copy with ``part`` in these joints of [B, J]."""
+        return _map_fields(lambda x, y: x.index_copy(1, joints, y), self, part)
+
+    def joints(self, joints: Int[Tensor, " j"]) -> Triangulation:
+        """Return some of the joints of [B, J]."""
+        return _map_fields(lambda x: x.index_select(1, joints), self)
+
     def unflatten(self, shape: torch.Size) -> Triangulation:
         """Return a copy whose first dimension has this shape."""
         return _map_fields(lambda x: x.reshape(*shape, *x.shape[1:]), self)

@@ -16,8 +16,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse
 from torch import Tensor
 
-from ghpt.calibration.comparison import Similarity
 from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.similarity import Similarity
 from ghpt.report.figures import MIDDLE, wrap_lines
 from ghpt.skeleton import BONES
 

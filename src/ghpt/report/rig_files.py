@@ -14,11 +14,14 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from torch import Tensor
 
-from ghpt.calibration.comparison import Similarity, align_robustly, upright
+from ghpt.calibration.comparison import align_robustly
 from ghpt.calibration.rig import RigEstimate
 from ghpt.data.formats.camera_writers import write_aniposelib, write_opencv, write_pose2sim
 from ghpt.files import atomic_write, finite, remove, write_json
 from ghpt.geometry.cameras import Cameras, CameraSet
+from ghpt.geometry.lens import is_fisheye
+from ghpt.geometry.similarity import Similarity
+from ghpt.geometry.upright import upright
 from ghpt.observations import Recording
 from ghpt.report.calibration import (
     CalibratedCamera,
@@ -89,7 +92,8 @@ def write_rig(output: Path, cameras: CameraSet, result: CalibrationResult) -> No
         metadata["size"] = "not known: twice the principal point"
     write_pose2sim(output / "rig.toml", cameras, metadata)
     write_aniposelib(output / "rig_anipose.toml", cameras, metadata)
-    write_opencv(output, cameras)
+    if not is_fisheye(cameras.distortion).any():
+        write_opencv(output, cameras)
 
 
 def write_poses(

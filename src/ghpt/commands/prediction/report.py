@@ -9,7 +9,6 @@ from ghpt.calibration.comparison import Quantiles
 from ghpt.commands.prediction.result import PredictionResult
 from ghpt.commands.prediction.statistics import EstimatorErrors
 from ghpt.commands.prediction.verdict import verdict_lines
-from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.report.document import (
     Block,
     Bullets,
@@ -170,7 +169,7 @@ def _joint_table(result: PredictionResult) -> Table:
 def _segment_table(result: PredictionResult) -> Table:
     estimators = _estimators(result)
     rows = []
-    for name in BONE_NAMES:
+    for name in next(iter(estimators.values())).segments.each:
         variations = [errors.segments.each[name] for errors in estimators.values()]
         cells = [format_number(variation, 1, 100) for variation in variations]
         rows.append([name.replace("_", " "), *cells])

@@ -26,6 +26,8 @@ class PredictionResult:
     unit_mm: float
     evaluation: Evaluation
     formats: list[str]
+    world: dict[str, Any]
+    """The world of the files, and the way there from that of the cameras."""
     provenance: dict[str, Any]
     verdict: Verdict | None = None
 

@@ -21,6 +21,7 @@ from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, stature
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import FILE_STATES, Reconstruction, State
+from ghpt.skeleton import JOINTS, Skeleton
 
 Estimate = Callable[[Observations], PoseEstimate]
 _LEAST = 20
@@ -98,7 +99,11 @@ def measure_coverage(
         count = float(states[:, state].sum())
         share[state.name.lower()] = count / max(frames * len(joints), 1)
     observed_share = (states[:, State.OBSERVED].double() / max(frames, 1)).tolist()
-    height = float(stature(torch.cat(points), torch.cat(observed)))
+    joints17 = [joints.index(name) if name in joints else -1 for name in JOINTS]
+    given = torch.tensor(joints17) >= 0
+    height = float(
+        stature(torch.cat(points)[:, joints17], torch.cat(observed)[:, joints17] & given)
+    )
     return Coverage(
         frames=frames,
         share=share,
@@ -118,7 +123,7 @@ def evaluate(
 ) -> Evaluation:
     """Return the errors of each estimator on at most so many frames, evenly spread.
 
-    ``flips`` are undone for all estimators.
+    ``flips``, which are of the sequence's skeleton, are undone for all estimators.
     """
     rows = sequence.spread(most)
     batches = []
@@ -130,7 +135,9 @@ def evaluate(
     names = sequence.cameras.names
     errors = {}
     for name, estimate in estimates.items():
-        errors[name] = _estimator_errors(batches, estimate, held_out[name], common, names)
+        errors[name] = _estimator_errors(
+            batches, estimate, held_out[name], common, names, sequence.skeleton
+        )
     return Evaluation(len(rows), errors)
 
 
@@ -158,6 +165,7 @@ def _estimator_errors(
     held_out: _Errors,
     common: Bool[Tensor, "T V J"],
     names: tuple[str, ...],
+    skeleton: Skeleton,
 ) -> EstimatorErrors:
     found = [estimate(batch) for batch in batches]
     points = torch.cat([poses.points.double() for poses in found])
@@ -169,7 +177,7 @@ def _estimator_errors(
     return EstimatorErrors(
         reprojection=view_errors(own.error, own.valid, names),
         held_out=view_errors(held_out.error, common, names),
-        segments=bone_variations(points, estimated),
+        segments=bone_variations(points, estimated, skeleton),
         placed=float(estimated.double().mean()),
         scales=_scaled_errors(batches, own, held_out, names),
     )

@@ -1,307 +1,162 @@
 """People's own camera files.
 
-They are those of Pose2Sim, aniposelib, caliscope, freemocap, OpenCV, EasyMocap, Panoptic, Human3.6M
-and COLMAP, and all are read as world to camera, mm. Pose2Sim's and caliscope's TOML are in metres,
-Panoptic in centimetres, Human3.6M in mm. COLMAP's models have a unit of their own, aniposelib's and
-OpenCV's files that of the calibration board: they are taken to be in metres until the size of the
-person tells (``ghpt.calibration.check.units``).
+They are those of Pose2Sim, aniposelib, caliscope, freemocap, OpenCap, OpenCV, EasyMocap, Panoptic,
+Human3.6M, xrmocap and COLMAP, and all are read as world to camera, mm. Pose2Sim's and caliscope's
+TOML are in metres, Panoptic in centimetres, Human3.6M and OpenCap in mm. COLMAP's models have a
+unit of their own, all others that of the calibration board: they are taken to be in metres until
+the size of the person tells (``ghpt.calibration.check.units``).
 """
 
 from __future__ import annotations
 
-import re
-import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from ghpt.data.formats.camera_entry import CameraEntry
+from ghpt.data.formats.camera_entry import KNOWN_CAMERAS, CameraContent, CameraEntry
+from ghpt.data.formats.camera_json import read_camera_json
+from ghpt.data.formats.camera_pickle import SUFFIXES, read_camera_pickle
+from ghpt.data.formats.camera_toml import read_toml
+from ghpt.data.formats.camera_yml import read_opencv
 from ghpt.data.formats.colmap import is_colmap, read_colmap
-from ghpt.data.formats.names import Name, chosen_name
-from ghpt.data.formats.opencv_yml import read_yml
+from ghpt.data.formats.names import Name
 from ghpt.data.formats.validate import (
-    MOST_VIEWS,
-    SMALL_JSON,
     check_cameras,
     check_view_count,
     numbers_in,
     open_input,
-    read_flag,
-    read_json,
-    read_name,
 )
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
+from ghpt.geometry.lens import COEFFICIENTS, fisheye_lens
 from ghpt.geometry.rotations import vector_to_matrix
 
 _MM_PER_M = 1000.0
-_MM_PER_CM = 10.0
-_LARGEST = 1 << 19
-_DEEPEST = 100
-"""Bytes of a TOML file; parts of a key in it, which cost their square to read."""
-_MOST_TABLES = 10 * MOST_VIEWS
-"""In a TOML file, with the rows of matrices that begin a line."""
 _LARGEST_NUMBER = 1e15
 """No focal length or distance; its square would still be one, though."""
-_FIELDS = ("matrix", "distortions", "rotation", "translation")
-_FORMATS = (
-    "Known: TOML of Pose2Sim, aniposelib, caliscope or freemocap; intri.yml (with extri.yml beside "
-    "it) of OpenCV or EasyMocap; calibration JSON of CMU Panoptic; camera-parameters.json of "
-    "Human3.6M; a folder with a COLMAP model."
-)
+_LENSES = (4, 5, 8, 12, 14)
+"""How many coefficients OpenCV's lenses have; of 12 and 14, those after the eighth must be 0."""
+_SUFFIXES = (".toml", ".json", ".yml", ".yaml", *SUFFIXES)
+"""Of a file in a folder of cameras."""
 
 
 def read_cameras(
     path: str | Path, subject: Name = None, unit_mm: int | float | None = None
 ) -> CameraSet:
-    """Return the cameras of a file, or of a folder with intri.yml or a COLMAP model.
+    """Return the cameras of a file, or of a folder.
 
-    The format is recognised by content. ``subject`` chooses of a Human3.6M file, which has other
-    extrinsics for each. ``unit_mm`` is the length of the file's unit where that is not the format's
-    own, or where the format has none. Raises GhptDataError, naming file, field and hint, for
-    anything that is not a pinhole camera with the lens of ``ghpt.geometry.lens``: fisheye lenses
-    among it.
+    A folder holds intri.yml, a COLMAP model, one file with all cameras, or a file for each camera,
+    beside each other or each in a folder of its own. The format is recognised by content.
+    ``subject`` chooses of a Human3.6M file, which has other extrinsics for each. ``unit_mm`` is the
+    length of the file's unit where that is not the format's own, or where the format has none.
+    Raises GhptDataError, naming file, field and hint, for anything that is not a camera with a lens
+    of ``ghpt.geometry.lens``.
     """
-    path = Path(path)
+    path = Path(path).expanduser()
     if unit_mm is not None and not 0 < unit_mm < float("inf"):
         hint = "Give the length of the file's unit in mm."
         raise GhptDataError(path, "unit_mm", f"is {unit_mm}", hint)
-    if path.is_dir() and not is_colmap(path):
-        path = path / "intri.yml"
-    content = _read_entries(path, subject)
-    unit = content.unit_mm if unit_mm is None else float(unit_mm)
-    return _camera_set(path, content, unit, content.unit_known or unit_mm is not None)
+    content = _read_folder(path, subject) if path.is_dir() else _read_file(path, subject)
+    if unit_mm is not None:
+        content = replace(content, unit_mm=float(unit_mm), unit_known=True)
+    return _camera_set(path, content)
 
 
-@dataclass(frozen=True)
-class _Content:
-    """What a file of a format holds."""
-
-    format: str
-    entries: Sequence[CameraEntry]
-    unit_mm: float
-    """The format's unit of length, or what it is taken for."""
-    unit_known: bool = True
-
-
-def _read_entries(path: Path, subject: Name) -> _Content:
-    if path.is_dir():
-        return _Content("COLMAP", read_colmap(path), _MM_PER_M, unit_known=False)
+def _read_file(path: Path, subject: Name) -> CameraContent:
     with open_input(path) as handle:
         start = handle.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
+    if path.suffix.lower() in SUFFIXES or start.startswith(b"\x80"):
+        return read_camera_pickle(path)
     if start.startswith(b"%YAML"):
-        return _Content("OpenCV", _opencv(path), _MM_PER_M, unit_known=False)
-    if start.startswith((b"{", b"\xff\xfe{", b"\xfe\xff\0{")):
-        content = read_json(path, SMALL_JSON)
-        if isinstance(content, dict) and "intrinsics" in content:
-            return _Content("Human3.6M", _human36m(path, content, subject), 1.0)
-        return _Content("Panoptic", _panoptic(path, content), _MM_PER_CM)
-    form, entries = _toml(path)
-    return _Content(form, entries, _MM_PER_M, unit_known=form != "aniposelib")
+        return read_opencv(path)
+    if start.startswith((b"{", b"[", b"\xff\xfe{", b"\xfe\xff\0{")) and not _is_table(start):
+        return read_camera_json(path, subject)
+    return read_toml(path)
 
 
-def _toml(path: Path) -> tuple[str, list[CameraEntry]]:
-    content = _parse_toml(path)
-    nested = content.get("cameras")
-    numbered = isinstance(nested, dict)
-    tables = nested if isinstance(nested, dict) else content
-    entries = []
-    for key, table in tables.items():
-        if not isinstance(table, dict) or not any(field in table for field in _FIELDS):
-            continue
-        if not read_flag(path, f"{key}.ignore", table.get("ignore", False)):
-            entries.append(_toml_camera(path, key, table, numbered))
-    if numbered:
-        return "caliscope", entries
-    fisheye = any("fisheye" in table for table in tables.values() if isinstance(table, dict))
-    return "Pose2Sim" if fisheye else "aniposelib", entries
+def _is_table(start: bytes) -> bool:
+    """Return whether a file begins with a table of TOML rather than a list of JSON."""
+    line = start.split(b"\n")[0].split(b"#")[0].strip()
+    return line.startswith(b"[") and line.endswith(b"]") and b"," not in line
 
 
-def _parse_toml(path: Path) -> dict[str, Any]:
-    with open_input(path) as handle:
-        data = handle.read(_LARGEST + 1)
-    if len(data) > _LARGEST:
-        problem = f"has more than {_LARGEST >> 10} KiB"
-        raise GhptDataError(path, "", problem, "Check that this is the right file.")
-    if data.count(b"\n[") > _MOST_TABLES:
-        raise GhptDataError(path, "", f"has more than {_MOST_TABLES} tables", _FORMATS)
-    parts = re.split(rb"[=,\n]", data)
-    if any(part.count(b".") > _DEEPEST for part in parts):
-        raise GhptDataError(path, "", f"has a key of more than {_DEEPEST} parts", _FORMATS)
-    try:
-        return tomllib.loads(data.decode("utf-8-sig"))
-    except (ValueError, RecursionError) as error:
-        problem = f"is no camera file: not TOML either ({error})"
-        raise GhptDataError(path, "", problem, _FORMATS) from error
+def _read_folder(path: Path, subject: Name) -> CameraContent:
+    """Return the cameras of a folder's files. Raises GhptDataError."""
+    if is_colmap(path):
+        return CameraContent("COLMAP", read_colmap(path), _MM_PER_M, unit_known=False)
+    if (path / "intri.yml").is_file():
+        return read_opencv(path / "intri.yml")
+    files = _camera_files(path)
+    check_view_count(path, len(files))
+    found = [_read_file(file, subject) for file in files]
+    if len(found) == 1:
+        return found[0]
+    several = [file.name for file, each in zip(files, found, strict=True) if len(each.entries) > 1]
+    if several:
+        problem = f"holds several files of cameras: {', '.join(sorted(several)[:5])}"
+        raise GhptDataError(path, "", problem, f"Name one: cameras={path / several[0]}")
+    if len({(each.format, each.unit_mm) for each in found}) > 1:
+        formats = ", ".join(sorted({each.format for each in found}))
+        problem = f"holds cameras of several formats: {formats}"
+        raise GhptDataError(path, "", problem, "Keep the cameras of one rig in a folder.")
+    names = _file_names(files)
+    entries = [
+        replace(entry, name=name if entry.name == file.stem else entry.name, other_name=name)
+        for file, name, each in zip(files, names, found, strict=True)
+        for entry in each.entries
+    ]
+    return replace(found[0], entries=entries)
 
 
-def _toml_camera(path: Path, key: str, table: Mapping[str, Any], numbered: bool) -> CameraEntry:
-    if read_flag(path, f"{key}.fisheye", table.get("fisheye", False)):
-        problem = "is true: fisheye lenses are not supported"
-        hint = "Undistort the images or the key points first, and give the pinhole camera."
-        raise GhptDataError(path, f"{key}.fisheye", problem, hint)
-    for field in ("matrix", "distortions"):
-        if field not in table:
-            hint = "Calibrate the intrinsics of this camera."
-            raise GhptDataError(path, f"{key}.{field}", "is missing", hint)
-    other = f"cam_{key}" if numbered and key.isdigit() else key
-    return CameraEntry(
-        name=read_name(path, f"{key}.name", table.get("name", other)),
-        other_name=other,
-        K=table["matrix"],
-        distortion=table["distortions"],
-        size=table.get("size"),
-        R=table.get("rotation"),
-        t=table.get("translation"),
+def _camera_files(folder: Path) -> list[Path]:
+    """Return the files of a folder that may be cameras, or those in the folders in it.
+
+    Raises GhptDataError, saying what else is there, where there are none.
+    """
+    for pattern in ("*", "*/*"):
+        files = [file for file in sorted(folder.glob(pattern)) if _may_be_camera(file)]
+        if files:
+            return files
+    there = sorted(entry.name for entry in folder.iterdir())
+    listed = ", ".join(there[:5]) + (", ..." if len(there) > 5 else "")
+    raise GhptDataError(
+        folder, "", f"holds no file of cameras: {listed or 'it is empty'}", KNOWN_CAMERAS
     )
 
 
-def _opencv(path: Path) -> list[CameraEntry]:
-    intrinsic = read_yml(path)
-    beside = path.with_name(path.name.replace("intri", "extri"))
-    extrinsic = read_yml(beside) if beside != path and beside.is_file() else intrinsic
-    names = intrinsic.get("names")
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
-        problem = "is not a list of the cameras' names"
-        raise GhptDataError(path, "names", problem, "Write it as EasyMocap does.")
-    check_view_count(path, len(names))
-    entries = []
-    for name in names:
-        if f"K_{name}" not in intrinsic:
-            hint = "Calibrate the intrinsics of this camera."
-            raise GhptDataError(path, f"K_{name}", "is missing", hint)
-        width = intrinsic.get(f"W_{name}")
-        height = intrinsic.get(f"H_{name}")
-        vector = extrinsic.get(f"R_{name}")
-        matrix = extrinsic.get(f"Rot_{name}")
-        entry = CameraEntry(
-            name=name,
-            other_name="",
-            K=intrinsic[f"K_{name}"],
-            distortion=_opencv_distortion(path, name, intrinsic),
-            size=None if width is None or height is None else [width, height],
-            R=vector if matrix is None else matrix,
-            t=extrinsic.get(f"T_{name}"),
-        )
-        entries.append(entry)
-    return entries
+def _may_be_camera(file: Path) -> bool:
+    visible = not file.name.startswith(".")
+    return visible and file.suffix.lower() in _SUFFIXES and file.is_file()
 
 
-def _opencv_distortion(path: Path, name: str, intrinsic: Mapping[str, object]) -> object:
-    distortion = intrinsic.get(f"dist_{name}", intrinsic.get(f"D_{name}"))
-    if distortion is not None:
-        return distortion
-    if any(key.startswith(("dist_", "D_")) for key in intrinsic):
-        problem = "is missing, and other cameras have it"
-        hint = "Write zeros if this lens does not distort."
-        raise GhptDataError(path, f"dist_{name}", problem, hint)
-    return [0.0] * 5
+def _file_names(files: list[Path]) -> list[str]:
+    """Return what the cameras are called: as their files, or as the folders of these."""
+    stems = [file.stem for file in files]
+    return stems if len(set(stems)) == len(stems) else [file.parent.name for file in files]
 
 
-def _human36m(path: Path, content: Mapping[str, Any], subject: Name) -> list[CameraEntry]:
-    """Return the cameras of karfly's file.
-
-    Its R and t take the world (mm) to the camera, unlike those of the data set's own XML.
-    """
-    intrinsics = _objects(path, "intrinsics", content["intrinsics"])
-    extrinsics = _objects(path, "extrinsics", content.get("extrinsics", {}))
-    chosen = _human36m_subject(path, subject, extrinsics)
-    poses = {} if chosen is None else extrinsics[chosen]
-    entries = []
-    for name, camera in intrinsics.items():
-        for field in ("calibration_matrix", "distortion"):
-            if field not in camera:
-                where = f"intrinsics.{name}.{field}"
-                raise GhptDataError(path, where, "is missing", "Get the file again.")
-        pose = poses.get(name, {})
-        if not isinstance(pose, dict):
-            where = f"extrinsics.{chosen}.{name}"
-            raise GhptDataError(path, where, "is not an object", "Get the file again.")
-        entry = CameraEntry(
-            name=name,
-            other_name="",
-            K=camera["calibration_matrix"],
-            distortion=camera["distortion"],
-            R=pose.get("R"),
-            t=pose.get("t"),
-        )
-        entries.append(entry)
-    return entries
-
-
-def _objects(path: Path, field: str, value: object) -> dict[str, dict[str, Any]]:
-    if isinstance(value, dict) and all(isinstance(part, dict) for part in value.values()):
-        return value
-    raise GhptDataError(path, field, "is not an object of objects", "Get the file again.")
-
-
-def _human36m_subject(
-    path: Path, subject: Name, extrinsics: Mapping[str, dict[str, Any]]
-) -> str | None:
-    """Return the subject whose extrinsics are wanted; None where the file has none."""
-    chosen: str | None
-    if subject is not None:
-        chosen = chosen_name(subject, extrinsics)
-        problem = f"there is no {chosen!r}"
-    else:
-        chosen = next(iter(extrinsics)) if len(extrinsics) == 1 else None
-        problem = "the extrinsics are different for each subject"
-    if chosen in extrinsics or (chosen is None and not extrinsics):
-        return chosen
-    hint = f"Choose one of {', '.join(extrinsics)}: subject=..."
-    raise GhptDataError(path, "subject", problem, hint)
-
-
-def _panoptic(path: Path, content: Any) -> list[CameraEntry]:
-    cameras = content.get("cameras") if isinstance(content, dict) else None
-    if not isinstance(cameras, list) or not all(isinstance(camera, dict) for camera in cameras):
-        raise GhptDataError(path, "cameras", "is not a list of cameras", _FORMATS)
-    check_view_count(path, len(cameras))
-    entries = []
-    for camera in cameras:
-        if camera.get("type", "hd") != "hd":
-            continue
-        for field in ("name", "K", "distCoef"):
-            if field not in camera:
-                where = f"camera {camera.get('name')}, {field}"
-                raise GhptDataError(path, where, "is missing", "Get the file again.")
-        entry = CameraEntry(
-            name=read_name(path, "name", camera["name"]),
-            other_name="",
-            K=camera["K"],
-            distortion=camera["distCoef"],
-            size=camera.get("resolution"),
-            R=camera.get("R"),
-            t=camera.get("t"),
-        )
-        entries.append(entry)
-    return entries
-
-
-def _camera_set(path: Path, content: _Content, unit_mm: float, unit_known: bool) -> CameraSet:
+def _camera_set(path: Path, content: CameraContent) -> CameraSet:
     """Check the cameras of a file. Raises GhptDataError."""
     entries = content.entries
     if not entries:
-        raise GhptDataError(path, "", "holds 0 cameras", _FORMATS)
+        raise GhptDataError(path, "", "holds 0 cameras", KNOWN_CAMERAS)
     check_view_count(path, len(entries))
     names = tuple(entry.name for entry in entries)
     K = np.stack([_intrinsics(path, entry) for entry in entries])
-    distortion = np.stack([_distortion(path, entry) for entry in entries])
-    poses = [_pose(path, entry, unit_mm) for entry in entries]
+    lenses = torch.stack([_lens(path, entry) for entry in entries])
+    plain = not lenses[:, 5:].any()
+    poses = [_pose(path, entry, content.unit_mm) for entry in entries]
     complete = [pose or (np.eye(3), np.zeros(3)) for pose in poses]
     R = np.stack([pose[0] for pose in complete])
     t = np.stack([pose[1] for pose in complete])
-    # what is not all the same tells the cameras apart: a file before extrinsic calibration has
-    # zeros for all
-    different = (np.abs(R - R[0]) > 0).any() or (np.abs(t - t[0]) > 0).any()
-    calibrated = all(pose is not None for pose in poses) and bool(different)
-    cameras, distortion = check_cameras(path, names, K, R, t, distortion)
+    cameras, distortion = check_cameras(path, names, K, R, t, lenses[:, : 5 if plain else None])
+    posed = torch.tensor([pose is not None for pose in poses])
+    calibrated = _tell_apart(R[posed.numpy()], t[posed.numpy()])
     sizes = [_size(path, entry) for entry in entries]
+    unposed = [name for name, pose in zip(names, poses, strict=True) if pose is None]
     return CameraSet(
         path=str(path),
         format=content.format,
@@ -310,20 +165,37 @@ def _camera_set(path: Path, content: _Content, unit_mm: float, unit_known: bool)
         K=cameras.K,
         distortion=torch.from_numpy(distortion),
         size=None if None in sizes else torch.tensor(sizes, dtype=torch.int64),
-        R=cameras.R if calibrated else None,
-        t=cameras.t if calibrated else None,
-        unit_mm=unit_mm,
-        unit_known=unit_known,
+        R=torch.where(posed[:, None, None], cameras.R, torch.nan) if calibrated else None,
+        t=torch.where(posed[:, None], cameras.t, torch.nan) if calibrated else None,
+        unposed=tuple(unposed),
+        unit_mm=content.unit_mm,
+        unit_known=content.unit_known,
     )
+
+
+def _tell_apart(R: Float[np.ndarray, "P 3 3"], t: Float[np.ndarray, "P 3"]) -> bool:
+    """Return whether there are several poses, not all the same.
+
+    A file before extrinsic calibration has zeros for all.
+    """
+    return len(R) > 1 and bool((R[0] != R).any() or (t[0] != t).any())
 
 
 def _intrinsics(path: Path, entry: CameraEntry) -> Float[np.ndarray, "3 3"]:
     return _numbers(path, entry.name, "matrix", entry.K, (9,)).reshape(3, 3)
 
 
-def _distortion(path: Path, entry: CameraEntry) -> Float[np.ndarray, " 5"]:
-    values = _numbers(path, entry.name, "distortion", entry.distortion, (4, 5))
-    return np.resize(np.append(values, 0), 5)
+def _lens(path: Path, entry: CameraEntry) -> Float[torch.Tensor, " 9"]:
+    values = _numbers(path, entry.name, "distortion", entry.distortion, _LENSES)
+    used = 4 if entry.fisheye else 8
+    if values[used:].any():
+        problem = f"has a coefficient after the first {used} that is not 0"
+        hint = "Calibrate it with a lens of k1 k2 p1 p2 k3 k4 k5 k6, or as a fisheye of k1 to k4."
+        raise GhptDataError(path, f"camera {entry.name}, distortion", problem, hint)
+    kept = torch.from_numpy(np.resize(np.append(values[:used], np.zeros(8)), used))
+    if entry.fisheye:
+        return fisheye_lens(kept)
+    return torch.nn.functional.pad(kept, (0, COEFFICIENTS - used))
 
 
 def _pose(
@@ -337,8 +209,8 @@ def _pose(
         R = vector_to_matrix(torch.from_numpy(rotation)).numpy()
     else:
         R = rotation.reshape(3, 3)
-    translation = _numbers(path, entry.name, "translation", entry.t, (3,))
-    return R, translation * mm_per_unit
+    t = _numbers(path, entry.name, "translation", entry.t, (3,)) * mm_per_unit
+    return (R.T, -R.T @ t) if entry.to_world else (R, t)
 
 
 def _absent(value: object) -> bool:
@@ -369,7 +241,8 @@ def _numbers(
     flat = array.ravel()
     shaped = array.ndim == 1 or array.shape == (3, 3)
     if not shaped or flat.size not in sizes or not (np.abs(flat) < _LARGEST_NUMBER).all():
-        expected = " or ".join(map(str, sizes))
+        *others, last = map(str, sizes)
+        expected = f"{', '.join(others)} or {last}" if others else last
         problem = f"is not {expected} finite numbers"
         hint = "Check how the file was written."
         raise GhptDataError(path, f"camera {name}, {field}", problem, hint)

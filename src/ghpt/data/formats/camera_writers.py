@@ -10,6 +10,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -17,6 +18,7 @@ from ghpt.data.formats.opencv_yml import read_yml
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
 from ghpt.geometry.cameras import CameraSet
+from ghpt.geometry.lens import is_fisheye, pad_lens
 from ghpt.geometry.rotations import matrix_to_vector
 
 _MM_PER_M = 1000.0
@@ -26,14 +28,14 @@ Metadata = Mapping[str, str | float | bool]
 def write_pose2sim(path: str | Path, rig: CameraSet, metadata: Metadata) -> None:
     """A TOML file as Pose2Sim's calibration leaves it: a table for each camera, rotation vectors.
 
-    Its lens model is OpenCV's, so a k3 that is not 0 is written as a fifth coefficient.
+    Its lens model is OpenCV's, so what it has beyond the four coefficients that Pose2Sim writes is
+    written after these. A fisheye's four are said to be its.
     """
     keys = [
         name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name, ensure_ascii=False)
         for name in rig.names
     ]
-    lenses = [lens if lens[4] != 0 else lens[:4] for lens in rig.distortion.tolist()]
-    _write_toml(path, rig, keys, lenses, metadata)
+    _write_toml(path, rig, keys, 4, metadata)
 
 
 def write_aniposelib(path: str | Path, rig: CameraSet, metadata: Metadata) -> None:
@@ -43,13 +45,8 @@ def write_aniposelib(path: str | Path, rig: CameraSet, metadata: Metadata) -> No
     before cam_10.
     """
     digits = len(str(len(rig) - 1))
-    _write_toml(
-        path,
-        rig,
-        [f"cam_{i:0{digits}d}" for i in range(len(rig))],
-        rig.distortion.tolist(),
-        metadata,
-    )
+    keys = [f"cam_{i:0{digits}d}" for i in range(len(rig))]
+    _write_toml(path, rig, keys, 5, metadata)
 
 
 def write_opencv(folder: str | Path, rig: CameraSet) -> None:
@@ -57,7 +54,8 @@ def write_opencv(folder: str | Path, rig: CameraSet) -> None:
     read them.
 
     FileStorage knows letters, digits, _ and - in a key; another character of a camera's name
-    becomes _. Raises GhptDataError if two names are then the same.
+    becomes _. Raises GhptDataError if two names are then the same, and for a fisheye, of which the
+    format knows nothing.
     """
     names = [re.sub(r"[^A-Za-z0-9_-]", "_", name) for name in rig.names]
     if len(set(names)) != len(names):
@@ -67,14 +65,18 @@ def write_opencv(folder: str | Path, rig: CameraSet) -> None:
             f"are the same in yml: {', '.join(rig.names)}",
             "Name the cameras by letters, digits, _ and -.",
         )
+    if is_fisheye(rig.distortion).any():
+        problem = "have a fisheye, which yml cannot say"
+        raise GhptDataError(Path(folder) / "intri.yml", "dist", problem, "Write TOML.")
     vectors = matrix_to_vector(rig.cameras.R)
+    lenses = _lenses(rig, 5)
     listed = ["names:", *(f'  - "{name}"' for name in names)]
     intrinsic = list(listed)
     extrinsic = list(listed)
     for i, name in enumerate(names):
         intrinsic += [
             *_matrix(f"K_{name}", rig.cameras.K[i]),
-            *_matrix(f"dist_{name}", rig.distortion[i][None]),
+            *_matrix(f"dist_{name}", torch.tensor(lenses[i], dtype=torch.float64)[None]),
         ]
         if rig.size is not None:
             width, height = rig.size[i].tolist()
@@ -93,9 +95,11 @@ def _write_toml(
     path: str | Path,
     rig: CameraSet,
     keys: Sequence[str],
-    lenses: Sequence[Sequence[float]],
+    least: int,
     metadata: Metadata,
 ) -> None:
+    lenses = _lenses(rig, least)
+    fisheyes = is_fisheye(rig.distortion).tolist()
     vectors = matrix_to_vector(rig.cameras.R).tolist()
     metres = (rig.cameras.t / _MM_PER_M).tolist()
     lines = []
@@ -105,10 +109,10 @@ def _write_toml(
             f"name = {json.dumps(name, ensure_ascii=False)}",
             f"size = {[float(x) for x in rig.image_size[i].tolist()]}",
             f"matrix = {rig.cameras.K[i].tolist()}",
-            f"distortions = {list(lenses[i])}",
+            f"distortions = {lenses[i]}",
             f"rotation = {vectors[i]}",
             f"translation = {metres[i]}",
-            "fisheye = false",
+            f"fisheye = {json.dumps(fisheyes[i])}",
             "",
         ]
     values = {key: json.dumps(value, ensure_ascii=False) for key, value in metadata.items()}
@@ -117,6 +121,16 @@ def _write_toml(
         path, "w", verify=lambda file: tomllib.loads(file.read_text(encoding="utf-8"))
     ) as handle:
         handle.write("\n".join(lines))
+
+
+def _lenses(rig: CameraSet, least: int) -> list[list[float]]:
+    """Return each lens's coefficients: four of a fisheye, else ``least``, 5 or 8, as it needs."""
+    found = []
+    for lens in pad_lens(rig.distortion).tolist():
+        *brown, fisheye = lens
+        count = next(n for n in (least, 5, 8) if not any(brown[n:]))
+        found.append(brown[: 4 if fisheye else count])
+    return found
 
 
 def _matrix(key: str, values: Float[Tensor, "rows cols"]) -> list[str]:

@@ -7,15 +7,16 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 from collections.abc import Iterator
-from itertools import islice
+from itertools import islice, takewhile
 from pathlib import Path, PurePosixPath
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from ghpt.data.formats.camera_entry import CameraEntry
 from ghpt.data.formats.validate import MOST_VIEWS, check_view_count, open_input
@@ -31,11 +32,27 @@ _MODELS = {
     2: ("SIMPLE_RADIAL", 4),
     3: ("RADIAL", 5),
     4: ("OPENCV", 8),
+    5: ("OPENCV_FISHEYE", 8),
     6: ("FULL_OPENCV", 12),
+    8: ("SIMPLE_RADIAL_FISHEYE", 4),
+    9: ("RADIAL_FISHEYE", 5),
 }
-"""Number in binary files -> name, count of parameters, of the models whose lens OpenCV's k1 k2 p1
-p2 k3 can be.
+"""Number in binary files -> name, count of parameters, of the models with a lens of
+``ghpt.geometry.lens``.
 """
+_FOCAL_ONE = (
+    "SIMPLE_PINHOLE",
+    "SIMPLE_RADIAL",
+    "RADIAL",
+    "SIMPLE_RADIAL_FISHEYE",
+    "RADIAL_FISHEYE",
+)
+"""The models with one focal length."""
+_MOST_IMAGES = 20 * MOST_VIEWS
+_SAME_ROTATION = 1e-4
+"""Of two poses that are one, largest difference of a number of their unit quaternions."""
+_SAME_PLACE = 1e-4
+"""And of t, as a share of its length."""
 
 
 class Image(NamedTuple):
@@ -55,10 +72,11 @@ def is_colmap(folder: Path) -> bool:
 def read_colmap(folder: Path) -> list[CameraEntry]:
     """Return the cameras of a folder with cameras and images as .bin or .txt, by the images' names.
 
-    An image's camera is called as the image, without its ending; where images are called alike
-    (``cam1/0001.png``, ``cam2/0001.png``), as their folders. COLMAP's first pixel has its centre at
-    (0.5, 0.5), ours at (0, 0). Raises GhptDataError for a damaged file, a lens that is not k1 k2 p1
-    p2 k3, and several images of one camera.
+    Images of one camera in one place (the frames of a rig that stands still) are one. A camera is
+    called as its image without ending or, where it has several or images are called alike
+    (``cam1/0001.png``, ``cam2/0001.png``), as their folder. COLMAP's first pixel has its centre at
+    (0.5, 0.5), ours at (0, 0). Raises GhptDataError for a damaged file, a lens of another model,
+    and a camera that moves.
     """
     end = "bin" if (folder / "images.bin").is_file() else "txt"
     camera_file = folder / f"cameras.{end}"
@@ -71,21 +89,22 @@ def read_colmap(folder: Path) -> list[CameraEntry]:
     except (struct.error, ValueError, OverflowError) as error:
         raise GhptDataError(camera_file, "", f"is damaged ({error})", _HINT) from error
     try:
-        images = sorted(islice(read_images(_content(image_file)), MOST_VIEWS + 1))
+        images = sorted(islice(read_images(_content(image_file)), _MOST_IMAGES + 1))
     except (struct.error, ValueError, OverflowError) as error:
         raise GhptDataError(image_file, "", f"is damaged ({error})", _HINT) from error
     check_view_count(camera_file, len(found))
-    check_view_count(image_file, len(images))
     cameras = {number: (model, size, values) for number, model, size, values in found}
-    names = _names(image_file, [PurePosixPath(image.name) for image in images])
+    places = _places(image_file, images)
+    check_view_count(image_file, len(places))
+    names = _names(image_file, places)
     rig = []
-    for image, (name, other) in zip(images, names, strict=True):
+    for (image, *_), (name, other) in zip(places, names, strict=True):
         if image.camera not in cameras:
             raise GhptDataError(
                 image_file, f"image {image.name}", f"there is no camera {image.camera}", _HINT
             )
         model, size, parameters = cameras[image.camera]
-        K, distortion = _intrinsics(camera_file, name, model, parameters)
+        K, distortion, fisheye = _intrinsics(camera_file, name, model, parameters)
         entry = CameraEntry(
             name=name,
             other_name=other,
@@ -94,9 +113,31 @@ def read_colmap(folder: Path) -> list[CameraEntry]:
             size=list(size),
             R=_rotation(image_file, image),
             t=np.array(image.t),
+            fisheye=fisheye,
         )
         rig.append(entry)
     return rig
+
+
+def _places(where: Path, images: list[Image]) -> list[list[Image]]:
+    """Return the images of each camera in each place, in the order of their names."""
+    if len(images) > _MOST_IMAGES:
+        problem = f"are more than {_MOST_IMAGES}"
+        raise GhptDataError(where, "images", problem, "Give a model of the rig's cameras.")
+    camera = np.array([image.camera for image in images], np.int64)
+    wxyz = np.array([image.wxyz for image in images]).reshape(-1, 4)
+    t = np.array([image.t for image in images]).reshape(-1, 3)
+    free = np.ones(len(images), np.bool_)
+    places: list[list[Image]] = []
+    while free.any() and len(places) <= MOST_VIEWS:
+        first = int(free.argmax())
+        with np.errstate(all="ignore"):  # a damaged file may hold any number
+            same = _same_pose(wxyz, t, first)
+        same &= free & (camera == camera[first])
+        same[first] = True
+        places.append([images[index] for index in np.flatnonzero(same)])
+        free &= ~same
+    return places
 
 
 def _content(path: Path) -> bytes:
@@ -167,45 +208,65 @@ def _lines(data: bytes) -> Iterator[str]:
     return (line.strip() for line in text if not line.startswith("#"))
 
 
-def _names(where: Path, paths: list[PurePosixPath]) -> list[tuple[str, str]]:
-    """A name and another for each camera."""
-    for of in (lambda p: p.stem, lambda p: p.parent.name):
-        names = [of(path) for path in paths]
+def _same_pose(
+    wxyz: Float[np.ndarray, "N 4"], t: Float[np.ndarray, "N 3"], one: int
+) -> Bool[np.ndarray, " N"]:
+    """Return which poses are that of ``one``."""
+    turned = np.minimum(np.abs(wxyz - wxyz[one]), np.abs(wxyz + wxyz[one])).max(1)
+    moved = np.abs(t - t[one]).max(1)
+    return (turned <= _SAME_ROTATION) & (moved <= _SAME_PLACE * np.linalg.norm(t[one]))
+
+
+def _names(where: Path, places: list[list[Image]]) -> list[tuple[str, str]]:
+    """Return a name and another for each camera: of its image, its folder, or what these share."""
+    paths = [[PurePosixPath(image.name) for image in place] for place in places]
+    for choice in (_own_stem, _own_folder, _shared_stem):
+        names = [choice(each) for each in paths]
         if len({*names}) == len(names) and all(names):
-            return [
-                (name, str(path.parent / path.stem))
-                for name, path in zip(names, paths, strict=True)
-            ]
+            others = [str(each[0].parent / each[0].stem) for each in paths]
+            return list(zip(names, others, strict=True))
     hint = "A rig's cameras stand still: keep one image of each, called as its view."
-    raise GhptDataError(
-        where, "images", f"are {len(paths)} with names that tell no cameras apart", hint
-    )
+    problem = f"are of {len(paths)} places with names that tell no cameras apart"
+    raise GhptDataError(where, "images", problem, hint)
+
+
+def _own_stem(paths: list[PurePosixPath]) -> str:
+    stems = {path.stem for path in paths}
+    return stems.pop() if len(stems) == 1 else ""
+
+
+def _own_folder(paths: list[PurePosixPath]) -> str:
+    folders = {path.parent.name for path in paths}
+    return folders.pop() if len(folders) == 1 else ""
+
+
+def _shared_stem(paths: list[PurePosixPath]) -> str:
+    """Return with what all names begin, without a part of a number: cam1 of cam1_001, cam1_002."""
+    stems = [path.stem for path in paths]
+    same = takewhile(lambda pair: pair[0] == pair[1], zip(min(stems), max(stems), strict=False))
+    shared = "".join(character for character, _ in same)
+    return re.sub(r"\d+$", "", shared).rstrip(" _.-")
 
 
 def _intrinsics(
     where: Path, name: str, model: int | str, parameters: list[float]
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Return K, the coefficients of the lens, and whether it is a fisheye."""
     counts = dict(_MODELS.values())
     if model not in counts or len(parameters) != counts[model]:
         problem = f"is of the model {model} with {len(parameters)} parameters"
-        raise GhptDataError(
-            where,
-            f"camera {name}",
-            problem,
-            f"Known: {', '.join(counts)}; undistort the images first.",
-        )
-    focal = 1 if model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") else 2
+        hint = f"Known: {', '.join(counts)}; undistort the images first."
+        raise GhptDataError(where, f"camera {name}", problem, hint)
+    focal = 1 if model in _FOCAL_ONE else 2
     fx = parameters[0]
     fy = parameters[focal - 1]
-    (cx, cy) = parameters[focal : focal + 2]
+    cx = parameters[focal]
+    cy = parameters[focal + 1]
     rest = parameters[focal + 2 :]
-    lens = np.zeros(8)
-    lens[: len(rest)] = rest  # k1 k2 p1 p2 k3 k4 k5 k6, OpenCV's order
-    if lens[5:].any():
-        raise GhptDataError(
-            where, f"camera {name}", "has k4, k5 or k6", "Calibrate it with the model OPENCV."
-        )
-    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]), lens[:5]
+    fisheye = "FISHEYE" in str(model)
+    lens = np.zeros(4 if fisheye else 8)
+    lens[: len(rest)] = rest  # OpenCV's order
+    return np.array([[fx, 0, cx - 0.5], [0, fy, cy - 0.5], [0, 0, 1]]), lens, fisheye
 
 
 def _rotation(where: Path, image: Image) -> Float[np.ndarray, "3 3"]:

@@ -21,7 +21,7 @@ from ghpt.data.formats.movement_files import (
 )
 from ghpt.data.formats.openpose import read_openpose
 from ghpt.data.formats.own_npz import read_own, write_key_points
-from ghpt.data.formats.skeletons import find_skeleton
+from ghpt.data.formats.skeletons import find_skeleton, skeleton_of
 from ghpt.data.formats.validate import frame_rate, open_input
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
@@ -58,9 +58,9 @@ def read_key_points(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
     people = FORMATS[format or _format_of(path)](path, skeleton)
-    if wanted is not None and wanted.key_points == people.joints:
-        people = replace(people, own_skeleton=wanted)
-    people.skeleton.require_joints(path)
+    if wanted is None or wanted.key_points != people.joints:
+        wanted = skeleton_of(path, people.joints)
+    people = replace(people, own_skeleton=wanted)
     seen_by = set(people.view[people.points.valid.any(-1)].tolist())
     for view, name in enumerate(people.views):
         if view not in seen_by:

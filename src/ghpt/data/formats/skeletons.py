@@ -9,20 +9,15 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-import yaml
 from jaxtyping import Bool, Float
 
-from ghpt.config import CONF, settings
+from ghpt.config import CONF, read_yaml, settings
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.skeleton import JOINTS, Skeleton, make_skeleton
 
 _FOLDER = CONF / "skeletons"
 _SUFFIXES = (".yaml", ".yml")
-_LARGEST = 1 << 20
-"""Bytes of a file."""
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""libyaml's, which is ten times as fast, where it is there."""
 _HINT = "See docs/skeletons.md for what the file holds."
 
 
@@ -39,17 +34,10 @@ class SkeletonFile:
 def read_skeleton(path: Path) -> Skeleton:
     """Return the skeleton of a yaml, named as the file is.
 
-    Raises GhptDataError for a file that is none.
+    Raises GhptConfigError for a file that cannot be read and GhptDataError for one that is no
+    skeleton.
     """
-    try:
-        if path.stat().st_size > _LARGEST:
-            raise GhptDataError(path, "", "is larger than any skeleton", _HINT)
-        content = yaml.load(path.read_text(encoding="utf-8"), _LOADER)
-    except (OSError, UnicodeError, yaml.YAMLError, RecursionError) as error:
-        problem = f"is no yaml that can be read ({' '.join(str(error).split())[:200]})"
-        raise GhptDataError(path, "", problem, _HINT) from error
-    if not isinstance(content, dict):
-        raise GhptDataError(path, "", "is no mapping", _HINT)
+    content = read_yaml(path, "skeleton")
     try:
         file = settings(SkeletonFile, content)
     except GhptConfigError as error:

@@ -50,7 +50,7 @@ def check_cameras(
     where: object, names: Sequence[str], K: Any, R: Any, t: Any, distortion: Any
 ) -> tuple[Cameras, np.ndarray]:
     """V users' cameras (K [V 3 3] pixels, R [V 3 3] and t [V 3] world to camera in mm) and their
-    distortion [V 5].
+    distortion [V C].
 
     R that is off by rounding (1e-9 to 1e-3) becomes the nearest rotation. Raises GhptDataError for
     fewer than two views, a camera listed twice, and values that are not finite or no pinhole
@@ -58,7 +58,12 @@ def check_cameras(
     """
     check_names(where, names)
     views = len(names)
-    expected = {"K": (views, 3, 3), "R": (views, 3, 3), "t": (views, 3), "distortion": (views, 5)}
+    expected: dict[str, Shape] = {
+        "K": (views, 3, 3),
+        "R": (views, 3, 3),
+        "t": (views, 3),
+        "distortion": (views, None),
+    }
     arrays = {
         field: check_array(where, field, np.asarray(value), expected[field], "fiu").astype(
             np.float64

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import logging
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from itertools import product
 
 from ghpt.data.formats.names import Name, chosen_name
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
 
+_log = logging.getLogger(__name__)
 _HINT = (
     "Rename them, say which is which (match={view: camera}), "
     "or name the views to use (views=[...])."
 )
 _WORDS = r"[ _.-](json|openpose|pose|keypoints|kpts|body|2d)\b"
 _SEPARATORS = {ord(character): None for character in " _.-"}
+_PARTS = re.compile(r"\d+|[^\W\d_]+")
+_MOST_PARTS = 4
+"""Words or numbers that are taken off an end of a name."""
+
+_Key = Callable[[str], str]
 
 
 def match_views(
@@ -31,11 +40,17 @@ def match_views(
     1. ``match`` names for it; or else
     2. has exactly its name; or else
     3. has its name but for case, separators, leading zeros and words like json
-       (``cam1_json`` is ``cam_01``).
+       (``cam1_json`` is ``cam_01``); or else
+    4. has its name once the words that all views share, or all cameras, are taken off
+       (``hd_00_03`` is ``00_03``, and ``int_cam01_img`` is ``cam1_json``).
+
+    A camera has a name of its own, and perhaps another (a table's key): those by which more views
+    find a camera are taken, the own ones where both do as well.
 
     ``wanted`` names the views to use, by the view's or the camera's name; without it every view
-    must have its camera and every camera its view. Raises GhptDataError, listing both sides, where
-    views and cameras do not match one to one.
+    must have its camera. A camera without a view, and one without extrinsics where two others have
+    them, is left out, with a warning. Raises GhptDataError, listing both sides, where a view has no
+    camera, or views and cameras do not match one to one.
     """
     labels = camera_labels(cameras)
     known = list(dict.fromkeys(name for names in labels for name in names))
@@ -47,12 +62,17 @@ def match_views(
         if view not in views or camera not in known:
             problem = f"match says {view}: {camera}, of which one is not there"
             raise _mismatch(where, views, cameras, problem)
-    pairs = _pairs(views, labels, chosen)
+    pairs = _pairs(views, cameras, chosen)
     if wanted is not None:
         names = [chosen_name(name, (*views, *known)) for name in wanted]
         pairs = _select(where, views, cameras, pairs, names)
     _check_one_to_one(where, views, cameras, pairs, complete=wanted is None)
+    if wanted is None:
+        _warn_of_unmatched(views, cameras, pairs)
+    _say_which(where, views, cameras, pairs, chosen)
     pairs.sort(key=lambda pair: pair[1])
+    if cameras.R is not None:
+        pairs = [(view, camera) for view, camera in pairs if cameras.is_posed(camera)]
     at = [view for view, _ in pairs]
     return at, cameras.select([camera for _, camera in pairs])
 
@@ -77,19 +97,101 @@ def camera_labels(cameras: CameraSet) -> list[tuple[str, ...]]:
 
 
 def _pairs(
-    views: Sequence[str], labels: Sequence[tuple[str, ...]], match: Mapping[str, str]
+    views: Sequence[str], cameras: CameraSet, match: Mapping[str, str]
 ) -> list[tuple[int, int]]:
     """Return every (view, camera) that may belong together."""
-    normalised = [{normalise_name(name) for name in names} for names in labels]
+    labels = camera_labels(cameras)
+    told: list[tuple[int, int]] = []
+    for index, view in enumerate(views):
+        if view in match:
+            found = [camera for camera, names in enumerate(labels) if match[view] in names]
+            told += [(index, camera) for camera in found]
+    free = [index for index, view in enumerate(views) if view not in match]
+    names = [views[index] for index in free]
+    schemes = [_match_names(names, kind) for kind in _kinds(cameras)]
+    best = max(schemes, key=_view_count, default=[])
+    return told + [(free[view], camera) for view, camera in best]
+
+
+def _kinds(cameras: CameraSet) -> list[Sequence[str]]:
+    """Return the cameras' own names and, where the file has them, their other ones."""
+    return [cameras.names, cameras.other_names] if cameras.other_names else [cameras.names]
+
+
+def _match_names(views: Sequence[str], cameras: Sequence[str]) -> list[tuple[int, int]]:
+    """Return every (view, camera) of equal names, by as much of the names as most views agree on.
+
+    What all share is taken off only where more views find one camera without it.
+    """
+    best = _equal(views, cameras, _whole, _whole)
+    for of_view, of_camera in product(_without_shared(views), _without_shared(cameras)):
+        found = _equal(views, cameras, of_view, of_camera)
+        if _view_count(found) > _view_count(best):
+            best = found
+    return best
+
+
+def _view_count(pairs: Sequence[tuple[int, int]]) -> int:
+    """Return how many views have exactly one camera."""
+    return sum(count == 1 for count in Counter(view for view, _ in pairs).values())
+
+
+def _equal(
+    views: Sequence[str], cameras: Sequence[str], of_view: _Key, of_camera: _Key
+) -> list[tuple[int, int]]:
+    """Return every (view, camera) of equal names, exactly or else when normalised."""
+    exact = _by_name(cameras, of_camera)
+    normalised = _by_name(cameras, lambda name: normalise_name(of_camera(name)))
     pairs = []
     for index, view in enumerate(views):
-        name = match.get(view, view)
-        found = [camera for camera, names in enumerate(labels) if name in names]
-        if not found and view not in match:
-            name = normalise_name(view)
-            found = [camera for camera, names in enumerate(normalised) if name in names]
-        pairs += [(index, camera) for camera in found]
+        name = of_view(view)
+        found = exact.get(name) or normalised.get(normalise_name(name), [])
+        pairs += [(index, camera) for camera in found if cameras[camera]]
     return pairs
+
+
+def _by_name(cameras: Sequence[str], of_camera: _Key) -> dict[str, list[int]]:
+    """Return the cameras of each name."""
+    found: dict[str, list[int]] = {}
+    for index, camera in enumerate(cameras):
+        found.setdefault(of_camera(camera), []).append(index)
+    return found
+
+
+def _whole(name: str) -> str:
+    return name
+
+
+def _without_shared(names: Sequence[str]) -> Iterator[_Key]:
+    """Yield functions that take off more and more of the words that all names begin or end with."""
+    parts = [[part.lower() for part in _PARTS.findall(name)] for name in names]
+    shortest = min(map(len, parts), default=0)
+    ahead = _shared(parts) if len(names) > 1 else 0
+    behind = _shared([each[::-1] for each in parts]) if len(names) > 1 else 0
+    for start, end in product(range(ahead + 1), range(behind + 1)):
+        if start + end < max(shortest, 1):
+            yield _cutter(start, end)
+
+
+def _shared(parts: Sequence[Sequence[str]]) -> int:
+    """Return with how many equal words all lists begin, at most ``_MOST_PARTS``."""
+    count = 0
+    for same in zip(*parts, strict=False):
+        if len(set(same)) > 1 or count == _MOST_PARTS:
+            break
+        count += 1
+    return count
+
+
+def _cutter(start: int, end: int) -> _Key:
+    """Return what takes so many words off the begin and the end of a name."""
+
+    def cut(name: str) -> str:
+        found = list(_PARTS.finditer(name))
+        kept = found[start : len(found) - end]
+        return name[kept[0].start() : kept[-1].end()] if kept and start + end else name
+
+    return cut
 
 
 def _select(
@@ -115,19 +217,49 @@ def _check_one_to_one(
     pairs: Sequence[tuple[int, int]],
     complete: bool,
 ) -> None:
-    matched_views = [view for view, _ in pairs]
-    matched_cameras = [camera for _, camera in pairs]
-    for names, matched, word, other in (
-        (views, matched_views, "view", "camera"),
-        (cameras.names, matched_cameras, "camera", "view"),
-    ):
-        for index, name in enumerate(names):
-            count = matched.count(index)
-            if count > 1:
-                problem = f"{word} {name} has more than one {other}"
-                raise _mismatch(where, views, cameras, problem)
-            if count == 0 and complete:
-                raise _mismatch(where, views, cameras, f"{word} {name} has no {other}")
+    cameras_of = Counter(view for view, _ in pairs)
+    views_of = Counter(camera for _, camera in pairs)
+    for index, name in enumerate(views):
+        if cameras_of[index] > 1:
+            raise _mismatch(where, views, cameras, f"view {name} has more than one camera")
+        if complete and not cameras_of[index]:
+            raise _mismatch(where, views, cameras, f"view {name} has no camera")
+    for index, name in enumerate(cameras.names):
+        if views_of[index] > 1:
+            raise _mismatch(where, views, cameras, f"camera {name} has more than one view")
+
+
+def _say_which(
+    where: str,
+    views: Sequence[str],
+    cameras: CameraSet,
+    pairs: Sequence[tuple[int, int]],
+    match: Mapping[str, str],
+) -> None:
+    """Say which view is taken for which camera, where that is not plain from their names."""
+    labels = camera_labels(cameras)
+    said = []
+    for view, camera in pairs:
+        names = {normalise_name(name) for name in labels[camera]}
+        if views[view] not in match and normalise_name(views[view]) not in names:
+            said.append(f"{views[view]} is {cameras.names[camera]}")
+    if said:
+        _log.info("%s: by what their names share, %s.", where, ", ".join(said))
+
+
+def _warn_of_unmatched(
+    views: Sequence[str], cameras: CameraSet, pairs: Sequence[tuple[int, int]]
+) -> None:
+    matched = {camera for _, camera in pairs}
+    unseen = [name for index, name in enumerate(cameras.names) if index not in matched]
+    if unseen:
+        _log.warning("%s: not used, as no view is of it: %s.", cameras.path, ", ".join(unseen))
+    if cameras.R is None:
+        return
+    for view, camera in pairs:
+        if not cameras.is_posed(camera):
+            text = "%s: %s has no extrinsics: view %s is not used. Calibrate all (calibrate.py)."
+            _log.warning(text, cameras.path, cameras.names[camera], views[view])
 
 
 def _mismatch(where: str, views: Sequence[str], cameras: CameraSet, problem: str) -> GhptDataError:

@@ -11,7 +11,7 @@ from jaxtyping import Int
 
 from ghpt.data.datasets.detections import undistort_key_points
 from ghpt.data.formats.names import Name
-from ghpt.data.formats.skeletons import joints17
+from ghpt.data.formats.skeletons import map_to_joints
 from ghpt.data.people.association import associate
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.following import follow_views
@@ -39,6 +39,25 @@ def person_sequence(
 ) -> Sequence:
     """Return one person with their cameras, the lens distortion undone, as the 17 joints.
 
+    The arguments are those of `detector_sequence`. Raises GhptDataError, also where the detector
+    gives too few of the 17.
+    """
+    people.skeleton.require_joints(people.path)
+    sequence = detector_sequence(people, cameras, match, views, person, title, check_sizes)
+    return sequence.as_joints()
+
+
+def detector_sequence(
+    people: Detections,
+    cameras: CameraSet,
+    match: Mapping[Name, Name] | None = None,
+    views: Items[Name] | None = None,
+    person: int | None = 0,
+    title: str = "",
+    check_sizes: bool = True,
+) -> Sequence:
+    """Return one person with their cameras, the lens distortion undone, and all their key points.
+
     Views and cameras are matched as `match_views` says. ``person`` chooses as `select_person` says;
     None follows the most prominent person of each view by itself. ``check_sizes`` refuses key
     points of images of another size. Raises GhptDataError.
@@ -48,24 +67,32 @@ def person_sequence(
     if person is None:
         chosen = follow_views(people)[:, at]
     else:
-        chosen = select_person(people, ordered, at, ideal, person)[:, at]
+        told_apart_by = _association_points(people, ideal)
+        chosen = select_person(people, ordered, at, told_apart_by, person)[:, at]
     raw = people.points.take(chosen)
     check_pixels(people.path, raw, ordered)
     if check_sizes:
         check_image_sizes(people.path, raw, ordered)
-    detected = joints17(people.path, people.joints, raw)
     return Sequence(
         title=title,
         source=people.path,
         cameras=ordered,
         frame=people.frame.astype(np.int64),
         rate_hz=people.rate_hz,
-        points=KeyPointArrays(ideal.take(chosen), detected),
+        points=KeyPointArrays(ideal.take(chosen), raw),
+        skeleton=people.skeleton,
     )
 
 
+def _association_points(people: Detections, ideal: KeyPoints) -> KeyPoints:
+    """Return by what people are told apart: the 17 joints, or all key points without them."""
+    if not people.skeleton.has_joints:
+        return ideal
+    return map_to_joints(ideal, people.skeleton)
+
+
 def undistort_detections(people: Detections, cameras: CameraSet, at: Items[int]) -> KeyPoints:
-    """Return the 17 joints [N J] of all detections in the views ``at``, as pinholes would see them.
+    """Return the key points [N K] of all detections in the views ``at``, as pinholes see them.
 
     ``cameras`` are those of the views. Nothing is valid in the other views.
     """
@@ -76,8 +103,7 @@ def undistort_detections(people: Detections, cameras: CameraSet, at: Items[int])
         points = undistort_view(people.points[indices], cameras, camera)
         pixels[indices] = points.pixels
         valid[indices] = points.valid
-    points = KeyPoints(pixels, people.points.confidence, valid)
-    return joints17(people.path, people.joints, points)
+    return KeyPoints(pixels, people.points.confidence, valid).masked()
 
 
 def undistort_view(points: KeyPoints, cameras: CameraSet, camera: int) -> KeyPoints:
@@ -100,7 +126,8 @@ def select_person(
 ) -> Chosen:
     """Return the detections of one person, the most visible (``person`` = 0), the next, ...
 
-    ``cameras`` are those of the views ``at``, and ``ideal`` what `undistort_detections` gives.
+    ``cameras`` are those of the views ``at``, and ``ideal`` [N J] what `undistort_detections` gives
+    or joints made of it.
     Persons are told apart
 
     1. by their identities, where all detections have one;

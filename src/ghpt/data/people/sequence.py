@@ -13,11 +13,13 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ghpt.data.formats.skeletons import map_to_joints
 from ghpt.data.points import KeyPoints
 from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.normal_equations import local_cameras
 from ghpt.observations import Observations
 from ghpt.reconstruction import Reconstruction
+from ghpt.skeleton import HUMAN36M, Skeleton
 
 _NEAR = 1e5
 """Distance (mm, along an axis) from the world's zero up to which a rig stays where it is.
@@ -36,7 +38,7 @@ Rows = Int[np.ndarray, " N"]
 
 @runtime_checkable
 class KeyPointSource(Protocol):
-    """Where a sequence's key points are: the 17 joints [N V J] of some of its frames."""
+    """Where a sequence's key points [N V J] of some of its frames are."""
 
     def undistorted(self, rows: Rows) -> KeyPoints:
         """Return what ideal pinhole cameras would see; float32."""
@@ -62,6 +64,34 @@ class KeyPointArrays:
 
 
 @dataclass(frozen=True)
+class SelectedKeyPoints:
+    """Some of the key points of a source."""
+
+    points: KeyPointSource
+    chosen: tuple[int, ...]
+
+    def undistorted(self, rows: Rows) -> KeyPoints:
+        return self.points.undistorted(rows).select(self.chosen)
+
+    def detected(self, rows: Rows) -> KeyPoints:
+        return self.points.detected(rows).select(self.chosen)
+
+
+@dataclass(frozen=True)
+class MappedKeyPoints:
+    """The 17 joints, of a source of key points with another skeleton."""
+
+    points: KeyPointSource
+    skeleton: Skeleton
+
+    def undistorted(self, rows: Rows) -> KeyPoints:
+        return map_to_joints(self.points.undistorted(rows), self.skeleton)
+
+    def detected(self, rows: Rows) -> KeyPoints:
+        return map_to_joints(self.points.detected(rows), self.skeleton)
+
+
+@dataclass(frozen=True)
 class Sequence:
     """T frames of one person before V cameras, in any calibration state."""
 
@@ -74,9 +104,28 @@ class Sequence:
     """The recording's own numbers, rising."""
     rate_hz: float | None
     points: KeyPointSource
+    skeleton: Skeleton = HUMAN36M
+    """Of the key points: their J axis has its order."""
 
     def __len__(self) -> int:
         return len(self.frame)
+
+    def as_joints(self) -> Sequence:
+        """Return the sequence of the 17 joints, which are means of the key points in the images.
+
+        A joint that the skeleton does not give is never valid.
+        """
+        if self.skeleton == HUMAN36M:
+            return self
+        mapped = MappedKeyPoints(self.points, self.skeleton)
+        return replace(self, points=mapped, skeleton=HUMAN36M)
+
+    def select_key_points(self, chosen: Items[int]) -> Sequence:
+        """Return the sequence of some of the key points, in this order."""
+        if list(chosen) == list(range(len(self.skeleton))):
+            return self
+        selected = SelectedKeyPoints(self.points, tuple(chosen))
+        return replace(self, points=selected, skeleton=self.skeleton.select(chosen))
 
     def undistorted(self, rows: Rows | None = None) -> KeyPoints:
         """Return the undistorted key points of some frames, or of all."""
@@ -131,7 +180,8 @@ class Sequence:
 
     def digest(self) -> str:
         """Return a SHA-256 of all that is known: cameras, frame numbers and key points."""
-        about = (self.cameras.names, len(self), self.rate_hz)
+        skeleton = (self.skeleton.key_points, self.skeleton.pairs, self.skeleton.joints)
+        about = (self.cameras.names, len(self), self.rate_hz, skeleton)
         digest = hashlib.sha256(repr(about).encode())
         cameras = self.cameras.cameras
         for tensor in (cameras.K, cameras.R, cameras.t):

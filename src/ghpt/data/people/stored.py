@@ -16,7 +16,7 @@ from jaxtyping import Bool, Int
 
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.own_npz import check_names
-from ghpt.data.formats.skeletons import joints17, recognise
+from ghpt.data.formats.skeletons import find_skeleton, recognise, skeleton_of
 from ghpt.data.formats.stored_npz import Member, members_of, read_rows, text_table
 from ghpt.data.formats.validate import check_view_count, finite_points, frame_rate
 from ghpt.data.people.detections import joints_for
@@ -27,6 +27,7 @@ from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
+from ghpt.skeleton import HUMAN36M, Skeleton
 
 _CHECKED = 2000
 """Frames, evenly spread, by which the skeleton is recognised and the views are checked against
@@ -50,7 +51,7 @@ class StoredFile:
     path: Path
     members: dict[str, Member]
     views: tuple[str, ...]
-    joints: tuple[str, ...]
+    skeleton: Skeleton
     frame: Int[np.ndarray, " T"]
     rate_hz: float | None
 
@@ -97,11 +98,10 @@ class StoredKeyPoints:
             undistort_view(points[:, view], self.cameras, camera)
             for camera, view in enumerate(self.views)
         ]
-        return joints17(self.file.path, self.file.joints, KeyPoints.stack(views))
+        return KeyPoints.stack(views).masked()
 
     def detected(self, rows: Rows) -> KeyPoints:
-        points = self.file.read(rows)[:, list(self.views)]
-        return joints17(self.file.path, self.file.joints, points)
+        return self.file.read(rows)[:, list(self.views)]
 
 
 def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -> StoredFile | None:
@@ -126,19 +126,22 @@ def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -
     if "frame" in members:
         frame = read_rows(path, members["frame"], 0, frames).astype(np.int64)
     rate = _rate(path, members, rate_hz)
-    file = StoredFile(path, members, views, (), frame, rate)
+    file = StoredFile(path, members, views, HUMAN36M, frame, rate)
     joints: tuple[str, ...] = ()
     if skeleton is None and "skeleton" not in texts:
         joints = texts.get("joints", ())
-    if not joints:
+    check_names(path, "views", views, view_count)
+    if joints:
+        check_names(path, "joints", joints, joint_count)
+        found = skeleton_of(path, joints)
+    else:
         written = next(iter(texts.get("skeleton", ())), None)
         name = skeleton or written or _recognise(file, joint_count)
-        joints = joints_for(path, name, joint_count)
-    check_names(path, "views", views, view_count)
-    check_names(path, "joints", joints, joint_count)
+        joints_for(path, name, joint_count)
+        found = find_skeleton(path, name)
     if (np.diff(frame) <= 0).any():
         raise GhptDataError(path, "frame", "does not rise", "Number the frames in order.")
-    file = replace(file, joints=joints)
+    file = replace(file, skeleton=found)
     _check_views(file)
     return file
 
@@ -160,7 +163,7 @@ def stored_sequence(
     check_pixels(path, points, ordered)
     check_image_sizes(path, points, ordered)
     stored = StoredKeyPoints(file, tuple(at), ordered)
-    return Sequence(title, path, ordered, file.frame, file.rate_hz, stored)
+    return Sequence(title, path, ordered, file.frame, file.rate_hz, stored, file.skeleton)
 
 
 def _fits(members: Mapping[str, Member]) -> bool:

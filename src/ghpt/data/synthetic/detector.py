@@ -9,11 +9,13 @@ fractions of the person's stature.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import shortest_path
 from scipy.special import expit, ndtr
 from torch import Tensor
 
@@ -74,11 +76,54 @@ class Processes:
     flip: Float[np.ndarray, "T G"]
     miss: Float[np.ndarray, "T J"]
     confidence: Float[np.ndarray, "T J"]
+    hardness: Float[np.ndarray, "T J"]
+    """How hard the joint is to find at the time."""
 
     def subsample(self, stride: int) -> Processes:
         """Return the same processes at every ``stride``-th frame."""
         sampled = {name: value[::stride] for name, value in vars(self).items()}
         return Processes(**sampled)
+
+
+def _bones_apart() -> Float[np.ndarray, "J J"]:
+    """Return how many bones lie between each two joints."""
+    ends = np.array(BONES).T
+    graph = coo_array((np.ones(len(BONES)), ends), shape=(len(JOINTS), len(JOINTS)))
+    return shortest_path(graph, directed=False, unweighted=True)
+
+
+_BONES_APART = _bones_apart()
+
+_WAVES = 64
+"""Waves that a random function of a direction is the sum of."""
+_UNBIASED = np.zeros((1, 1, 2))
+
+
+@dataclass(frozen=True)
+class DirectionBias:
+    """Random functions of the direction from which a body is seen, of unit variance: one for each
+    joint and image coordinate.
+
+    They are sums of waves over the unit sphere (random Fourier features), which forget within the
+    angle that their frequencies say.
+    """
+
+    frequency: Float[np.ndarray, "W 3"]
+    phase: Float[np.ndarray, " W"]
+    amplitude: Float[np.ndarray, "W J 2"]
+
+    @classmethod
+    def draw(cls, rng: np.random.Generator, degrees: float) -> DirectionBias:
+        """Draw functions whose correlation is exp(-1/2) at directions ``degrees`` apart."""
+        distance = 2.0 * np.sin(np.deg2rad(degrees) / 2.0)
+        frequency = rng.normal(size=(_WAVES, 3)) / distance
+        phase = rng.uniform(0.0, 2.0 * np.pi, _WAVES)
+        return cls(frequency, phase, rng.normal(size=(_WAVES, len(JOINTS), 2)))
+
+    def __call__(self, direction: Float[np.ndarray, "T 3"]) -> Float[np.ndarray, "T J 2"]:
+        """Return the functions' values at unit vectors."""
+        waves = np.cos(direction @ self.frequency.T + self.phase)
+        return np.sqrt(2.0 / _WAVES) * np.tensordot(waves, self.amplitude, axes=1)
 
 
 @dataclass(frozen=True)
@@ -128,6 +173,14 @@ class Detector:
     ``noise_seconds``.
     """
     noise_slow_seconds: float
+    neighbours: float
+    """Correlation of the noise and of the view bias of joints that a bone connects; its n-th power
+    where n bones do.
+    """
+    noise_spread: float
+    """Standard deviation of the logarithm of the noise's size, which lasts for
+    ``noise_slow_seconds``: the noise's tails are the heavier for it.
+    """
     joints: Mapping[str, float]
     """Noise and outlier rate of ``ankle``, ``knee``, ... relative to the average joint's."""
     bias: float
@@ -138,6 +191,12 @@ class Detector:
     """Which definition: the same for everybody, mirrored on the other side."""
     bias_of_subject: float
     """Share of the bias' variance that differs between people."""
+    view_bias: float
+    """Standard deviation of a pixel coordinate's bias that depends on the direction from which the
+    body is seen: it lasts as long as the person does not turn, and differs between views.
+    """
+    view_bias_degrees: float
+    """Turn of the body within which that bias is forgotten."""
     drift: float
     """Size of the slow 3D error that all views share: clothes, the body's shape."""
     drift_seconds: float
@@ -149,6 +208,8 @@ class Detector:
     outlier_seconds: float
     swap_rate: float
     swap_seconds: float
+    swap_together: float
+    """Correlation of the exchange of the legs with that of the arms."""
     miss_rate: float
     miss_rate_occluded: float
     miss_seconds: float
@@ -184,7 +245,8 @@ class Detector:
         for view, name in enumerate(rig.names):
             camera_rng = generator(seed, "camera", take, name)
             processes = self.draw_processes(frames, rate_hz, camera_rng)
-            views.append(self.detect_view(points, apparent, rig, view, processes, familiar))
+            bias = self.draw_view_bias(points, rig, view, seed, subject)
+            views.append(self.detect_view(points, apparent, rig, view, processes, familiar, bias))
         return SimulatedDetections(
             key_points=np.stack([view.key_points for view in views], axis=1),
             confidence=np.stack([view.confidence for view in views], axis=1),
@@ -210,6 +272,33 @@ class Detector:
         persistence = self.drift_seconds * rate_hz
         drift = gaussian_process(drift_rng, (len(JOINTS), 3), frames, persistence)
         return BodyError(bias / 2.0, drift / np.sqrt(3.0))
+
+    def draw_view_bias(
+        self,
+        points: Float[np.ndarray, "T J 3"],
+        rig: CameraSet,
+        view: int,
+        seed: int,
+        subject: str,
+    ) -> Float[np.ndarray, "#T #J 2"]:
+        """Draw the bias of the direction from which a camera sees the body, of unit size.
+
+        What everybody shares of it and what is the subject's own are in the proportion of ``bias``.
+        """
+        if not self.view_bias:
+            return _UNBIASED
+        centre = rig.cameras.centre[view].numpy()
+        ray = centre - points[:, PELVIS]
+        ray /= np.linalg.norm(ray, axis=-1, keepdims=True).clip(min=1e-9)
+        direction = (ray[:, None] @ trunk_frame(points))[:, 0]
+        common_rng = generator(self.bias_seed, "view bias")
+        common = DirectionBias.draw(common_rng, self.view_bias_degrees)
+        own_rng = generator(seed, "view bias", subject)
+        own = DirectionBias.draw(own_rng, self.view_bias_degrees)
+        common_share = np.sqrt(1.0 - self.bias_of_subject)
+        own_share = np.sqrt(self.bias_of_subject)
+        bias = common_share * common(direction) + own_share * own(direction)
+        return self._share_with_neighbours(bias)
 
     def displace_joints(
         self,
@@ -247,14 +336,36 @@ class Detector:
         quick_share = 1.0 - self.noise_white - self.noise_slow
         variances = np.array([self.noise_white, quick_share, self.noise_slow])
         deviations = np.sqrt(variances).astype(np.float32)
-        return Processes(
-            noise=deviations[0] * white + deviations[1] * quick + deviations[2] * slow,
+        noise = deviations[0] * white + deviations[1] * quick + deviations[2] * slow
+        processes = Processes(
+            noise=self._share_with_neighbours(noise),
             outlier=draw((joints,), self.outlier_seconds),
             direction=draw((joints, 2), self.outlier_seconds),
             flip=draw((len(FLIPPED_TOGETHER),), self.swap_seconds),
             miss=draw((joints,), self.miss_seconds),
             confidence=draw((joints,), self.noise_seconds),
+            hardness=np.zeros((frames, joints), dtype=np.float32),
         )
+        # drawn last: what detectors without these numbers draw is as it was
+        if self.noise_spread:
+            hardness = draw((joints,), self.noise_slow_seconds)
+            processes = replace(processes, hardness=hardness)
+        if self.swap_together:
+            both = draw((1,), self.swap_seconds)
+            alone = np.sqrt(1.0 - self.swap_together) * processes.flip
+            flip = np.sqrt(self.swap_together) * both + alone
+            processes = replace(processes, flip=flip)
+        return processes
+
+    def _share_with_neighbours(
+        self,
+        independent: Float[np.ndarray, "T J 2"],
+    ) -> Float[np.ndarray, "T J 2"]:
+        """Return unit processes that neighbouring joints share of independent ones."""
+        if not self.neighbours:
+            return independent
+        mixing = np.linalg.cholesky(self.neighbours**_BONES_APART)
+        return mixing.astype(independent.dtype) @ independent
 
     def detect_view(
         self,
@@ -264,13 +375,17 @@ class Detector:
         view: int,
         processes: Processes,
         familiar: bool,
+        view_bias: Float[np.ndarray, "#T #J 2"] = _UNBIASED,
     ) -> ViewDetections:
-        """Detect the key points of one camera; ``apparent`` is of ``displace_joints``."""
+        """Detect the key points of one camera; ``apparent`` is of ``displace_joints``,
+        ``view_bias`` of ``draw_view_bias``.
+        """
         projection = _project(points, apparent, rig, view)
         K = rig.K[view]
         distortion = rig.distortion[view]
         raw = projection.raw
-        error = self._familiarity(familiar) * self._error(projection.hidden, processes)
+        error = self._error(projection.hidden, processes) + self.view_bias * view_bias
+        error = self._familiarity(familiar) * error
         flipped = self._flip(projection, processes)
         found = flipped + projection.stature_pixels[..., None] * error
 
@@ -297,7 +412,9 @@ class Detector:
         relative = np.array([self.joints[kind] for kind in KINDS])
         occluded = 1.0 + (self.occluded_noise - 1.0) * hidden
         deviation = self.noise * occluded * relative
-        noise = deviation[..., None] * processes.noise
+        # a log-normal size of mean square 1: the noise's variance does not depend on its spread
+        size = np.exp(self.noise_spread * processes.hardness - self.noise_spread**2)
+        noise = (size * deviation)[..., None] * processes.noise
         return noise + self._outliers(hidden, relative, processes)
 
     def _outliers(

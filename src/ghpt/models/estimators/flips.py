@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,16 +13,15 @@ from ghpt.errors import check
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import Estimator, person_scale
 from ghpt.observations import Observations, PoseEstimate
-from ghpt.skeleton import JOINTS, MIRROR
+from ghpt.skeleton import HUMAN36M, Skeleton
 
 _LIMB_PARTS = (("hip", "knee", "ankle"), ("shoulder", "elbow", "wrist"))
-LIMBS = tuple(
-    tuple(joint for joint, name in enumerate(JOINTS) if name.split("_")[-1] in parts)
-    for parts in _LIMB_PARTS
-)
 """The joints that detectors flip together: those of the legs, those of the arms."""
-
-
+_FOOT_AND_HAND = (
+    ("heel", "toe"),
+    ("hand", "thumb", "finger", "forefinger", "index", "pinky"),
+)
+"""Words in the names of what is flipped with them, and says nothing of whether they are."""
 _HYPOTHESES = ((True, True), (True, False), (False, True))
 """What may be flipped in a view: (legs, arms)."""
 
@@ -42,11 +42,39 @@ class LeftRightFlips:
     gain: float
     rounds: int
     views: int
+    skeleton: Skeleton = HUMAN36M
+    """Of the batches."""
 
     def __post_init__(self) -> None:
         for name in ("scale", "gain", "rounds", "views"):
             value = getattr(self, name)
             check(value > 0, name, f"is {value}", "It must be > 0.")
+
+    def for_skeleton(self, skeleton: Skeleton) -> LeftRightFlips:
+        """Return the same for batches of another skeleton; it has no limbs but a person's."""
+        return replace(self, skeleton=skeleton)
+
+    @cached_property
+    def limbs(self) -> tuple[tuple[int, ...], ...]:
+        """The joints of the legs and of the arms, without feet and hands."""
+        return tuple(self._sided(words) for words in _LIMB_PARTS)
+
+    @cached_property
+    def flipped_together(self) -> tuple[tuple[int, ...], ...]:
+        """What is exchanged with the legs and with the arms: all of their key points."""
+        ends = [self._sided(words) for words in _FOOT_AND_HAND]
+        return tuple((*limb, *end) for limb, end in zip(self.limbs, ends, strict=True))
+
+    def _sided(self, words: tuple[str, ...]) -> tuple[int, ...]:
+        """Return the key points of a side with one of these words in their name."""
+        names = self.skeleton.key_points
+        sided = sorted(joint for pair in self.skeleton.pairs for joint in pair)
+        return tuple(joint for joint in sided if _has_word(names[joint], words))
+
+
+def _has_word(name: str, words: tuple[str, ...]) -> bool:
+    found = {word.rstrip("0123456789") for word in name.split("_")}
+    return not found.isdisjoint(words)
 
 
 @torch.no_grad()
@@ -61,15 +89,15 @@ def undo_flips(
     """
     frames, views = batch.valid.shape[:2]
     device = batch.valid.device
-    flipped = torch.zeros(frames, views, len(LIMBS), dtype=torch.bool, device=device)
+    flipped = torch.zeros(frames, views, len(_LIMB_PARTS), dtype=torch.bool, device=device)
     seen_views = batch.valid.any(-1).sum(-1)
     most = (seen_views - 1) // 2
     if not len(batch) or int(most.max()) < 1:
         return batch, flipped.any(-1)
     estimate = estimate or flips.estimator(batch)
-    cost = _view_costs(batch, estimate, flips.scale)
+    cost = _view_costs(batch, estimate, flips)
     # a view that is right in a pose that is nearly right is far from its mirror image
-    mirrored = _view_costs(_flip(batch, ~flipped), estimate, flips.scale)
+    mirrored = _view_costs(_flip(batch, ~flipped, flips), estimate, flips)
     fits_badly = cost > flips.gain / 2
     may_be_flipped = mirrored < cost + flips.gain
     doubtful = (fits_badly & may_be_flipped).any(-1)
@@ -90,7 +118,7 @@ def undo_flips(
         rows = rows[better]
         flipped[rows] = candidates[row, best][better]
         cost[rows] = best_cost[better]
-    return _flip(batch, flipped), flipped.any(-1)
+    return _flip(batch, flipped, flips), flipped.any(-1)
 
 
 def _candidates(
@@ -112,19 +140,21 @@ def _candidate_costs(
     frames, count = candidates.shape[:2]
     frame = torch.arange(frames, device=candidates.device)
     repeated = batch.rows(frame.repeat_interleave(count))
-    hypotheses = _flip(repeated, candidates.flatten(0, 1))
-    costs = _view_costs(hypotheses, flips.estimator(hypotheses), flips.scale)
+    hypotheses = _flip(repeated, candidates.flatten(0, 1), flips)
+    costs = _view_costs(hypotheses, flips.estimator(hypotheses), flips)
     return costs.unflatten(0, (-1, count))
 
 
-def _flip(batch: Observations, flipped: Bool[Tensor, "B V G"]) -> Observations:
+def _flip(
+    batch: Observations, flipped: Bool[Tensor, "B V G"], flips: LeftRightFlips
+) -> Observations:
     """Return the batch with left and right of these limbs exchanged."""
     device = flipped.device
-    joints = torch.arange(len(JOINTS), device=device)
+    joints = torch.arange(len(flips.skeleton), device=device)
     order = joints.expand(*flipped.shape[:2], -1).clone()
-    mirror = torch.tensor(MIRROR, device=device)
-    for group, limb_joints in enumerate(LIMBS):
-        limbs = torch.tensor(limb_joints, device=device)
+    mirror = torch.tensor(flips.skeleton.mirror, device=device)
+    for group, limb_joints in enumerate(flips.flipped_together):
+        limbs = torch.tensor(limb_joints, dtype=torch.long, device=device)
         mask = flipped[..., group, None]
         order[..., limbs] = torch.where(mask, mirror[limbs], order[..., limbs])
     coordinates = order[..., None].expand(-1, -1, -1, 2)
@@ -136,19 +166,21 @@ def _flip(batch: Observations, flipped: Bool[Tensor, "B V G"]) -> Observations:
     )
 
 
-def _view_costs(batch: Observations, estimate: PoseEstimate, scale: float) -> Float[Tensor, "B V"]:
+def _view_costs(
+    batch: Observations, estimate: PoseEstimate, flips: LeftRightFlips
+) -> Float[Tensor, "B V"]:
     """Return each view's share of its frame's cost.
 
     It is that of the joints that the view sees and the frame estimates, with their mirrors.
     """
-    size = scale * person_scale(batch.key_points, batch.valid).double()
+    size = flips.scale * person_scale(batch.key_points, batch.valid).double()
     size = size.clamp(min=1e-12)[..., None]
     error = reprojection_error(batch.cameras, batch.key_points, estimate.points) / size
-    mirror = list(MIRROR)
+    mirror = list(flips.skeleton.mirror)
     estimated = estimate.estimated & estimate.estimated[:, mirror]
     valid = batch.valid & batch.valid[:, :, mirror]
     square = error.clamp(max=1e6) ** 2
     measured = valid & estimated[:, None]
     loss = torch.where(measured, torch.log1p(square), 0.0)
-    limbs = [joint for group in LIMBS for joint in group]
+    limbs = [joint for limb in flips.limbs for joint in limb]
     return loss[..., limbs].sum(-1)

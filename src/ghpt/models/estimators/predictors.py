@@ -15,9 +15,10 @@ from ghpt.models.estimators.classical import Estimator, as_poses
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.estimators.uncertainty import JointUncertainty, UncertaintyModel
-from ghpt.models.estimators.view_weights import ViewWeights
+from ghpt.models.estimators.view_weights import ViewWeights, WeightedViews
 from ghpt.observations import Observations
 from ghpt.reconstruction import Reconstruction, State
+from ghpt.skeleton import HUMAN36M, JOINT, JOINTS, Skeleton
 
 FAR = 20.0
 """Reject a key point whose distance from the view's median exceeds this multiple of the median
@@ -32,6 +33,9 @@ class Predictor(Protocol):
 
     That holds once the predictor is ``fitted``.
     """
+
+    def for_skeleton(self, skeleton: Skeleton) -> Predictor:
+        """Return the same for batches whose key points are this skeleton's, not the 17 joints."""
 
     def fitted(self, batch: Observations) -> Predictor:
         """Return the same with the noise of these frames: a few hundred of a recording."""
@@ -60,6 +64,11 @@ class Classical:
         self.uncertainty = uncertainty
         self.flips = flips
         self.reject = reject
+
+    def for_skeleton(self, skeleton: Skeleton) -> Classical:
+        """Return the same for batches of another skeleton than the 17 joints'."""
+        flips = self.flips and self.flips.for_skeleton(skeleton)
+        return Classical(self.estimator, self.uncertainty, flips, self.reject)
 
     def fitted(self, batch: Observations) -> Classical:
         clean = _prepare(batch, self.flips, self.estimator).batch
@@ -97,8 +106,12 @@ class Classical:
 class Learned:
     """A trained model's view weights with what can be said of their joints.
 
-    The views that made a joint are those on which the consensus of ``view_weights`` agrees, and
-    error and covariance are theirs. The score is the mean logit of the hypotheses under their
+    The model sees the 17 joints, which are means of the ``skeleton``'s key points in the images.
+    Those of them that are key points themselves are its own; all other key points are what the
+    consensus of ``view_weights`` makes of them.
+
+    The views that made a joint are those on which the consensus agrees, and error and covariance
+    are theirs. The score is the mean logit of the hypotheses under their
     weights, before ``cap_logit_std``, which centres each frame's. ``flips`` and ``reject`` as in
     Classical.
     """
@@ -109,29 +122,58 @@ class Learned:
         uncertainty: UncertaintyModel,
         flips: LeftRightFlips | None,
         reject: Rejection | None,
+        skeleton: Skeleton = HUMAN36M,
     ) -> None:
         self.view_weights = view_weights
         self.uncertainty = uncertainty
         self.flips = flips
         self.reject = reject
+        self.skeleton = skeleton
+
+    def for_skeleton(self, skeleton: Skeleton) -> Learned:
+        """Return the same for batches of another skeleton, which has joints of the 17."""
+        flips = self.flips and self.flips.for_skeleton(skeleton)
+        return Learned(self.view_weights, self.uncertainty, flips, self.reject, skeleton)
 
     def fitted(self, batch: Observations) -> Learned:
         prepared = _prepare(batch, self.flips, self.view_weights.consensus)
         clean = prepared.batch
-        weighted = self.view_weights.weigh(clean, prepared.triangulation)
+        weighted = self._weigh(prepared)
         result = weighted.triangulation
         uncertainty = self.uncertainty.fitted(clean, result.points, weighted.views)
         reject = self.reject and self.reject.fitted(clean, result.points, result.has_position)
-        return Learned(self.view_weights, uncertainty, self.flips, reject)
+        return Learned(self.view_weights, uncertainty, self.flips, reject, self.skeleton)
 
     def rejecting_nothing(self) -> Learned:
         """Return the same with all its joints: what it is compared with others by."""
-        return Learned(self.view_weights, self.uncertainty, self.flips, None)
+        return Learned(self.view_weights, self.uncertainty, self.flips, None, self.skeleton)
+
+    def _weigh(self, prepared: _Prepared) -> WeightedViews:
+        """Return the key points, those of the 17 joints among them by the model."""
+        clean = prepared.batch
+        if self.skeleton == HUMAN36M:
+            return self.view_weights.weigh(clean, prepared.triangulation)
+        consensus = prepared.triangulation
+        views, _ = self.view_weights.consensus.inlier_views(
+            clean, consensus.points, consensus.has_position
+        )
+        weighted = self.view_weights.weigh(observe_joints(clean, self.skeleton))
+        direct = [name for name in JOINTS if name in self.skeleton.key_points]
+        device = views.device
+        joints = torch.tensor([JOINT[name] for name in direct], device=device)
+        own = [self.skeleton.key_points.index(name) for name in direct]
+        key_points = torch.tensor(own, device=device)
+        learned = weighted.triangulation.joints(joints)
+        return WeightedViews(
+            triangulation=consensus.with_joints(key_points, learned),
+            views=views.index_copy(2, key_points, weighted.views.index_select(2, joints)),
+            pool=weighted.pool,
+        )
 
     @torch.no_grad()
     def __call__(self, batch: Observations) -> Reconstruction:
         prepared = _prepare(batch, self.flips, self.view_weights.consensus)
-        weighted = self.view_weights.weigh(prepared.batch, prepared.triangulation)
+        weighted = self._weigh(prepared)
         points = weighted.triangulation.points
         state = _final_states(prepared, weighted.triangulation, self.reject)
         views = weighted.views & (state == State.OBSERVED)[:, None]
@@ -172,6 +214,24 @@ def _prepare(batch: Observations, flips: LeftRightFlips | None, estimator: Estim
     if len(rows):
         result = result.with_rows(rows, estimator.triangulate(clean.rows(rows)))
     return _Prepared(clean, rejected, flipped, result)
+
+
+def observe_joints(batch: Observations, skeleton: Skeleton) -> Observations:
+    """Return the 17 joints, as means in the images of the key points of a batch.
+
+    A joint is valid where all of its parts are, and has the least of their confidences.
+    """
+    weights = torch.from_numpy(skeleton.joint_weights).to(batch.key_points)
+    is_part = weights > 0
+    absent = (~batch.valid).to(weights) @ is_part.to(weights).mT
+    valid = (absent == 0) & is_part.any(-1)
+    parts = torch.where(is_part, batch.confidence[..., None, :], 1.0)
+    return replace(
+        batch,
+        key_points=torch.where(valid[..., None], weights @ batch.key_points, 0.0),
+        confidence=torch.where(valid, parts.amin(-1), 0.0),
+        valid=valid,
+    )
 
 
 def remove_outliers(batch: Observations) -> tuple[Observations, Bool[Tensor, "B V J"]]:
