@@ -37,8 +37,8 @@ class StochasticEstimator(L.LightningModule):
     ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like
     ``StochasticLoss``. ``logit_std_cap`` limits how much a pool's logits differ
     (``cap_logit_std``). ``selection``: the aggregation of the estimation loss, ``weight`` or
-    ``stochastic`` (straight through). ``schedule``: of the learning rate, step by step. All randomness is a function of seed, optimiser step and
-    sample: see ``ghpt.randomness``.
+    ``stochastic`` (straight through). ``schedule``: of the learning rate, step by step. All
+    randomness is a function of seed, optimiser step and sample: see ``ghpt.randomness``.
     """
 
     def __init__(

@@ -49,7 +49,9 @@ class Mistakes:
     """Distance likewise, mm."""
 
 
-def random_recordings(split: str, seed: int, count: int, frames: int) -> Iterator[LabelledRecording]:
+def random_recordings(
+    split: str, seed: int, count: int, frames: int
+) -> Iterator[LabelledRecording]:
     """Return ``count`` recordings of so many frames, a pure function of the arguments."""
     for number in range(count):
         yield _draw_recording(f"{split}-{number}", seed, frames)
@@ -67,7 +69,7 @@ def _draw_recording(name: str, seed: int, frames: int) -> LabelledRecording:
     mistakes = _draw_mistakes(rng)
     if mistakes.others > 0:
         other = draw_motion(seed, f"{name} other", f"{name} other", action, frames, RATE)
-        other[..., :2] += rng.normal(0, 900.0, 2)
+        other[..., :2] += rng.normal(0, 600.0, 2)
         found = _show_another(found, other, rig, mistakes.others, rng)
     found = _displace(found, mistakes, rng)
     valid = found.valid & (np.arange(VIEWS) < views)[:, None]
@@ -97,7 +99,9 @@ def random_rig(rng: np.random.Generator) -> CameraSet:
     # the smallest focal length at which a person of two metres fills a third of the image's height
     focal = rng.uniform(0.33, 0.8) * min(width, height) * reach / 2000.0
     arc = np.deg2rad(rng.choice([360.0, 360.0, 200.0, 100.0]))
-    azimuth = rng.uniform(0, 2 * np.pi) + arc * (np.arange(VIEWS) + rng.uniform(-0.4, 0.4, VIEWS)) / VIEWS
+    azimuth = (
+        rng.uniform(0, 2 * np.pi) + arc * (np.arange(VIEWS) + rng.uniform(-0.4, 0.4, VIEWS)) / VIEWS
+    )
     azimuth = rng.permutation(azimuth)
     distance = reach * rng.uniform(0.8, 1.25, VIEWS)
     level = rng.uniform(300.0, 2800.0, VIEWS)
@@ -169,15 +173,15 @@ def _draw_mistakes(rng: np.random.Generator) -> Mistakes:
     turned = np.zeros(VIEWS)
     shifted = np.zeros(VIEWS)
     kind = rng.uniform()
-    if kind < 0.35:  # all cameras
+    if kind < 0.4:  # all cameras
         turned = rng.uniform(0.0, 2.5) * rng.uniform(0.7, 1.3, VIEWS)
         shifted = rng.uniform(0.0, 40.0) * rng.uniform(0.7, 1.3, VIEWS)
-    elif kind < 0.5:  # one of them
+    elif kind < 0.55:  # one of them
         turned[rng.integers(VIEWS // 2)] = rng.uniform(0.3, 4.0)
     return Mistakes(
         outliers=rng.uniform(0.02, 0.4) if rng.uniform() < 0.5 else 0.0,
         missing=rng.uniform(0.05, 0.6) if rng.uniform() < 0.35 else 0.0,
-        others=rng.uniform(0.03, 0.25) if rng.uniform() < 0.3 else 0.0,
+        others=rng.uniform(0.03, 0.25) if rng.uniform() < 0.4 else 0.0,
         turned=turned,
         shifted=shifted,
     )

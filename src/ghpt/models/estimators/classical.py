@@ -22,6 +22,7 @@ from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
 from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.estimators.confidence import confidence_exponent, confidence_weights
 from ghpt.observations import Observations, PoseEstimate
+from ghpt.skeleton import Skeleton
 
 
 def person_scale(
@@ -68,6 +69,10 @@ class Estimator(ABC):
 
     def fitted(self, batch: Observations) -> Self:
         """Return the same estimator with what it takes from these frames of a recording."""
+        return self
+
+    def for_skeleton(self, skeleton: Skeleton) -> Self:
+        """Return the same estimator for batches of another skeleton than the 17 joints'."""
         return self
 
     def inlier_threshold(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float
@@ -10,9 +10,11 @@ from torch import Tensor
 
 from ghpt.geometry.triangulation import Triangulation, concatenate
 from ghpt.models.estimators.classical import Estimator
+from ghpt.models.estimators.predictors import observe_joints
 from ghpt.models.key_points.problem import KeyPoints, KeyPointWeights
 from ghpt.models.weights import load_shipped
 from ghpt.observations import Observations, PoseEstimate
+from ghpt.skeleton import HUMAN36M, JOINT, JOINTS, Skeleton
 
 _PAIRS_AT_ONCE = 2**18
 """Pairs of key points of one joint that are looked at together."""
@@ -25,11 +27,32 @@ class FrameLearned(Estimator):
     ``weights``: of a model of ``ghpt/weights``. The first estimate is that of the model's own
     AdaptiveRansac, which also stands where the weights leave a joint without a point; a view counts
     as one that made a joint as it does there.
+
+    The network knows the 17 joints, which are means of the ``skeleton``'s key points in the images.
+    Those of them that are key points themselves are its own; all others have the first estimate.
     """
 
     weights: str
+    skeleton: Skeleton = HUMAN36M
+
+    def for_skeleton(self, skeleton: Skeleton) -> FrameLearned:
+        return replace(self, skeleton=skeleton)
 
     def triangulate(self, batch: Observations) -> Triangulation:
+        skeleton = self.skeleton
+        if skeleton == HUMAN36M:
+            return self._triangulate_joints(batch)
+        start = self._problem.start.triangulate(batch)
+        direct = [name for name in JOINTS if name in skeleton.key_points]
+        if not direct or not skeleton.has_joints:
+            return start
+        device = batch.valid.device
+        joints = torch.tensor([JOINT[name] for name in direct], device=device)
+        own = torch.tensor([skeleton.key_points.index(name) for name in direct], device=device)
+        learned = self._triangulate_joints(observe_joints(batch, skeleton))
+        return start.with_joints(own, learned.joints(joints))
+
+    def _triangulate_joints(self, batch: Observations) -> Triangulation:
         frames, views, joints = batch.valid.shape
         size = max(1, _PAIRS_AT_ONCE // max(views * views * joints, 1))
         starts = range(0, max(frames, 1), size)

@@ -181,9 +181,7 @@ def _log(length: Tensor) -> Tensor:
     return (length + 0.05).log()
 
 
-def _stature(
-    points: Float[Tensor, "B J 3"], estimated: Bool[Tensor, "B J"]
-) -> Float[Tensor, " B"]:
+def _stature(points: Float[Tensor, "B J 3"], estimated: Bool[Tensor, "B J"]) -> Float[Tensor, " B"]:
     """Return the stature that the median bone has, mm."""
     start = [a for a, _ in BONES]
     end = [b for _, b in BONES]
@@ -221,9 +219,7 @@ def _median(values: PerKeyPoint, valid: Mask, dims: tuple[int, ...]) -> PerKeyPo
     return masked.nanmedian(-1, keepdim=True).values.nan_to_num(0.0)
 
 
-def _without_common(
-    residual: Float[Tensor, "B V J 2"], valid: Mask
-) -> Float[Tensor, "B V J 2"]:
+def _without_common(residual: Float[Tensor, "B V J 2"], valid: Mask) -> Float[Tensor, "B V J 2"]:
     """Return the residuals less the median of their view's: what a turned camera gives them all."""
     masked = torch.where(valid[..., None], residual, torch.nan)
     return residual - masked.nanmedian(2, keepdim=True).values.nan_to_num(0.0)

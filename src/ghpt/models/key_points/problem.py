@@ -19,7 +19,7 @@ from ghpt.models.problem import Errors, Features, Hypotheses, Keys, Weights
 from ghpt.observations import Observations, PoseEstimate, Truth
 
 _SMALL = 10.0
-"""mm: errors far below it differ little to the loss, those above it by their logarithm."""
+"""mm: the loss grows with the error below it, and with its root far above."""
 _FAR = 1e4
 """mm: no key point is farther from the truth than that."""
 
@@ -105,9 +105,9 @@ class KeyPointWeights(PoseProblem):
         return distance.flatten(1), usable.flatten(1).any(-1)
 
     def training_error(self, estimate: PoseEstimate, truth: Truth) -> Float[Tensor, " B"]:
-        """Return the mean over the joints of log(1 + distance / ``_SMALL``)."""
+        """Return the mean over the joints of the root of 1 + distance / ``_SMALL``, less 1."""
         difference = estimate.points - truth.points.double()
         counted = estimate.estimated & truth.valid
         square = torch.where(counted, difference.square().sum(-1), 1.0)
-        loss = torch.where(counted, (square.sqrt() / _SMALL).log1p(), 0.0)
+        loss = torch.where(counted, (1 + square.sqrt() / _SMALL).sqrt() - 1, 0.0)
         return loss.sum(-1) / counted.sum(-1).clamp_min(1)
