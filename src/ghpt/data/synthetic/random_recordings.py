@@ -150,7 +150,7 @@ def random_detector(rng: np.random.Generator) -> Detector:
         noise_spread=rng.uniform(0.0, 0.6),
         joints={kind: between(0.6, 1.7) for kind in dict.fromkeys(KINDS)},
         bias=0.0,
-        bias_seed=0,
+        bias_seed=int(rng.integers(2**31)),
         bias_of_subject=0.0,
         view_bias=between(0.001, 0.012),
         view_bias_degrees=30.0,
