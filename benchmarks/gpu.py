@@ -261,7 +261,7 @@ def prediction(device: torch.device, frames: int) -> Callable[[], None]:
     """Return the classical default of ``predict.py`` on so many frames."""
     estimator = configuration("predict")
     baseline = build(estimator["baselines"][estimator["triangulation"]], "baselines")
-    predictor = build(estimator["estimator"]["classical"], "estimator.classical")(
+    predictor = build(estimator["predictor"]["classical"], "predictor.classical")(
         estimator=baseline
     )
     batch = labelled(frames).observations.to(device)

@@ -175,8 +175,8 @@ def measure_linearity(views: int, name: str, method: Method, options: Options) -
 
 def make_methods(baselines: dict[str, Any]) -> dict[str, Method]:
     """Return all classical estimators, the loop, and what predict does by default."""
-    config = configuration("estimator/default")["estimator"]["classical"]
-    classical = build(config, "estimator.classical")
+    config = configuration("predictor/default")["predictor"]["classical"]
+    classical = build(config, "predictor.classical")
     predictor = classical(estimator=baselines[configuration("predict")["triangulation"]])
     methods: dict[str, Method] = {}
     for name, baseline in baselines.items():

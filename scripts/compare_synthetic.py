@@ -22,7 +22,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 from scipy.stats import spearmanr
 
-from ghpt.data.datasets.panoptic import joints17
+from ghpt.data.datasets.panoptic_joints import joints17
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import synthetic_recordings, takes
 from ghpt.geometry import lens

@@ -63,7 +63,7 @@ def main(folder: Path, words: list[str]) -> None:
         given = [word.format(folder) for word in given]
         found = {}
         with tempfile.TemporaryDirectory() as output:
-            runs = {estimator: [f"triangulation={estimator}"] for estimator in ESTIMATORS}
+            runs = {estimator: [f"estimator={estimator}"] for estimator in ESTIMATORS}
             runs |= {"view_weights": words} if words else {}
             for estimator, more in runs.items():
                 found[estimator] = poses(

@@ -13,10 +13,11 @@ import numpy as np
 import torch
 
 from ghpt.data.datasets.labels import LABELS_FILE
-from ghpt.data.datasets.panoptic import COCO19, joints17
+from ghpt.data.datasets.panoptic_joints import COCO19, joints17
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import CameraSet, project
 from ghpt.geometry.lens import distort
+from ghpt.skeleton import MIRROR
 
 Detect = Callable[[CameraSet, np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
 """(rig, poses [T 17 3] mm) -> ideal pixels [T V 17 2], confidence [T V 17], seen [T V 17]."""
@@ -176,6 +177,50 @@ def panoptic_calibration(rig: CameraSet) -> dict:
         for v, name in enumerate(rig.names)
     ]
     return {"calibDataSource": "test", "cameras": cameras}
+
+
+def cmu_labels(rig: CameraSet, mm: float) -> dict:
+    """Labels as the CMU data set's are: cameras of two actions, t in a unit of ``mm``."""
+    fields = [("R", "f4", (3, 3)), ("t", "f4", (3, 1)), ("K", "f4", (3, 3)), ("dist", "f4", 5)]
+    cameras = np.zeros((2, len(rig)), fields)
+    cameras["R"], cameras["K"] = rig.cameras.R, rig.cameras.K
+    cameras["t"], cameras["dist"] = rig.cameras.t[..., None] / mm, rig.distortion
+    columns = [("action_idx", "i1"), ("person_id", "i1"), ("frame_name", "i2")]
+    table = np.zeros(5, [*columns, ("keypoints", "f4", (19, 4))])
+    return {
+        "camera_names": list(rig.names),
+        "action_names": ["171026_pose1", "171026_pose2"],
+        "person_ids": [0, 4],
+        "cameras": cameras,
+        "table": table,
+    }
+
+
+def write_cmu_layout(
+    root: Path,
+    rig: CameraSet,
+    poses: np.ndarray,
+    truth_mm: float = 1.0,
+    camera_mm: float = 10.0,
+    lens: bool = True,
+    mirrored: bool = False,
+    flat_boxes: bool = False,
+) -> np.ndarray:
+    """The authors' flat folder of poses [T 19 3] mm; returns the 17 joints that it shows."""
+    root.mkdir(parents=True, exist_ok=True)
+    joints, _ = joints17(poses, np.isfinite(poses).all(-1))
+    shown = ideal(rig, joints.astype(np.float64))
+    shown = through_lens(rig, shown) if lens else shown
+    corner = np.floor(shown.min(2))
+    size = np.ceil((shown.max(2) - corner).max(-1, keepdims=True))
+    crop = (shown - corner[:, :, None]) * (384 / size[:, :, None])
+    boxes = np.stack([corner, corner + size], axis=2)
+    order = list(MIRROR) if mirrored else slice(None)
+    np.save(root / "all_2d_preds.npy", crop[:, :, order].astype(np.float32))
+    np.save(root / "all_bboxes.npy", boxes.reshape(*boxes.shape[:2], 4) if flat_boxes else boxes)
+    np.save(root / "all_3d_gt.npy", (poses / truth_mm).astype(np.float32))
+    write_pickle(root / "cmu-multiview-labels-MRCNNbboxes.npy", cmu_labels(rig, camera_mm))
+    return joints
 
 
 def upright19() -> np.ndarray:

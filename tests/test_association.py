@@ -2,7 +2,6 @@
 put first.
 """
 
-import json
 import logging
 from dataclasses import replace
 
@@ -17,15 +16,18 @@ from ghpt.data.people.detections import Detections
 from ghpt.data.people.persons import (
     person_sequence,
     select_person,
+    tell_apart,
     undistort_detections,
 )
 from ghpt.data.people.tracks import Bodies, track_bodies
 from ghpt.data.points import KeyPoints
 from ghpt.data.synthetic.detector import Detector
+from ghpt.data.synthetic.people import PeopleRecording, Scene, Stay, record_people
 from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
+from ghpt.skeleton import BONES
 
 FRAMES = 240
 
@@ -167,37 +169,79 @@ def test_whoever_is_alone_is_taken_as_they_are(detector):
     np.testing.assert_array_equal(one.pixels, other.pixels)
 
 
-def test_identities_in_the_files_are_taken_as_they_are(tmp_path):
-    rng = np.random.default_rng(0)
-    bodies = {
-        number: np.column_stack([rng.uniform(0, 400, (25, 2)), np.full(25, 0.5)])
-        for number in (3, 7)
-    }
-    for view in ("a", "b"):
-        (tmp_path / view).mkdir()
-        for frame in range(4):
-            there = [
-                number for number in rng.permutation([3, 7]).tolist() if number == 7 or frame != 2
-            ]
-            listed = [
-                {"person_id": [n], "pose_keypoints_2d": (bodies[n] + frame).ravel().tolist()}
-                for n in there
-            ]
-            (tmp_path / view / f"{frame}.json").write_text(json.dumps({"people": listed}))
-    people = read_key_points(tmp_path, "body_25b")
-    cameras = camera_file(
-        CameraSet.from_cameras(("a", "b"), rig_of(2).cameras, rig_of(2).distortion, rig_of(2).size)
+def test_numbers_of_trackers_mean_nothing_in_another_view(detector):
+    """Each view's tracker counts anew, and so each calls another person its first."""
+    rig = rig_of(4)
+    people, owner = scene(detector, rig)
+    numbered = replace(people, identity=np.where(people.view % 2, 1 - owner, owner))
+    for person in (0, 1):
+        chosen = person_of(numbered, camera_file(rig), range(4), person)
+        assert len(set(owner[chosen[chosen >= 0]])) == 1
+
+
+def test_numbers_of_trackers_tell_who_came_back_in_a_view():
+    """A body far from both tracks is whom the views call by the old number."""
+    body = np.random.default_rng(0).uniform(-1, 1, (17, 3)) * [300, 300, 900]
+    place = np.array([0, 500, 250])
+    bodies = Bodies(
+        frame=np.array([0, 0, 1]),
+        points=body + place[:, None, None] * np.array([1.0, 0, 0]),
+        valid=np.ones((3, 17), bool),
+        identity=np.array([[4, 9], [7, 2], [7, 2]]),
+        bones=BONES,
     )
-    for person, number in enumerate((7, 3)):
-        points = people.points.take(person_of(people, cameras, (0, 1), person))
-        there = np.array([number == 7 or frame != 2 for frame in range(4)])
-        assert (points.valid.any(-1) == there[:, None]).all()
-        expected = np.broadcast_to(
-            (bodies[number][:, 0] + np.arange(4)[:, None])[:, None], (4, 2, 25)
-        )
-        np.testing.assert_allclose(points.pixels[..., 0][there], expected[there])
-    with pytest.raises(GhptDataError, match="there is no person 2: 2 can be told apart"):
-        person_of(people, cameras, (0, 1), 2)
+    assert track_bodies(bodies).tolist() == [0, 1, 1]
+
+
+@pytest.mark.parametrize(("size", "count"), [(1.0, 1), (0.8, 2)])
+def test_one_after_another_are_two_if_their_sizes_differ(size, count, detector):
+    """Who comes after another has gone is another if smaller by a fifth, and the same otherwise."""
+    rig = rig_of(4)
+    motion = draw_motion(0, "one", "one", "Walking", FRAMES, 50.0)
+    second = motion[::-1] * size
+    points = np.concatenate([motion[:120], second[120:]])
+    found = detector(points, rig, 50.0, 0, "one", "one")
+    valid = found.valid.copy()
+    valid[100:140] = False
+    key_points = KeyPoints(found.key_points.astype(float), found.confidence.astype(float), valid)
+    frame = np.arange(FRAMES)
+    people = Detections.of_person("", rig.names, SKELETONS["human36m"], frame, key_points)
+    ideal = undistort_detections(people, camera_file(rig), range(4))
+    persons = tell_apart(people, camera_file(rig), range(4), ideal)
+    spans = [np.flatnonzero((chosen >= 0).any(1))[[0, -1]].tolist() for chosen in persons]
+    assert sorted(spans) == {1: [[0, 239]], 2: [[0, 99], [140, 239]]}[count]
+
+
+def test_everybody_counts_where_nobody_is_there_for_half_of_the_time(detector):
+    """Three people, each there for 40 % of the time: all are found in all of their frames."""
+    stays = [
+        Stay("Walking", (0, 0), ((0.0, 0.4),), stature=1850.0),
+        Stay("Walking", (0, 700), ((0.3, 0.7),)),
+        Stay("Walking", (0, 0), ((0.6, 1.0),), stature=1550.0),
+    ]
+    recording = record_people("turns", Scene([3, 12, 23], stays, 60, 30.0), detector, 0)
+    persons = everybody(recording)
+    found = np.zeros(recording.present.shape, bool)
+    for chosen in persons:
+        row, view = np.nonzero(chosen >= 0)
+        found[row, recording.owner[chosen[row, view]]] = True
+    assert len(persons) == 3
+    assert found[recording.detected_views() >= 2].mean() > 0.98
+
+
+def test_detections_of_nobody_make_nobody(detector):
+    """Twenty in every view of every frame, beside two people."""
+    stays = [Stay("Walking", (0, 0)), Stay("Walking", (600, 300))]
+    scene = Scene([3, 8, 12, 18, 23], stays, 20, 30.0, false_detections=20)
+    recording = record_people("false", scene, detector, 0)
+    owners = [recording.owner[chosen[chosen >= 0]] for chosen in everybody(recording)]
+    assert sorted(np.bincount(owner + 1).argmax() - 1 for owner in owners) == [0, 1]
+    assert all((owner >= 0).mean() > 0.97 for owner in owners)
+
+
+def everybody(recording: PeopleRecording) -> list[np.ndarray]:
+    people = recording.detections
+    return tell_apart(people, recording.cameras, range(len(people.views)), people.points)
 
 
 def test_nobody_is_no_error():
@@ -213,7 +257,7 @@ def test_who_was_seen_beside_another_is_not_that_one():
     body = np.random.default_rng(0).uniform(-1, 1, (17, 3)) * [300, 300, 900]
     frame, place = np.array([0, 0, 1, 1, 2, 2, 3]), np.array([0, 4000, 30, 4020, 60, 9000, 9020])
     points = body + place[:, None, None] * np.array([1.0, 0, 0])
-    bodies = Bodies(frame, points, np.ones((7, 17), bool))
+    bodies = Bodies(frame, points, np.ones((7, 17), bool), np.full((7, 2), -1), BONES)
     assert track_bodies(bodies).tolist() == [0, 1, 0, 1, 0, 2, 2]
 
 

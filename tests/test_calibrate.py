@@ -204,7 +204,7 @@ def test_an_assumed_scale_is_said_everywhere(command, scene, tmp_path):
         ),
         (["scale.segments={thigh: long}"], r"scale\.segments: says thigh is 'long'"),
         (["scale.height=-3"], r"scale\.height: is -3"),
-        (["triangulation=guess"], "triangulation: is 'guess'"),
+        (["estimator=guess"], "estimator: is 'guess'"),
         (["views=[cam_00,cam_07]"], "there is no view cam_07"),
         (["views=[cam_00]"], "triangulation needs at least two|fewer than two|1 given"),
         (["skeleton=body_25"], "body_25 has 25 joints and the key points have 17"),

@@ -27,7 +27,7 @@ from ghpt.data.people.persons import person_sequence
 from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
-from ghpt.geometry.cameras import project
+from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.lens import distort
 from ghpt.skeleton import JOINTS
 from rigs_with_people import people
@@ -96,8 +96,10 @@ PUSHED = (
     "lens_missing",
     "metres",
     "moved",
+    "one_turned_180",
     "resolution",
     "sides_swapped",
+    "turned_90",
 )
 """One of each sort; all the others, two seconds each, at night."""
 
@@ -128,6 +130,8 @@ def test_numbers_of_the_mistakes_are_those_that_were_made():
         "centimetres": 10,
         "one_metres": 1000,
         "resolution": pytest.approx(0.5),
+        "turned_90": 90,
+        "one_turned_180": 180,
     }
     expected = {kind: numbers[kind] for kind in tried(numbers)}
     assert {kind: checked(kind).findings[0].value for kind in expected} == expected
@@ -139,6 +143,27 @@ def test_mended_poses_are_the_true_ones():
         mended = checked(kind).setup
         torch.testing.assert_close(mended.R, setup.R, rtol=0, atol=1e-9)
         torch.testing.assert_close(mended.t, setup.t, rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_turned_camera_shows_the_turned_image(quarters):
+    rig = human36m_rig("S9")  # with tangential distortion
+    setup = setup_of(rig)
+    turned = setup.turned((0,), 90 * quarters)
+    point = torch.tensor([[[300.0, -200.0, 1500.0]]], dtype=torch.float64)
+
+    def shown(of):
+        pixels, _ = project(Cameras(of.K, of.R, of.t), point[0])
+        return distort(pixels, of.K, of.lens)[0, 0]
+
+    u, v = shown(setup)
+    width, height = setup.width[0], setup.height[0]
+    expected = {1: (height - 1 - v, u), 2: (width - 1 - u, height - 1 - v), 3: (v, width - 1 - u)}
+    torch.testing.assert_close(shown(turned), torch.stack(expected[quarters]))
+    back = turned.turned((0,), 360 - 90 * quarters)
+    torch.testing.assert_close(back.K, setup.K)
+    torch.testing.assert_close(back.lens, setup.lens)
+    assert (back.width, back.height) == (setup.width, setup.height)
 
 
 def test_two_mistakes_in_one_recording_are_both_found():

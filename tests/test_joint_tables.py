@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from ghpt.data.datasets import panoptic
-from ghpt.data.datasets.panoptic import COCO19
+from ghpt.data.datasets.panoptic_joints import COCO19
 from ghpt.data.formats.skeletons import SKELETONS, canonical, joints17
 from ghpt.data.points import KeyPoints
 from ghpt.skeleton import BONES, JOINTS, MIRROR, SIX_JOINTS, SYMMETRIC_BONES

@@ -9,7 +9,7 @@ import pytest
 
 from ghpt.data.formats.key_points import FORMATS, read_key_points
 from ghpt.data.formats.skeletons import SKELETONS, canonical
-from ghpt.errors import GhptDataError
+from ghpt.errors import GhptConfigError, GhptDataError
 from single_person import read_person
 
 RNG = np.random.default_rng(0)
@@ -93,12 +93,14 @@ def test_one_coco_file_whose_images_name_the_views(form, tmp_path):
     ("content", "says"),
     [
         ([], "people: is empty"),
-        ([1], "annotations: is not a list of objects"),
+        ([1], "is not a key-point format that is known"),
+        ({"annotations": [1]}, "annotations: is not a list of objects"),
         ({"images": 1, "annotations": []}, "images: is not a list"),
-        ([{"keypoints": [1, 2, 3]}], "image_id: an image has neither number nor name"),
-        ([result("frame.jpg")], "'frame.jpg' has no frame number"),
-        ([result(-1)], "image_id: -1 has no frame number"),
-        ([{"image_id": 1}], r"\[0\]\.keypoints: is not a list of x, y, confidence"),
+        ([{"keypoints": [1, 2, 3]}], "it looks like mmpose's"),
+        ([result(None)], "image_id: an image has neither number nor name"),
+        ([result("frame.jpg")], "frame.jpg: its name has no frame number"),
+        ([result(-1)], "image_id: -1 is no frame number"),
+        ([{"image_id": 1}], r"\[0\]: has no key points"),
         ([{"image_id": 1, "keypoints": [1, 2, "3"]}], r"\[0\]\.keypoints: is not a list"),
         ([{"image_id": 1, "keypoints": [1, 2e6, 3]}], "beyond 1e6"),
         ([{"image_id": 1, "keypoints": [10**400, 2, 3]}], "beyond 1e6"),
@@ -170,7 +172,7 @@ def test_the_joints_are_those_that_mmpose_names(tmp_path):
         ([{"frame_id": 1, "instances": []}] * 2, "frame_id: is there twice"),
         (
             [{"frame_id": 1, "instances": [{"keypoints": [1]}]}],
-            r"keypoints: is not a list of \[x, y\]",
+            r"keypoints: is not a list of x, y",
         ),
         (
             [{"frame_id": 1, "instances": [{"keypoints": [[1, 2]]}]}],
@@ -206,5 +208,108 @@ def test_a_format_is_chosen_by_name(tmp_path):
     write(tmp_path / "a.json", mmpose([(1, [0.0])]))
     with pytest.raises(GhptDataError, match=f"there is no format 'c3d'.*{', '.join(FORMATS)}"):
         read_key_points(tmp_path, format="c3d")
-    with pytest.raises(GhptDataError, match="annotations: is not a list of objects"):
+    with pytest.raises(GhptDataError, match="is not of coco: it looks like mmpose's"):
         read_key_points(tmp_path, format="coco")
+
+
+XY = BODY[:, :2].tolist()
+SURE = BODY[:, 2].tolist()
+TRIPLES = BODY.tolist()
+FLAT = BODY.ravel().tolist()
+INSTANCE = {"keypoints": XY, "keypoint_scores": SURE, "bbox": [[0, 0, 9, 9]], "bbox_score": 0.9}
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        {"version": 1.3, "people": [{"pose_keypoints_2d": FLAT}]},
+        {"version": 1.1, "people": [{"pose_keypoints": FLAT}, {}]},
+        {"version": "AlphaPose v0.3", "bodies": [{"joints": FLAT}]},
+        {"filename": "images/1/000000.jpg", "annots": [{"personID": 0, "keypoints": TRIPLES}]},
+        [INSTANCE],
+        {"predictions": [[INSTANCE]], "visualization": []},
+        {"keypoints": [XY], "scores": [SURE]},
+    ],
+)
+def test_a_file_of_each_image_in_every_detector_s_words(frame, tmp_path):
+    for view in ("cam1", "cam2"):
+        for number in (0, 1):
+            write(tmp_path / view / f"{view}_{number:06d}.json", frame)
+        write(tmp_path / view / f"{view}_000002.json", type(frame)())
+    if isinstance(frame, dict):
+        for view in ("cam1", "cam2"):
+            (tmp_path / view / f"{view}_000002.json").unlink()
+    found = read_key_points(tmp_path, "coco_17")
+    assert found.views == ("cam1", "cam2")
+    assert (found.counts()[:2] == 1).all()
+    np.testing.assert_array_equal(found.points.pixels, np.broadcast_to(BODY[:, :2], (4, 17, 2)))
+    np.testing.assert_array_equal(found.points.confidence, np.broadcast_to(BODY[:, 2], (4, 17)))
+
+
+@pytest.mark.parametrize(
+    "recording",
+    [
+        [{"frame_id": 5, "instances": [INSTANCE]}, {"frame_id": 6, "instances": [INSTANCE] * 2}],
+        {"visualization": [], "predictions": [[INSTANCE], [INSTANCE] * 2]},
+        [[INSTANCE], [INSTANCE] * 2],
+        [{"predictions": [[INSTANCE]]}, {"predictions": [[INSTANCE] * 2]}],
+        [{"keypoints": [XY], "scores": [SURE]}, {"keypoints": [XY] * 2, "scores": [SURE] * 2}],
+        {"keypoints": [[XY], [XY] * 2], "scores": [[SURE], [SURE] * 2]},
+        {
+            "0.jpg": {"people": [{"pose_keypoints_2d": FLAT}]},
+            "1.jpg": {"bodies": [{"joints": FLAT}] * 2},
+        },
+        [{"image_id": f"{t}.jpg", "keypoints": FLAT, "idx": [0.0]} for t in (3, 4, 4)],
+    ],
+)
+@pytest.mark.parametrize("form", ["{}.json", "{}/alphapose-results.json", "{}/predictions/x.json"])
+def test_a_file_of_each_video_in_every_detector_s_words(recording, form, tmp_path):
+    for view in ("cam1", "cam2"):
+        write(tmp_path / form.format(view), recording)
+    found = read_key_points(tmp_path, "coco_17")
+    assert found.views == ("cam1", "cam2")
+    assert found.counts().tolist() == [[1, 1], [2, 2]]
+    assert np.diff(found.frame).tolist() == [1]
+    np.testing.assert_array_equal(found.points.pixels, np.broadcast_to(BODY[:, :2], (6, 17, 2)))
+
+
+def test_nan_and_null_are_missing_key_points(tmp_path):
+    for view in ("a", "b"):
+        flat = [*FLAT]
+        flat[0], flat[4], flat[8] = float("nan"), None, float("nan")
+        write(tmp_path / view / "1.json", {"people": [{"pose_keypoints_2d": flat}]})
+    found = read_key_points(tmp_path, "coco_17").points
+    assert found.valid[:, :4].tolist() == [[False, False, False, True]] * 2
+    assert (found.pixels[~found.valid] == 0).all()
+
+
+def test_calibrations_beside_the_folders_are_no_key_points(tmp_path):
+    for view in ("a", "b"):
+        write(tmp_path / view / "1.json", [INSTANCE])
+    write(tmp_path / "calibration_1.json", {"cameras": [{"name": "a"}]})
+    assert read_key_points(tmp_path, "coco_17").views == ("a", "b")
+
+
+def test_of_several_recordings_one_is_chosen(tmp_path):
+    for view in ("cam1", "cam2"):
+        for shift, trial in enumerate(("walk", "jump")):
+            write(tmp_path / f"{trial}_{view}.json", [result(0, shift), result(1, shift)])
+    with pytest.raises(GhptDataError, match=r"several sessions are in it: jump, walk"):
+        read_key_points(tmp_path)
+    found = read_key_points(tmp_path, session="jump")
+    assert found.views == ("cam1", "cam2")
+    np.testing.assert_allclose(found.points.pixels[:, 0, 0], BODY[0, 0] + 1)
+
+
+def test_a_key_point_below_the_least_confidence_is_missing(tmp_path):
+    weak = BODY * [1, 1, 0.1]
+    for view in ("a", "b"):
+        write(tmp_path / f"{view}.json", [result(0), result(0, 300, weak)])
+    limit = float(np.sort(BODY[:, 2])[5])
+    found = read_key_points(tmp_path, least_confidence=limit)
+    assert found.counts().tolist() == [[1, 1]]
+    np.testing.assert_array_equal(found.points.valid, np.array([BODY[:, 2] >= limit] * 2))
+    with pytest.raises(GhptDataError, match="no key point with a confidence of at least"):
+        read_key_points(tmp_path, least_confidence=1)
+    with pytest.raises(GhptConfigError, match="least_confidence"):
+        read_key_points(tmp_path, least_confidence=1.5)

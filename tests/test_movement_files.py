@@ -108,12 +108,6 @@ def test_what_movement_cannot_read_is_named(tmp_path, monkeypatch):
         read_key_points(tmp_path)
 
 
-def test_deeplabcut_s_h5_files_are_refused(tmp_path):
-    (tmp_path / "cam1.h5").write_bytes(b"\x89HDF\r\n\x1a\n")
-    with pytest.raises(GhptDataError, match=r"holds no \.csv of DeepLabCut.*Export \.csv files"):
-        read_key_points(tmp_path, format="deeplabcut")
-
-
 def test_a_real_file_by_the_real_package(tmp_path):
     pytest.importorskip("movement")
     for name in ("cam1", "cam2"):

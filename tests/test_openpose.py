@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from ghpt.data.formats.key_points import read_key_points
-from ghpt.data.formats.openpose import read_view
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.people.following import follow
 from ghpt.errors import GhptDataError
@@ -142,7 +141,7 @@ def test_of_two_people_the_larger_is_followed_whoever_is_listed_first(tmp_path):
     np.testing.assert_allclose(found.key_points, np.broadcast_to(BODY, (2, 2, 25, 2)))
 
 
-def test_person_ids_count_where_everybody_has_one(tmp_path):
+def test_person_ids_are_those_of_the_view(tmp_path):
     def write_ids(view, ids):
         (tmp_path / view).mkdir(exist_ok=True)
         people = [{"person_id": [i], "pose_keypoints_2d": person().ravel().tolist()} for i in ids]
@@ -153,18 +152,19 @@ def test_person_ids_count_where_everybody_has_one(tmp_path):
     assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [1, 0, 7]
     for other in (-1, True, 1 << 31, "1", 1.0):
         write_ids("b", [other])
-        assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [-1, -1, -1]
+        assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [1, 0, -1]
 
 
 def test_64_people_are_read_and_a_pixel_below_a_million(tmp_path):
     one = person()
     one[0, 0] = 999_999.5
-    write(tmp_path / "a", [[one] * 64])
-    assert read_view(tmp_path / "a").points.pixels.shape == (64, 25, 2)
+    for view in ("a", "b"):
+        write(tmp_path / view, [[one] * 64])
+    assert len(read_key_points(tmp_path, **JOINTS)) == 128
     one[0, 0] = -1e6
     write(tmp_path / "a", [[one]])
     with pytest.raises(GhptDataError, match="beyond 1e6"):
-        read_view(tmp_path / "a")
+        read_key_points(tmp_path, **JOINTS)
 
 
 def test_the_number_of_people_is_told(tmp_path):
@@ -181,11 +181,12 @@ def test_cameras_without_a_common_frame_are_refused(tmp_path):
 
 
 def test_bad_folders_are_named(tmp_path):
-    with pytest.raises(
-        GhptDataError, match=r"holds no folder with OpenPose's JSON files.*for each camera"
-    ):
+    with pytest.raises(GhptDataError, match=r"is not a key-point format that is known"):
         read_person(tmp_path)
-    write(tmp_path / "a", [[]] * 3)
+    with pytest.raises(GhptDataError, match=r"holds no JSON file.*each camera"):
+        read_person(tmp_path, format="openpose")
+    for view in ("a", "b"):
+        write(tmp_path / view, [[]] * 3)
     with pytest.raises(GhptDataError, match="people: is empty"):
         read_person(tmp_path)
     write(tmp_path / "b", [[person()]] * 3)
@@ -199,20 +200,18 @@ def test_bad_folders_are_named(tmp_path):
     ("name", "content", "says"),
     [
         ("x.json", "{}", "its name has no frame number"),
-        ("01.json", '{"people": []}', "has the frame number 1, as 01.json has"),
+        ("01.json", '{"people": []}', "has the frame number 1, as"),
         ("9.json", '{"people": [', "is not valid JSON"),
         ("9.json", '{"people": 1}', "people: is not a list of people"),
-        (
-            "9.json",
-            '{"people": [{}]}',
-            r"people\[0\]\.pose_keypoints_2d: is not a list of x, y, confidence",
-        ),
+        ("9.json", '{"people": [{"x": 1}]}', r"people\[0\]: has no key points"),
         (
             "9.json",
             '{"people": [{"pose_keypoints_2d": [1, 2]}]}',
             "is not a list of x, y, confidence",
         ),
-        ("9.json", '{"people": [{"pose_keypoints_2d": [NaN, 2, 3]}]}', "NaN is no JSON number"),
+        ("9.json", '{"people": [{"pose_keypoints_2d": [Infinity, 2, 3]}]}', "no JSON number"),
+        ("9.json", "{}", "is not a key-point format"),
+        ("9.json", '[{"frame_id": 1, "instances": []}]', "holds a recording"),
         (
             "9.json",
             '{"people": [{"pose_keypoints_2d": [1e300, 2, 3]}]}',
@@ -231,10 +230,11 @@ def test_bad_folders_are_named(tmp_path):
     ],
 )
 def test_a_bad_file_is_named(name, content, says, tmp_path):
-    write(tmp_path, [[person()]] * 3)
-    (tmp_path / name).write_text(content)
+    for view in ("a", "b"):
+        write(tmp_path / view, [[person()]] * 3, "{}.json")
+    (tmp_path / "a" / name).write_text(content)
     with pytest.raises(GhptDataError, match=says):
-        read_view(tmp_path)
+        read_key_points(tmp_path, **JOINTS)
 
 
 def test_the_real_recording(shared_data):

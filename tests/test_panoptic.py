@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 
 import real_layout as layout
-from ghpt.data.datasets.panoptic import COCO19, joints17, panoptic_files, panoptic_recordings
+from ghpt.data.datasets.panoptic import panoptic_files, panoptic_recordings
+from ghpt.data.datasets.panoptic_joints import COCO19, joints17
 from ghpt.data.datasets.store import write_store
+from ghpt.data.formats.skeletons import joints_of
 from ghpt.data.synthetic.rigs import panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.observations import LabelledRecording
@@ -19,6 +21,7 @@ from ghpt.skeleton import JOINT, JOINTS
 
 ALL = tuple(range(31))
 NAME = "010101_pose7"
+BODY_25 = joints_of("", "body_25")
 FRAMES = list(range(100, 120))
 
 
@@ -225,6 +228,46 @@ def test_the_authors_array_gives_the_same(root: Path, poses: np.ndarray) -> None
         read(root, "test", (12, 6))
 
 
+DIRECT = [name for name in JOINTS if name in BODY_25]
+"""The joints that BODY_25 has too."""
+
+
+def as_openpose(root: Path, views: dict[str, str]) -> None:
+    """Write the npz files' key points as OpenPose does, with a passer-by, and remove the npz."""
+    folder = root / NAME / "keypoints"
+    for camera, view in views.items():
+        arrays = np.load(folder / f"{camera}.npz")
+        (folder / view).mkdir()
+        for frame, points in zip(arrays["frame"], arrays["key_points"], strict=True):
+            values = np.zeros((len(BODY_25), 3))
+            for name in DIRECT:
+                values[BODY_25.index(name)] = (*points[JOINT[name]], 0.5)
+            other = values + (values[:, 2:] > 0) * (1500, 0, 0)
+            people = [{"pose_keypoints_2d": each.ravel().tolist()} for each in (other, values)]
+            path = folder / view / f"{view}_{frame:08d}_keypoints.json"
+            path.write_text(json.dumps({"version": 1.3, "people": people}), encoding="utf-8")
+    for file in folder.glob("*.npz"):
+        file.unlink()
+
+
+def test_a_detector_s_own_files_give_the_same(tmp_path: Path) -> None:
+    root, rig = tmp_path, panoptic_rig((3, 6, 10))
+    calibration = layout.panoptic_calibration(panoptic_rig(ALL))
+    person = layout.upright19() + np.random.default_rng(0).normal(0, 1, (len(FRAMES), 19, 3))
+    layout.write_panoptic_layout(root, NAME, calibration, rig, FRAMES, person, layout.perfect)
+    from_npz = read(root, "train")
+    as_openpose(root, {"00_03": "hd_00_03", "00_06": "hd_00_06", "00_10": "hd_00_10"})
+    recording = read(root, "train")
+    joints = [JOINT[name] for name in DIRECT]
+    assert recording.camera_names == ("00_10", "00_03")
+    assert recording.valid[..., joints].all()
+    assert np.abs(recording.key_points - from_npz.key_points)[..., joints, :].max() < 0.01
+    assert (recording.confidence[..., joints] == 0.5).all()
+    assert len(panoptic_files(root, (10, 3))) == 1 + 20 + 3 * 20
+    with pytest.raises(GhptDataError, match="there is no view 00_12 with a camera"):
+        read(root, "train", (10, 12))
+
+
 def test_files_are_those_read(root: Path) -> None:
     files = panoptic_files(root, (3, 12))
     assert len(files) == len(set(files)) == 1 + 20 + 2
@@ -275,7 +318,7 @@ BAD = {
     ),
     "no detections": (
         lambda root: (root / NAME / "keypoints").rename(root / "gone"),
-        "neither keypoints",
+        "neither keypoints/ nor",
     ),
     "no camera file": (
         lambda root: (root / NAME / "keypoints/00_03.npz").unlink(),

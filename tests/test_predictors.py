@@ -283,7 +283,7 @@ def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
     conf = Path(__file__).parents[1] / "conf"
     config, baselines = (
         yaml.safe_load((conf / name / "default.yaml").read_text())
-        for name in ("estimator", "baselines")
+        for name in ("predictor", "baselines")
     )
     estimator = build(baselines["adaptive_ransac"], "baselines.adaptive_ransac")
     scene = random_scene(9, frames=30, views=5).noisy(2, 0)
@@ -292,8 +292,8 @@ def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
     batch = replace(scene, key_points=off).batch()
     size = person_scale(scene.key_points, batch.valid).mean()
     for made in (
-        build(config["classical"], "estimator.classical")(estimator=estimator),
-        build(config["learned"], "estimator.learned")(view_weights=learned().view_weights),
+        build(config["classical"], "predictor.classical")(estimator=estimator),
+        build(config["learned"], "predictor.learned")(view_weights=learned().view_weights),
     ):
         assert made(batch).has_position.all()
         assert made.fitted(batch).uncertainty.noise == pytest.approx(float(2 / size), rel=0.3)

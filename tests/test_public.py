@@ -114,7 +114,7 @@ def test_shapes_that_do_not_fit_are_named(key_points, cameras, said):
 
 
 def test_a_predictor_takes_arrays_and_changes_of_settings(key_points):
-    poses = ghpt.Predictor(triangulation="linear", flips=False)(key_points, ARRAYS, rate_hz=50.0)
+    poses = ghpt.Predictor(estimator="linear", flips=False)(key_points, ARRAYS, rate_hz=50.0)
     assert poses.about.estimator == "linear"
     assert poses.about.rate_hz == 50
     assert ghpt.mpjpe(poses.points, TRUTH) < 5

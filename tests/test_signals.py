@@ -143,7 +143,7 @@ def predict_to(folder, patch):
     patch.setattr(prediction, "recording_sequence", lambda _: sequence_of(250))
     origin_of = {"ghpt": "0", "commit": "", "command": ""}
     patch.setattr(prediction, "provenance", lambda seed: origin_of | {"seed": seed})
-    settings = config("triangulation=linear", "shard_frames=50", "batch=25", "formats=[npz,csv]")
+    settings = config("estimator=linear", "shard_frames=50", "batch=25", "formats=[npz,csv]")
     prediction.predict(settings, folder)
 
 

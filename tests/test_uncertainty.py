@@ -128,9 +128,9 @@ def test_calibration_on_embedded_people_known_to_the_detector_and_not(split, ban
     """
     conf = Path(__file__).parents[1] / "conf"
     detector = Detector(**yaml.safe_load((conf / "detector/human36m.yaml").read_text()))
-    settings = yaml.safe_load((conf / "estimator/default.yaml").read_text())["classical"]
+    settings = yaml.safe_load((conf / "predictor/default.yaml").read_text())["classical"]
     estimator = yaml.safe_load((conf / "baselines/default.yaml").read_text())["adaptive_ransac"]
-    predictor = build(settings, "estimator.classical")(
+    predictor = build(settings, "predictor.classical")(
         estimator=build(estimator, "baselines.adaptive_ransac")
     )
     takes = list(islice(synthetic_recordings("h36m", split, 0, detector), 4))

@@ -9,7 +9,7 @@ configuration: nothing here has numbers of its own.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -44,13 +44,14 @@ from ghpt.metrics.relative_pose import (
     translation_error,
 )
 from ghpt.observations import Observations, PoseEstimate, Truth
-from ghpt.reconstruction import About, Reconstruction, State, concatenate
+from ghpt.reconstruction import About, Reconstruction, State
 from ghpt.skeleton import JOINTS
 
 if TYPE_CHECKING:
     from ghpt.calibration.findings import Finding
     from ghpt.commands.predict import PredictSettings
-    from ghpt.models.estimators.predictors import Classical, Learned
+    from ghpt.models.estimators.predictors import Classical, FrameSource
+    from ghpt.models.estimators.predictors import Predictor as FittablePredictor
 
 Rows = Int[np.ndarray, " N"]
 
@@ -120,18 +121,13 @@ def triangulate(key_points: Array, cameras: CamerasLike, confidence: Array | Non
     points = as_key_points(key_points, confidence, len(rig))
     names = tuple(f"joint_{joint}" for joint in range(points.valid.shape[-1]))
     defaults = _defaults("predict")
-    name = defaults["triangulation"]
-    group = defaults["estimator"]["classical"] | {"flips": None}
+    name = "adaptive_ransac"
+    group = defaults["predictor"]["classical"] | {"flips": None}
     baseline = build(defaults["baselines"][name], f"baselines.{name}")
-    predictor: Classical = build(group, "estimator.classical")(estimator=baseline)
+    predictor: Classical = build(group, "predictor.classical")(estimator=baseline)
     observations = _observe(points, rig)
-
-    def read(rows: Rows) -> Observations:
-        return observations.rows(torch.from_numpy(rows))
-
-    part = _estimate(
-        predictor, read, len(points), Chunks(defaults["fitted_frames"], defaults["batch"])
-    )
+    source = _ArraySource(np.arange(len(points)), None, observations)
+    part = _estimate(predictor, source, defaults["fitted_frames"], defaults["batch"])
     return Poses(_about(name, names, rig.names, None), part)
 
 
@@ -139,7 +135,7 @@ class Predictor:
     """Predicts 3D poses as predict.py does: robustly, with exchanged sides undone.
 
     Without a checkpoint the estimator is classical; with one that train.py wrote it is the trained
-    model. ``changes`` are settings of conf/predict.yaml, such as ``triangulation="linear"`` or
+    model. ``changes`` are settings of conf/predict.yaml, such as ``estimator="linear"`` or
     ``hypotheses=100``; ``trust`` names packages of your own whose classes the checkpoint uses.
     Raises GhptCheckpointError and GhptConfigError.
     """
@@ -179,9 +175,8 @@ class Predictor:
         sequence = resolve_unit(
             sequence, build(wanted.camera_check, "camera_check").consensus, ask=True
         )
-        chunks = Chunks(wanted.fitted_frames, wanted.batch)
         predictor = self.estimator.predictor.for_skeleton(sequence.skeleton)
-        part = _estimate(predictor, sequence.read, len(sequence), chunks)
+        part = _estimate(predictor, sequence, wanted.fitted_frames, wanted.batch)
         joints = joints_of(wanted, sequence.skeleton)
         names = sequence.cameras.names
         about = _about(self.estimator.name, joints.joints, names, sequence.rate_hz)
@@ -216,7 +211,7 @@ def calibrate_rig(
     sequence = person_sequence(people, rig, wanted.match, wanted.views, person=None)
     case = Case(sequence, "the given calibration", is_own=True)
     calibration = build(wanted.calibration, "calibration")
-    name = wanted.triangulation
+    name = wanted.estimator
     estimator = build(wanted.baselines[name], f"baselines.{name}")
     source = read_scale(wanted.scale, sequence.cameras.names)
     solution = solve_rig(case, calibration, estimator, source, wanted.seed)
@@ -303,13 +298,15 @@ def _defaults(command: str) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Chunks:
-    """How the frames of a recording are taken."""
+class _ArraySource:
+    """Observations in memory, as a recording whose frames are read."""
 
-    fitted_frames: int
-    """At most so many, evenly spread, give the recording's noise."""
-    batch: int
-    """Frames at a time."""
+    frame: Rows
+    rate_hz: float | None
+    observations: Observations
+
+    def read(self, rows: Rows) -> Observations:
+        return self.observations.rows(torch.from_numpy(rows))
 
 
 def default_settings(**changes: Any) -> PredictSettings:
@@ -320,19 +317,12 @@ def default_settings(**changes: Any) -> PredictSettings:
 
 
 def _estimate(
-    predictor: Classical | Learned,
-    read: Callable[[Rows], Observations],
-    count: int,
-    chunks: Chunks,
+    predictor: FittablePredictor, source: FrameSource, fitted_frames: int, batch: int
 ) -> Reconstruction:
-    """Return what the predictor makes of ``count`` frames."""
-    spread = np.linspace(0, count - 1, min(chunks.fitted_frames, count)).astype(np.int64)
-    fitted = predictor.fitted(read(np.unique(spread)))
-    parts = []
-    for start in range(0, count, chunks.batch):
-        rows = np.arange(start, min(start + chunks.batch, count))
-        parts.append(fitted(read(rows)))
-    return concatenate(parts)
+    """Return what the predictor makes of all frames."""
+    fitted = predictor.fit(source, fitted_frames)
+    rows = np.arange(len(source.frame))
+    return fitted.predict(source, rows, batch, torch.device("cpu"), lambda frames: None)
 
 
 def _observe(points: KeyPoints, rig: CameraSet) -> Observations:

@@ -89,9 +89,20 @@ class Reconstruction:
         """Joints that have a position."""
         return self.state <= State.FILLED
 
+    @property
+    def is_measured(self) -> Bool[Tensor, "T J"]:
+        """Joints that views made: observed, or supported. They have an error and a covariance."""
+        return self.state <= State.SUPPORTED
+
 
 _AXIS = (("points", 1), ("state", 1), ("error", 1), ("views", 2), ("covariance", 1))
 """The fields with a value for each joint, and the dimension that the joints are."""
+
+
+def select_frames(part: Reconstruction, rows: Int[Tensor, " N"]) -> Reconstruction:
+    """Return some of the frames, in this order."""
+    values = {field.name: getattr(part, field.name)[rows] for field in fields(Reconstruction)}
+    return Reconstruction(**values)
 
 
 def move_to_cpu(part: Reconstruction) -> Reconstruction:

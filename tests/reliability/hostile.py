@@ -8,6 +8,7 @@ as a crash or a hang of its own.
 import io
 import json
 import os
+import pickle
 import random
 import resource
 import signal
@@ -85,6 +86,72 @@ def coco(folder: Path) -> Path:
     return folder / "a.json"
 
 
+def results(folder: Path) -> Path:
+    """MMPose's result dict, a file for each camera."""
+    person = {"keypoints": BODY[:, :2].tolist(), "keypoint_scores": BODY[:, 2].tolist()}
+    for view in ("a", "b"):
+        content = {"visualization": [], "predictions": [[person], [person]]}
+        (folder / f"{view}.json").write_text(json.dumps(content))
+    return folder / "a.json"
+
+
+def easymocap(folder: Path) -> Path:
+    for view in ("a", "b"):
+        (folder / view).mkdir()
+        for frame in (1, 2):
+            annots = [{"personID": 0, "keypoints": BODY.tolist()}]
+            content = {"filename": f"images/{view}/{frame}.jpg", "annots": annots}
+            (folder / view / f"{frame:06d}.json").write_text(json.dumps(content))
+    return folder / "a" / "000001.json"
+
+
+def rtmlib(folder: Path) -> Path:
+    arrays = {"keypoints": [BODY[:, :2].tolist()], "scores": [BODY[:, 2].tolist()]}
+    for view in ("a", "b"):
+        frames = [{"frame_id": frame} | arrays for frame in (1, 2)]
+        (folder / f"{view}.json").write_text(json.dumps(frames))
+    return folder / "a.json"
+
+
+def yolo(folder: Path) -> Path:
+    share = BODY / [400, 400, 1]
+    line = "0 " + " ".join(f"{value:.6f}" for value in (0.5, 0.5, 0.2, 0.6, *share.ravel()))
+    for view in ("a", "b"):
+        (folder / view).mkdir()
+        for frame in (1, 2):
+            (folder / view / f"{view}_{frame}.txt").write_text(f"{line}\n{line}\n")
+    return folder / "a" / "a_1.txt"
+
+
+def sleap(folder: Path) -> Path:
+    import h5py
+
+    for view in ("a", "b"):
+        with h5py.File(folder / f"{view}.analysis.h5", "w") as file:
+            file["node_names"] = np.array(SKELETONS["coco_17"], "S")
+            points = np.broadcast_to(BODY[:, :2].T[None, ..., None], (1, 2, 17, 3))
+            file.create_dataset("tracks", data=points, compression="gzip")
+            file["point_scores"] = np.broadcast_to(BODY[None, :, 2:], (1, 17, 3))
+    return folder / "a.analysis.h5"
+
+
+def deeplabcut(folder: Path) -> Path:
+    import h5py
+
+    names = [("net", name, c) for name in SKELETONS["coco_17"] for c in ("x", "y", "likelihood")]
+    rows = np.zeros(3, [("index", "<i8"), ("values_block_0", "<f8", (51,))])
+    rows["index"] = np.arange(3)
+    rows["values_block_0"] = BODY.ravel()
+    for view in ("a", "b"):
+        with h5py.File(folder / f"{view}.h5", "w") as file:
+            group = file.create_group("df_with_missing")
+            group.attrs["pandas_type"] = np.bytes_(b"frame_table")
+            group["table"] = rows
+            kind = np.void(pickle.dumps(names, 0))
+            group["table"].attrs["values_block_0_kind"] = kind
+    return folder / "a.h5"
+
+
 def caliscope(folder: Path) -> Path:
     rows = [
         f"{t},{port},{t},0.5,{k},{x},{y},,"
@@ -147,6 +214,32 @@ def panoptic(folder: Path) -> Path:
     ]
     (folder / "calibration.json").write_text(json.dumps({"cameras": cameras}))
     return folder / "calibration.json"
+
+
+def fields(view: int) -> dict[str, Any]:
+    rig = panoptic_rig((1, 2))
+    return {
+        "intrinsicMat": rig.cameras.K[view].numpy(),
+        "distortion": rig.distortion[view].numpy(),
+        "imageSize": np.array([[1080.0], [1920.0]]),
+        "rotation": rig.cameras.R[view].numpy(),
+        "translation": rig.cameras.t[view].numpy()[:, None],
+    }
+
+
+def opencap(folder: Path) -> Path:
+    for view in (1, 0):
+        path = folder / f"{view}.pickle"
+        path.write_bytes(pickle.dumps(fields(view)))
+    return path
+
+
+def camera_json(folder: Path) -> Path:
+    for view in (1, 0):
+        path = folder / f"{view}.json"
+        values = {name: value.tolist() for name, value in fields(view).items()}
+        path.write_text(json.dumps({"convention": "opencv", "world2cam": True} | values))
+    return path
 
 
 def human36m(folder: Path) -> Path:
@@ -353,6 +446,12 @@ FORMATS: dict[str, Format] = {
     "openpose": Format(openpose, lambda folder: read_key_points(folder, "coco_17"), mutate_json),
     "mmpose": Format(mmpose, read_key_points, mutate_json),
     "coco": Format(coco, read_key_points, mutate_json),
+    "results": Format(results, lambda folder: read_key_points(folder, "coco_17"), mutate_json),
+    "easymocap": Format(easymocap, lambda folder: read_key_points(folder, "coco_17"), mutate_json),
+    "rtmlib": Format(rtmlib, lambda folder: read_key_points(folder, "coco_17"), mutate_json),
+    "yolo": Format(yolo, read_key_points, mutate_text),
+    "sleap": Format(sleap, read_key_points, mutate_records),
+    "deeplabcut": Format(deeplabcut, read_key_points, mutate_records),
     "caliscope": Format(caliscope, lambda folder: read_key_points(folder / "xy.csv"), mutate_text),
     "npz": Format(npz, lambda folder: read_key_points(folder / "points.npz"), mutate_npz),
     "npy": Format(npy, read_key_points, mutate_npy),
@@ -361,6 +460,8 @@ FORMATS: dict[str, Format] = {
     "panoptic": Format(
         panoptic, lambda folder: read_cameras(folder / "calibration.json"), mutate_json
     ),
+    "opencap": Format(opencap, read_cameras, mutate_records),
+    "camera_json": Format(camera_json, read_cameras, mutate_json),
     "human36m": Format(human36m, lambda folder: read_cameras(folder / "cameras.json"), mutate_json),
     "colmap": Format(colmap, lambda folder: read_cameras(folder, unit_mm=1), mutate_records),
 }
@@ -391,7 +492,7 @@ def part_of(found: Any, whole: Any) -> bool:
         return all(
             one[name] is None or np.array_equal(one[name], other[name])
             for name in one
-            if name != "unit_known"
+            if name not in ("unit_known", "unposed")
         )
     if not {*one["views"]} <= {*other["views"]} or one["joints"] != other["joints"]:
         return False

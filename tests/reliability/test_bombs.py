@@ -4,6 +4,7 @@ All are read in one child of its own process, forked for each bomb (``hostile.fo
 """
 
 import json
+import pickle
 import resource
 import shutil
 import struct
@@ -187,6 +188,8 @@ def written(text: str | bytes) -> Callable[[Path], None]:
 
 Bomb = tuple[str, Callable[[Path], Any], Callable[[Path], Any]]
 DEEP, LONG = "[" * 200_000, "9" * 2_000_000
+PICKLED = pickle.dumps({"intrinsicMat": np.zeros(3)}, 2)
+"""With the shape (3,) as the bytes K 3 of a tuple of one."""
 CALISCOPE = b"sync_index,port,point_id,img_loc_x,img_loc_y\n"
 OF_COCO = '[{"image_id": 1, "keypoints": ['
 BOMBS: dict[str, Bomb] = {
@@ -330,6 +333,16 @@ BOMBS: dict[str, Bomb] = {
         "o",
         colmap_of_many_images,
         lambda path: read_cameras(path, unit_mm=1),
+    ),
+    "a pickled camera of 1e9 elements": (
+        "c.pickle",
+        written(PICKLED.replace(b"K\x03\x85", b"J\x00\xca\x9a\x3b\x85")),
+        read_cameras,
+    ),
+    "a pickled camera of 1 GB": (
+        "c.pickle",
+        lambda path: sparse(path, b"\x80\x04", 1 << 30),
+        read_cameras,
     ),
     "labels with a dtype of 1e9 elements": ("labels.npy", labels_1e9, read_labels),
     "labels that declare 1e12 elements": (

@@ -19,6 +19,7 @@ import pytest
 import real_layout as layout
 from auditing import watch
 from ghpt.data.datasets.labels import read_labels
+from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.validate import read_npy, read_npz
 from ghpt.errors import GhptDataError
 
@@ -145,6 +146,20 @@ def test_labels_run_nothing(tmp_path: Path, record_row: Callable[..., None]) -> 
         len(refused),
         len(cases),
     )
+    assert refused == list(cases)
+
+
+def test_a_pickled_camera_runs_nothing(tmp_path: Path, record_row: Callable[..., None]) -> None:
+    sentinel, file = tmp_path / "sentinel", tmp_path / "camera.pickle"
+    codecs.lookup("raw_unicode_escape")
+    refused, cases = [], payloads(sentinel)
+    for name, pickled in cases.items():
+        file.write_bytes(pickled)
+        with watch(WATCHED) as valid, pytest.raises(GhptDataError) as caught:
+            read_cameras(file)
+        if not sentinel.exists() and not valid and str(file) in str(caught.value):
+            refused.append(name)
+    record_row("A5", "pickled cameras: none run, all refused", len(refused), len(cases))
     assert refused == list(cases)
 
 

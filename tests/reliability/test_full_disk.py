@@ -73,7 +73,7 @@ def test_command(typed, conf, tmp_path, train_command, blank_figures):
 def predict_command(typed, tmp_path, monkeypatch):
     monkeypatch.setattr(prediction, "recording_sequence", lambda _: sequence_of(400))
     words = (
-        "triangulation=linear",
+        "estimator=linear",
         "shard_frames=100",
         "formats=[npz,csv]",
         "evaluated_frames=4",

@@ -17,6 +17,10 @@ FORMATS = (
     "openpose",
     "mmpose",
     "coco",
+    "results",
+    "easymocap",
+    "rtmlib",
+    "yolo",
     "caliscope",
     "npz",
     "npy",
@@ -25,7 +29,14 @@ FORMATS = (
     "panoptic",
     "human36m",
     "colmap",
+    "opencap",
+    "camera_json",
 )
+HDF5 = ("sleap", "deeplabcut")
+"""Read by h5py, which is an extra."""
+GROUPS = (FORMATS[:8], FORMATS[8:12], FORMATS[12:])
+TABLES = ("caliscope", "toml", "yaml", "yolo")
+"""Cut between two lines they are whole, and shorter."""
 
 
 def measured(row, formats, count, seed):
@@ -36,8 +47,10 @@ def of_all(found, *outcomes):
     return sum(form["outcomes"].get(outcome, 0) for form in found.values() for outcome in outcomes)
 
 
-@pytest.mark.parametrize("formats", [FORMATS[:4], FORMATS[4:8], FORMATS[8:]], ids="-".join)
+@pytest.mark.parametrize("formats", [*GROUPS, HDF5], ids="-".join)
 def test_a_mutated_file_is_read_or_named(formats, record_row):
+    if formats is HDF5:
+        pytest.importorskip("h5py")
     found = measured("A1", formats, sizes.MUTATED_FILES, 0)
     for name, form in found.items():
         bad = {kind: n for kind, n in form["outcomes"].items() if kind in ("crash", "hang", "leak")}
@@ -64,18 +77,18 @@ def test_our_own_key_points_never_come_back_different(record_row):
     assert of_all(found, "same") > 0  # some bytes, such as dates, mean nothing
 
 
-@pytest.mark.parametrize("formats", [FORMATS[:4], FORMATS[4:]], ids="-".join)
+@pytest.mark.parametrize("formats", [*GROUPS, HDF5], ids="-".join)
 def test_a_file_that_ends_early_is_named(formats, record_row):
     """Cut at bytes all over the file, every one at night. Tables and texts that end between two
     lines are shorter recordings or rigs without poses; nothing that is read is any other than in
     the whole file.
     """
+    if formats is HDF5:
+        pytest.importorskip("h5py")
     found = measured("A3", formats, sizes.CUT_FILES, 0)
     for name, form in found.items():
-        accepted = form["outcomes"].get("part", 0) if name in ("caliscope", "toml", "yaml") else 0
-        spaces = (
-            12 if name in ("toml", "yaml", "caliscope") else 0
-        )  # the whole without what ends it
+        accepted = form["outcomes"].get("part", 0) if name in TABLES else 0
+        spaces = 12 if name in TABLES else 0  # the whole without what ends it
         bad = form["total"] - form["outcomes"]["named"] - accepted
         record_row(
             "A3",

@@ -70,7 +70,7 @@ def test_b3_killed_predictions_end_in_the_same_bytes(tmp_path, record_row, monke
         command, "provenance", lambda seed: {"ghpt": "0", "commit": "", "seed": seed, "command": ""}
     )
     settings = config(
-        "triangulation=linear", f"shard_frames={shard}", "batch=100", "formats=[npz,csv,trc]"
+        "estimator=linear", f"shard_frames={shard}", "batch=100", "formats=[npz,csv,trc]"
     )
     started = time.perf_counter()
     assert forked(tmp_path / "whole", frames, settings)

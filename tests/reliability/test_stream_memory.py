@@ -26,7 +26,7 @@ def child(output: str, frames: int) -> None:
 
     run.Shards.write = measured
     command.recording_sequence = lambda _: sequence_of(frames)
-    words = ("triangulation=linear", "shard_frames=2000", "batch=1000", "formats=[npz,csv]")
+    words = ("estimator=linear", "shard_frames=2000", "batch=1000", "formats=[npz,csv]")
     command.predict(config(*words), Path(output))
     third = len(held) // 3
     print("figures", max(held[-third:]) - max(held[third:-third]), memory.peak_memory())

@@ -21,7 +21,7 @@ from ghpt.reconstruction import State
 from predicting import cameras_file, config, openpose_folders, walk, write_people
 
 FRAMES = list(range(3, 15))
-WORDS = ("skeleton=human36m", "triangulation=linear", "formats=[npz]", "rate_hz=50")
+WORDS = ("skeleton=human36m", "estimator=linear", "formats=[npz]", "rate_hz=50")
 PIXELS = project(human36m_rig("S9").cameras, walk())[0]
 Case = Callable[[Path], None]
 

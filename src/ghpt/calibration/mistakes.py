@@ -250,6 +250,10 @@ def _mirror(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     return replace(setup, mirrored=_toggle(setup.mirrored, views))
 
 
+def _turn(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
+    return setup.turned(views, round(value))
+
+
 def _mirror_and_exchange_sides(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
     return _mirror(_exchange_sides(setup, views, value), views, value)
 
@@ -267,6 +271,16 @@ LENS = Mistake(
     undo=_set_lens,
     values=RADIAL,
     fitted=True,
+)
+IMAGE_TURNED = Mistake(
+    "image_turned",
+    "key points of {camera} are of images turned by {value:g} degrees (clockwise) against the "
+    "calibration's",
+    "give the cameras of the turned images, which cameras.py writes, or detect again in images "
+    "that are turned back",
+    undo=_turn,
+    values=(90, 180, 270),
+    needs_extrinsics=False,
 )
 UNIT_OF_ONE = Mistake(
     "unit",
@@ -316,6 +330,7 @@ MISTAKES = (
         values=RESOLUTIONS,
         needs_extrinsics=False,
     ),
+    IMAGE_TURNED,
     ALREADY_UNDISTORTED,
     LENS,
     Mistake(
@@ -358,6 +373,12 @@ FRAME_RATE = Mistake(
     "frame_rate",
     "{camera} has another frame rate: {value:.3g} of its frames go with one of the others'",
     "take those of the others' moments (frame numbers must be of one clock)",
+)
+TIME_UNKNOWN = Mistake(
+    "time_unknown",
+    "when the frames of {cameras} were taken cannot be told from the people in view",
+    "let somebody walk and turn before all cameras, or clap",
+    Severity.WARNING,
 )
 MOVED = Mistake(
     "moved",

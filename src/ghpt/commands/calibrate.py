@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.calibration.check.evidence import gather
+from ghpt.calibration.check.recording_time import unknown_time
 from ghpt.calibration.check.setup import setup_of
 from ghpt.calibration.comparison import (
     align,
@@ -31,6 +32,7 @@ from ghpt.calibration.millimetres import (
 )
 from ghpt.calibration.mistakes import SEVERAL_PEOPLE
 from ghpt.calibration.rig import RigCalibration, RigEstimate
+from ghpt.calibration.time.uncalibrated import UncalibratedShifts
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
@@ -43,8 +45,10 @@ from ghpt.commands.inputs import (
     resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
+from ghpt.commands.time import calibrate_sequence, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.detections import Detections
+from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
@@ -82,16 +86,17 @@ class CalibrateSettings(InputSettings):
     calibration: Target
     baselines: dict[str, Target]
     camera_check: Target
-    triangulation: str
+    estimator: str
+    start_times: Target
     evaluated_frames: int
     seed: int
 
     def __post_init__(self) -> None:
         frames = self.evaluated_frames
         check(frames >= 1, "evaluated_frames", f"is {frames}", "Give 1 or more.")
-        name = self.triangulation
+        name = self.estimator
         hint = suggest(name, self.baselines)
-        check(name in self.baselines, "triangulation", f"is {name!r}", hint)
+        check(name in self.baselines, "estimator", f"is {name!r}", hint)
 
 
 @dataclass(frozen=True)
@@ -175,10 +180,10 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     are none. Returns what calibration.json holds.
     """
     calibration: RigCalibration = build(settings.calibration, "calibration")
-    name = settings.triangulation
+    name = settings.estimator
     estimator: Estimator = build(settings.baselines[name], f"baselines.{name}")
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
-    case = open_case(settings, estimator)
+    case = in_one_time(settings, open_case(settings, estimator), calibration, camera_check)
     cameras = case.sequence.cameras
     source = read_scale(settings.scale, cameras.names)
     sweep_temporaries(output)
@@ -208,7 +213,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         scale=scale,
         world=solution.world,
         reference=None if reference is None else case.reference,
-        triangulation=settings.triangulation,
+        triangulation=settings.estimator,
         converged=estimate.converged,
         usable=tuple(cameras.names[view] for view in usable),
         cameras=calibrated_cameras(estimate, change, cameras),
@@ -244,7 +249,7 @@ def solve_rig(
     seed: int,
 ) -> RigSolution:
     """Return the rig that a recording shows, with the length that ``source`` gives it."""
-    estimate = _estimate(calibration, case.sequence, seed)
+    estimate = calibrate_sequence(calibration, case.sequence, seed)
     placed = _placed_views(estimate)
 
     def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
@@ -295,6 +300,25 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     return Case(sequence, "the file's own calibration", is_own=True, notes=notes)
 
 
+def in_one_time(
+    settings: CalibrateSettings, case: Case, calibration: RigCalibration, camera_check: CameraCheck
+) -> Case:
+    """Return the case with all views in one time, and the clock in its cameras."""
+    sequence = case.sequence
+    cameras = sequence.cameras
+    notes = case.notes
+    if settings.time == "estimate":
+        starts: UncalibratedShifts = build(settings.start_times, "start_times")
+        found = time_of_rig(sequence, calibration, starts, camera_check.time, settings.seed)
+        log_time(cameras.names, found)
+        notes += unknown_time(cameras.names, found)
+        clock = found.clock
+    else:
+        clock = clock_of(settings.time, sequence, camera_check.time)
+    timed = replace(retime(sequence, clock), cameras=replace(cameras, clock=clock))
+    return replace(case, sequence=timed, notes=notes)
+
+
 def people_findings(people: Detections) -> tuple[Finding, ...]:
     """Return a warning where one of several people was followed."""
     crowded = people.crowded_frames()
@@ -316,20 +340,6 @@ def usable_cameras(estimate: RigEstimate) -> Bool[Tensor, " V"]:
             views = [estimate.names.index(name) for name in found.cameras]
             usable[views or slice(None)] = False
     return usable if int(usable.sum()) >= 2 else torch.zeros_like(usable)
-
-
-def _estimate(calibration: RigCalibration, sequence: Sequence, seed: int) -> RigEstimate:
-    points = sequence.undistorted()
-    cameras = sequence.cameras
-    return calibration(
-        cameras.names,
-        cameras.K,
-        torch.from_numpy(points.pixels).double(),
-        torch.from_numpy(points.confidence).double(),
-        torch.from_numpy(points.valid),
-        cameras.size,
-        seed,
-    )
 
 
 def _placed_views(estimate: RigEstimate) -> list[int]:

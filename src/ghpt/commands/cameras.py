@@ -17,7 +17,9 @@ from ghpt.calibration.check.breakages import Case as SpoiltCase
 from ghpt.calibration.check.camera_check import CameraCheck, CameraCheckResult
 from ghpt.calibration.check.evidence import Evidence, choose, gather
 from ghpt.calibration.check.mended_files import MENDED, write_mended
+from ghpt.calibration.check.recording_time import in_one_time
 from ghpt.calibration.check.setup import Setup, setup_of
+from ghpt.calibration.findings import Finding
 from ghpt.commands.app import Command
 from ghpt.commands.calibrate import people_findings
 from ghpt.commands.catalogue import run_by_name
@@ -30,7 +32,9 @@ from ghpt.commands.inputs import (
     own_sequence,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
+from ghpt.commands.time import clock_of
 from ghpt.config import Target, build, suggest
+from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError, check
@@ -79,7 +83,11 @@ class Subject:
     cameras: CameraSet
     setup: Setup
     sequence: Sequence | None
-    """The user's key points; None for a demonstration."""
+    """The user's key points, in one time; None for a demonstration."""
+    time: tuple[Finding, ...] = ()
+    """What was wrong with their time."""
+    given_px: tuple[float, ...] = ()
+    """The held-out error of each view before that was undone; empty where nothing was."""
 
 
 def files(settings: CamerasSettings) -> Files:
@@ -104,9 +112,9 @@ def check_cameras(settings: CamerasSettings, output: Path) -> CameraReport:
         remove(output / name)
     result = camera_check(subject.evidence, subject.setup)
     report = _report(subject, result, settings.seed)
-    mended = any(finding.mended for finding in result.findings)
+    mended = any(finding.mended for finding in report.findings)
     if mended:
-        write_mended(output, subject.cameras, result, subject.sequence)
+        write_mended(output, subject.cameras, result, subject.sequence, subject.time)
     write_json(output / "cameras.json", report.plain())
     write_markdown(output / "report.md", camera_check_document(report))
     print_document(camera_check_summary(report))
@@ -131,7 +139,9 @@ def own_subject(settings: CamerasSettings, camera_check: CameraCheck) -> Subject
     cameras = own_cameras(settings, "Calib.toml")
     people = own_people(settings)
     sequence = own_sequence(settings, people, cameras, person=None, check_sizes=False)
-    evidence = gather(sequence, camera_check.frames, camera_check.shift)
+    clock = clock_of(settings.time, sequence, camera_check.time)
+    timed = in_one_time(retime(sequence, clock), camera_check)
+    evidence = gather(timed.sequence, camera_check.frames, camera_check.shift)
     for finding in people_findings(people):
         _log.warning(finding.text)
     key_points = Path(str(settings.keypoints)).resolve().name
@@ -141,7 +151,9 @@ def own_subject(settings: CamerasSettings, camera_check: CameraCheck) -> Subject
         evidence=evidence,
         cameras=sequence.cameras,
         setup=setup_of(sequence.cameras),
-        sequence=sequence,
+        sequence=timed.sequence,
+        time=timed.findings,
+        given_px=timed.given_px,
     )
 
 
@@ -185,7 +197,7 @@ def synthetic_evidence(
 
 
 def _report(subject: Subject, result: CameraCheckResult, seed: int) -> CameraReport:
-    given = result.given_px.tolist()
+    given = subject.given_px or result.given_px.tolist()
     mended = result.error_px.tolist()
     names = subject.evidence.names
     cameras = [CheckedCamera(*each) for each in zip(names, given, mended, strict=True)]
@@ -195,7 +207,7 @@ def _report(subject: Subject, result: CameraCheckResult, seed: int) -> CameraRep
         frames=len(subject.evidence.frame),
         stature_mm=result.stature or None,
         unit_mm=result.unit_mm,
-        findings=result.findings,
+        findings=(*subject.time, *result.findings),
         cameras=tuple(cameras),
         provenance=provenance(seed),
     )

@@ -46,7 +46,10 @@ class InputSettings(OutputSettings):
     match: dict[Name, Name] | None
     skeleton: str | None
     format: str | None
+    session: Name
+    least_confidence: float
     rate_hz: float | None
+    time: str
     recording: str | None
     data: Target
 
@@ -66,7 +69,14 @@ def own_cameras(inputs: InputSettings, example: str) -> CameraSet:
 
 def own_people(inputs: InputSettings) -> Detections:
     """Return everybody in the user's key points."""
-    return read_key_points(_required_path(inputs), inputs.skeleton, inputs.rate_hz, inputs.format)
+    return read_key_points(
+        _required_path(inputs),
+        inputs.skeleton,
+        inputs.rate_hz,
+        inputs.format,
+        inputs.session,
+        inputs.least_confidence,
+    )
 
 
 def own_sequence(

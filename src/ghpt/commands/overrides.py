@@ -24,6 +24,9 @@ _SWEEP = {"-m", "--multirun"}
 _FORMER_NAMES = {
     "doctor": "camera_check",
     "swaps": "flips",
+    "triangulation": "estimator",
+    "estimator.classical": "predictor.classical",
+    "estimator.learned": "predictor.learned",
     "model.spread": "model.logit_std_cap",
 }
 """Settings by the names that scripts written for earlier versions give."""

@@ -20,7 +20,6 @@ from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
-    own_detector_sequence,
     own_people,
     own_title,
     recording_sequence,
@@ -28,22 +27,22 @@ from ghpt.commands.inputs import (
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
-from ghpt.commands.prediction.gaps import Gaps, apply_gaps, gap_frames
+from ghpt.commands.prediction.gaps import OWN, Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
 from ghpt.commands.prediction.report import report_document, summary_document, verdict_document
 from ghpt.commands.prediction.result import PredictionResult
 from ghpt.commands.prediction.run import RunSettings, predict_shards
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.prediction.statistics import (
-    Estimate,
     Evaluation,
     evaluate,
     measure_coverage,
-    pose_estimate,
 )
 from ghpt.commands.prediction.verdict import Judge, Level, Measures
 from ghpt.commands.prediction.world import World, choose_world
+from ghpt.commands.time import clock_of, person_in_one_time
 from ghpt.config import Target, build, suggest
+from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
@@ -54,7 +53,7 @@ from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.joint_means import JointMeans, all_joints, human_joints
-from ghpt.models.estimators.predictors import Classical, Learned
+from ghpt.models.estimators.predictors import Classical, Estimate, Learned, Predictor
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, Reconstruction
@@ -73,12 +72,19 @@ _NOT_OF_SHARDS = ("command", "seed")
 _log = logging.getLogger(__name__)
 
 
+TRAJECTORY = "trajectory"
+"""The estimator of all frames together."""
+_ALIASES = {"frame": "adaptive_ransac"}
+"""Other names of baselines."""
+
+
 @dataclass(frozen=True)
-class EstimatorSettings:
-    """How key points become joints, without a checkpoint and with one."""
+class PredictorSettings:
+    """How key points become joints: frame by frame, by a checkpoint's model, or together."""
 
     classical: Target
     learned: Target
+    trajectory: Target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -90,9 +96,9 @@ class PredictSettings(InputSettings):
     ckpt: str | None
     trust: list[str]
     hypotheses: int | None
-    triangulation: str
+    estimator: str
     fill: int | str | None
-    interpolation: str
+    interpolation: str | None
     smooth: float | None
     formats: list[str] | None
     trc: dict[str, Any]
@@ -107,7 +113,7 @@ class PredictSettings(InputSettings):
     baselines: dict[str, Target]
     trainer: dict[str, Any]
     flips: bool
-    estimator: EstimatorSettings
+    predictor: PredictorSettings
     view_weights: Target
     fitted_frames: int
     camera_check: Target
@@ -120,7 +126,8 @@ class PredictSettings(InputSettings):
             count = getattr(self, name)
             check(count >= 1, name, f"is {count}", "Give 1 or more.")
         if not self.ckpt:
-            _check_exists("triangulation", self.triangulation, self.baselines)
+            names = (TRAJECTORY, *_ALIASES, *self.baselines)
+            _check_exists("estimator", self.estimator, dict.fromkeys(names))
         for name in self.compare:
             _check_exists("compare", name, self.baselines)
         for name in self.formats or ():
@@ -138,7 +145,7 @@ class PoseEstimator:
     name: str
     text: str
     """In words, for people."""
-    predictor: Classical | Learned
+    predictor: Predictor
     flips: LeftRightFlips | None
     weights: torch.nn.Module | None
     identity: dict[str, Any]
@@ -173,7 +180,7 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     sequence = open_sequence(settings, camera_check)
     gaps = Gaps(
         longest=gap_frames(settings.fill, sequence.rate_hz),
-        interpolation=settings.interpolation,
+        interpolation=settings.interpolation or _interpolation(estimator),
         cut_off_hz=settings.smooth,
         rate_hz=sequence.rate_hz,
     )
@@ -268,10 +275,12 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
     """
     if settings.ckpt:
         return _learned_estimator(settings, settings.ckpt)
-    name = settings.triangulation
-    group = _with_flips(settings, settings.estimator.classical)
+    name = _ALIASES.get(settings.estimator, settings.estimator)
+    if name == TRAJECTORY:
+        return _trajectory(settings)
+    group = _with_flips(settings, settings.predictor.classical)
     baseline = settings.baselines[name]
-    factory = build(group, "estimator.classical")
+    factory = build(group, "predictor.classical")
     predictor: Classical = factory(estimator=build(baseline, f"baselines.{name}"))
     shown = NAMES.get(name, name.replace("_", " "))
     return PoseEstimator(
@@ -284,6 +293,24 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
     )
 
 
+def _trajectory(settings: PredictSettings) -> PoseEstimator:
+    group = dict(settings.predictor.trajectory)
+    if not settings.flips:
+        trajectory = dict(group["trajectory"])
+        group["trajectory"] = trajectory | {
+            "solver": dict(trajectory["solver"]) | {"exchange": None}
+        }
+    flips: LeftRightFlips | None = build(settings.predictor.classical["flips"], "flips")
+    return PoseEstimator(
+        name=TRAJECTORY,
+        text="the trajectory of the whole recording (no ckpt was given)",
+        predictor=build(group, "predictor.trajectory"),
+        flips=flips if settings.flips else None,
+        weights=None,
+        identity=group,
+    )
+
+
 def _learned_estimator(settings: PredictSettings, ckpt: str) -> PoseEstimator:
     changes = {"hypotheses": settings.hypotheses, "seed": settings.seed}
     model, trained = load_model(ckpt, settings.trust, **changes)
@@ -291,8 +318,8 @@ def _learned_estimator(settings: PredictSettings, ckpt: str) -> PoseEstimator:
         problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
         raise GhptCheckpointError(ckpt, problem, "Give one that train.py model=pose wrote.")
     view_weights = build(settings.view_weights, "view_weights")(model)
-    group = _with_flips(settings, settings.estimator.learned)
-    predictor: Learned = build(group, "estimator.learned")(view_weights=view_weights)
+    group = _with_flips(settings, settings.predictor.learned)
+    predictor: Learned = build(group, "predictor.learned")(view_weights=view_weights)
     data = trained["provenance"].get("data", "unknown")
     return PoseEstimator(
         name="view_weights",
@@ -318,7 +345,8 @@ def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Seque
     """Return what is predicted: the user's own key points, or a recording of the data set."""
     if not settings.keypoints:
         return recording_sequence(settings)
-    sequence = needed_key_points(settings, _files_sequence(settings))
+    found = _files_sequence(settings, camera_check)
+    sequence = needed_key_points(settings, found)
     sequence.cameras.check_calibrated(sequence.source)
     return resolve_unit(sequence, camera_check.consensus, ask=True)
 
@@ -337,17 +365,19 @@ def needed_key_points(settings: PredictSettings, sequence: Sequence) -> Sequence
     return sequence.select_key_points(parts.tolist())
 
 
-def _files_sequence(settings: PredictSettings) -> Sequence:
+def _files_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Sequence:
     cameras = own_cameras(settings, "Calib.toml")
     cameras.check_calibrated(str(settings.cameras))
-    if settings.format in (None, "npz"):
+    if settings.format in (None, "npz") and settings.session is None:
         path = str(settings.keypoints)
-        stored = open_stored(path, settings.skeleton, settings.rate_hz)
+        least = settings.least_confidence
+        stored = open_stored(path, settings.skeleton, settings.rate_hz, least)
         if stored is not None:
             title = own_title(settings)
-            return stored_sequence(stored, cameras, settings.match, settings.views, title)
+            sequence = stored_sequence(stored, cameras, settings.match, settings.views, title)
+            return retime(sequence, clock_of(settings.time, sequence, camera_check.time))
     people = own_people(settings)
-    sequence = own_detector_sequence(settings, people, cameras, settings.person)
+    sequence = person_in_one_time(settings, people, cameras, settings.person, camera_check.time)
     crowded = people.crowded_frames()
     if crowded:
         words = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
@@ -355,6 +385,10 @@ def _files_sequence(settings: PredictSettings) -> Sequence:
             "Several people are in %s: person %d is followed (person=).", words, settings.person
         )
     return sequence
+
+
+def _interpolation(estimator: PoseEstimator) -> str:
+    return OWN if estimator.name == TRAJECTORY else "pchip"
 
 
 def _mapped(chunks: Chunks, function: Callable[[Reconstruction], Reconstruction]) -> Chunks:
@@ -374,12 +408,10 @@ def joints_of(settings: PredictSettings, skeleton: Skeleton) -> JointMeans:
     return human_joints(skeleton) if settings.joints == "human36m" else all_joints(skeleton)
 
 
-def _fitted(
-    estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings
-) -> Classical | Learned:
-    """Return the predictor for a sequence's key points, with their noise."""
-    sample = sequence.read(sequence.spread(settings.fitted_frames))
-    return estimator.predictor.for_skeleton(sequence.skeleton).fitted(sample)
+def _fitted(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:
+    """Return the predictor for a sequence's key points, with what they tell of the recording."""
+    predictor = estimator.predictor.for_skeleton(sequence.skeleton)
+    return predictor.fit(sequence, settings.fitted_frames)
 
 
 def _evaluate(
@@ -391,12 +423,12 @@ def _evaluate(
     """Return what the estimators are worth on the 17 joints, or on all key points without them."""
     judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
     sample = judged.read(judged.spread(settings.fitted_frames))
-    own = _fitted(estimator, judged, settings).rejecting_nothing()
-    estimates: dict[str, Estimate] = {estimator.name: pose_estimate(own)}
+    own = _fitted(estimator, judged, settings)
+    estimates: dict[str, Estimate] = {estimator.name: own.estimate}
     for name, other in compared.items():
         estimates.setdefault(name, other.fitted(sample))
     flips = estimator.flips and estimator.flips.for_skeleton(judged.skeleton)
-    return evaluate(judged, flips, estimates, settings.evaluated_frames, settings.batch)
+    return evaluate(judged, flips, estimates, settings.evaluated_frames)
 
 
 def _about(

@@ -11,6 +11,7 @@ from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
 from ghpt.commands.lost import told
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
+from ghpt.commands.people import PeopleResult, is_of_people, test_people
 from ghpt.commands.trainer import make_trainer, progress
 from ghpt.config import Target, build
 from ghpt.errors import GhptCheckpointError
@@ -78,12 +79,23 @@ def files(settings: TestSettings) -> Files:
     return Files(input_paths(settings.ckpt, root), names, growing=(".predictions",))
 
 
-def test(settings: TestSettings, output: Path) -> TestResult | None:
+def test(settings: TestSettings, output: Path) -> TestResult | PeopleResult | None:
     """Test a checkpoint on a data set, and show the result.
 
     Writes predictions.npz, metrics.json, report.md and TensorBoard events into ``output`` and
-    prints the table. Returns None on all processes but the first.
+    prints the table. Returns None on all processes but the first. Data of several people are
+    another test: see `test_people`.
     """
+    if is_of_people(settings.data):
+        return test_people(
+            settings.data,
+            settings.baselines,
+            settings.trainer,
+            settings.ckpt,
+            settings.seed,
+            settings.progress_bar,
+            output,
+        )
     result = measure(settings, output)
     if result is None:
         return None
@@ -150,10 +162,12 @@ def measure(settings: TestSettings, output: Path) -> TestResult | None:
     return TestResult(problem, predictions, metrics)
 
 
-def summary(result: TestResult | None) -> str:
+def summary(result: TestResult | PeopleResult | None) -> str:
     """Return the result in one line."""
     if result is None:
         return ""
+    if isinstance(result, PeopleResult):
+        return result.words
     error = NONE if result.error is None else f"{result.error:.1f} mm"
     return f"{title(result.metrics)}: {error}"
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+
+from ghpt.errors import check
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,16 @@ class KeyPoints:
         pixels = _take(self.pixels, chosen)
         confidence = _take(self.confidence, chosen)
         return KeyPoints(pixels, confidence, _take(self.valid, chosen))
+
+    def above(self, least_confidence: float) -> KeyPoints:
+        """Return the key points, of which those below this confidence are not valid.
+
+        Raises GhptConfigError for a limit outside of [0, 1].
+        """
+        problem = f"is {least_confidence:g}"
+        hint = "Give a confidence from 0 (all key points) to 1."
+        check(0 <= least_confidence <= 1, "least_confidence", problem, hint)
+        return replace(self, valid=self.valid & (self.confidence >= least_confidence))
 
     @staticmethod
     def stack(views: Sequence[KeyPoints]) -> KeyPoints:

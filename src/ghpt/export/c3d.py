@@ -21,7 +21,7 @@ from ghpt.export.stream import (
 )
 from ghpt.files import atomic_write
 from ghpt.geometry.masking import where
-from ghpt.reconstruction import About, Reconstruction, State
+from ghpt.reconstruction import About, Reconstruction
 
 _BLOCK = 512
 _MOST = 65_535
@@ -97,7 +97,7 @@ def _points(about: About, piece: Reconstruction) -> np.ndarray:
     The word has the mask of cameras in the high byte and the residual in the low one.
     """
     has_position = piece.has_position
-    observed = piece.state == State.OBSERVED
+    observed = piece.is_measured
     bits = 2 ** torch.arange(min(_CAMERAS, piece.views.shape[1]))
     mask = (piece.views[:, :_CAMERAS] * bits[:, None]).sum(1)
     steps = (piece.error / RESIDUAL_STEP).round().nan_to_num(255.0)

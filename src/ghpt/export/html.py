@@ -28,7 +28,7 @@ from ghpt.export.scene import (
 from ghpt.export.stream import Chunks, extent, local_points, pieces
 from ghpt.files import atomic_write
 from ghpt.geometry.masking import where
-from ghpt.reconstruction import About, Reconstruction, State
+from ghpt.reconstruction import About, Reconstruction
 
 MOST_FRAMES = 6000
 """A page holds no more: 2.5 MB. Of longer recordings it has every n-th frame, and says so."""
@@ -99,7 +99,7 @@ def _resource(name: str) -> str:
 
 
 def _select_frames(about: About, piece: Reconstruction, rows: slice) -> _Frames:
-    observed = (piece.state == State.OBSERVED)[rows]
+    observed = piece.is_measured[rows]
     total = torch.where(observed, piece.error[rows], 0.0).sum(1)
     count = observed.sum(1)
     mean = torch.where(count > 0, total / count.clamp(min=1), torch.nan)

@@ -23,9 +23,11 @@ from ghpt.geometry.masking import where
 from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
 from ghpt.skeleton import HUMAN36M, NamePair
 
-FORMAT_VERSION = 2
-_POINTS = {1: "<f4", 2: "<f8"}
+FORMAT_VERSION = 3
+_POINTS = {1: "<f4", 2: "<f8", 3: "<f8"}
 """How each version that is read stores positions; the first had few digits far from the zero."""
+_WITH_SUPPORTED = 3
+"""The first version that has the state SUPPORTED, as number 1; before, the others had one less."""
 _HINT = "Predict this recording again, or copy the file again"
 _FORMAT = "ghpt reconstruction"
 
@@ -132,7 +134,7 @@ def write_npz(path: Path, about: About, chunks: Chunks) -> None:
 def _mask_missing(piece: Reconstruction) -> Reconstruction:
     """Return the frames on the CPU, with NaN for what is not known."""
     piece = Reconstruction(**{name: value.cpu() for name, value in vars(piece).items()})
-    observed = piece.state == State.OBSERVED
+    observed = piece.is_measured
     return replace(
         piece,
         points=where(piece.has_position, piece.points, torch.nan),
@@ -201,6 +203,10 @@ class _File:
             values = read_rows(self.path, self.members[array.name], start, stop)
             rows[array.field] = torch.from_numpy(values)
         piece = Reconstruction(**rows)
+        if self.meta.format_version < _WITH_SUPPORTED:
+            piece = replace(
+                piece, state=piece.state + (piece.state > State.OBSERVED).to(torch.int8)
+            )
         unknown = (piece.state < 0) | (piece.state > max(FILE_STATES))
         if unknown.any():
             raise GhptDataError(self.path, "state", "holds a number that is no state", _HINT)

@@ -1,7 +1,7 @@
 "use strict";
 
 const COLOURS = { left: "#0072b2", right: "#d55e00", middle: "#333333" };
-const OBSERVED = 0, FILLED = 1;
+const OBSERVED = 0, SUPPORTED = 1, FILLED = 2;
 
 // Base64 of little-endian numbers.
 function unpack(text, Kind) {

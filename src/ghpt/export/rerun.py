@@ -129,7 +129,7 @@ class _PieceLog:
         self._strips("world/bones", strips, present, colours, 6.0)
 
     def _errors(self) -> None:
-        observed = self.piece.state == State.OBSERVED
+        observed = self.piece.is_measured
         total = torch.where(observed, self.piece.error, 0.0).sum(1)
         mean = total / observed.sum(1)
         self._send("error_px", self.rr.Scalars.columns(scalars=mean.double().numpy()))
@@ -147,7 +147,7 @@ class _PieceLog:
         points = piece.points.double()
         double = cameras.to(torch.float64)
         pixels, depth = project(double, points)
-        observed = piece.state == State.OBSERVED
+        observed = piece.is_measured
         grey = torch.full_like(piece.state, _GREY, dtype=torch.long)
         for v, name in enumerate(self.about.camera_names):
             centre = double.centre[v].expand_as(points)

@@ -16,7 +16,7 @@ from ghpt.errors import GhptConfigError
 from ghpt.export.stream import Chunks, pieces, plain_names, text_rows
 from ghpt.files import atomic_write
 from ghpt.geometry.masking import where
-from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
+from ghpt.reconstruction import FILE_STATES, About, Reconstruction
 
 _STATES = np.array([state.name.lower() for state in FILE_STATES])
 
@@ -40,7 +40,7 @@ def columns(path: Path, about: About, piece: Reconstruction) -> list[Column]:
     and spread_mm, the root of the covariance's trace.
     """
     rate = about.rate_hz if about.rate_hz else np.nan
-    observed = piece.state == State.OBSERVED
+    observed = piece.is_measured
     points = where(piece.has_position, piece.points, torch.nan).numpy()
     error = torch.where(observed, piece.error, torch.nan).numpy()
     spread = torch.where(observed, _spread(piece.covariance), torch.nan).numpy()

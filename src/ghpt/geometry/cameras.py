@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ghpt.clock import Clock
 from ghpt.errors import GhptDataError
 
 
@@ -121,6 +122,8 @@ class CameraSet:
     """False where the file has no unit of length and nobody gave one: ``t`` is in mm by a guess."""
     unit_mm: float = 1.0
     """Length of the file's own unit, given, the format's or guessed."""
+    clock: Clock | None = None
+    """When the cameras' frames are taken, where the file says it."""
 
     @classmethod
     def from_cameras(
@@ -203,6 +206,7 @@ class CameraSet:
             R=None if self.R is None else self.R[at],
             t=None if self.t is None else self.t[at],
             unposed=tuple(self.names[i] for i in at if self.names[i] in self.unposed),
+            clock=None if self.clock is None else self.clock.select(at),
         )
 
     def with_cameras(self, cameras: Cameras) -> CameraSet:

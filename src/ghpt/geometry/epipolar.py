@@ -70,6 +70,16 @@ def essential(R: Float[Tensor, "*B 3 3"], t: Float[Tensor, "*B 3"]) -> Float[Ten
     return cross_matrix(t) @ R
 
 
+def fundamental(
+    K: Float[Tensor, "*B 3 3"],
+    K_other: Float[Tensor, "*B 3 3"],
+    R: Float[Tensor, "*B 3 3"],
+    t: Float[Tensor, "*B 3"],
+) -> Float[Tensor, "*B 3 3"]:
+    """Return F of ``x_other^T F x = 0``, in pixels, of cameras with ``X_other = R X + t``."""
+    return torch.linalg.inv(K_other).mT @ essential(R, t) @ torch.linalg.inv(K)
+
+
 def _hartley(
     points: Float[Tensor, "*B N 2"],
     weights: Float[Tensor, "*B N"],

@@ -22,12 +22,13 @@ class State(IntEnum):
         return member
 
     OBSERVED = 0, "it is triangulated from this frame's key points"
-    FILLED = 1, "it is interpolated between observed frames, on request"
-    FEW_VIEWS = 2, "fewer than two views see it"
-    PARALLEL = 3, "the rays that see it are parallel or from one centre, and fix no point"
-    BEHIND = 4, "the rays that see it meet behind a camera"
-    BAD_INPUT = 5, "a key point, weight or camera is not finite, absurdly large or not a camera"
-    REJECTED = 6, "no two views explain it, so wherever it were put would be made up"
+    SUPPORTED = 1, "one view sees it, and the frames around and the bones carry it"
+    FILLED = 2, "it is interpolated between observed frames, on request"
+    FEW_VIEWS = 3, "fewer than two views see it"
+    PARALLEL = 4, "the rays that see it are parallel or from one centre, and fix no point"
+    BEHIND = 5, "the rays that see it meet behind a camera"
+    BAD_INPUT = 6, "a key point, weight or camera is not finite, absurdly large or not a camera"
+    REJECTED = 7, "no two views explain it, so wherever it were put would be made up"
     NOT_CONVERGED = -1, "an iterative estimator stopped at its limit; the point is its last"
 
     @property

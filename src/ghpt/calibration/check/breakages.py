@@ -133,6 +133,19 @@ def _exchange_with_first(case: Case, views: Views) -> Case:
     )
 
 
+def _turn(case: Case, views: Views, quarters: int) -> Case:
+    """Return images that are turned clockwise."""
+    pixels = case.evidence.pixels.clone()
+    for view in views:
+        width = case.setup.width[view]
+        height = case.setup.height[view]
+        for _ in range(quarters):
+            u, v = pixels[view].unbind(-1)
+            pixels[view] = torch.stack((height - 1 - v, u), dim=-1)
+            width, height = height, width
+    return replace(case, evidence=replace(case.evidence, pixels=pixels))
+
+
 def _mirror(case: Case, views: Views, image: bool, sides: bool) -> Case:
     pixels = case.evidence.pixels.clone()
     valid: Bool[Tensor, "V S F J"] = case.evidence.valid.clone()
@@ -174,6 +187,9 @@ def _of_all_or_one() -> dict[str, Breakage]:
         "resolution": ("resolution", partial(_scale_key_points, ratio=0.5)),
         "already_undistorted": ("already_undistorted", _undistort),
         "lens_missing": ("lens", _use_unknown_lens),
+        "turned_90": ("image_turned", partial(_turn, quarters=1)),
+        "turned_180": ("image_turned", partial(_turn, quarters=2)),
+        "turned_270": ("image_turned", partial(_turn, quarters=3)),
     }
     of_all = {kind: Breakage(code, True, spoil) for kind, (code, spoil) in kinds.items()}
     of_one = {f"one_{kind}": Breakage(code, False, spoil) for kind, (code, spoil) in kinds.items()}

@@ -27,6 +27,7 @@ from ghpt.calibration.mistakes import (
     Candidate,
     size_finding,
 )
+from ghpt.calibration.time.estimation import TimeEstimation
 from ghpt.errors import check, check_positive
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import stature
@@ -59,6 +60,7 @@ class CameraCheck:
     nothing mends, is off. ``clean``: where the error of every view is smaller, predict.py does not
     ask. ``many``: of more views it asks only if a view's error exceeds ``suspicious``, because the
     time grows with their square. ``consensus``: estimator that the person is measured with.
+    ``time``: of the views, which is looked at before anything else.
     """
 
     frames: int
@@ -70,6 +72,7 @@ class CameraCheck:
     suspicious: float
     thresholds: Thresholds
     consensus: Estimator
+    time: TimeEstimation
 
     def __post_init__(self) -> None:
         check_positive(

@@ -6,10 +6,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from ghpt.calibration.check.camera_check import CameraCheckResult
 from ghpt.calibration.check.evidence import moment
 from ghpt.calibration.check.setup import Setup
+from ghpt.calibration.findings import Finding
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.formats.key_points import write_key_points
 from ghpt.data.people.sequence import Sequence
@@ -23,12 +25,17 @@ MENDED = (CAMERAS_FILE, KEY_POINTS_FILE)
 
 
 def write_mended(
-    output: Path, cameras: CameraSet, result: CameraCheckResult, sequence: Sequence | None
+    output: Path,
+    cameras: CameraSet,
+    result: CameraCheckResult,
+    sequence: Sequence | None,
+    time: tuple[Finding, ...] = (),
 ) -> None:
     """Write the mended cameras, and the mended key points where a view was shifted, thinned to the
     others' frames, mirrored or its sides exchanged.
 
-    Exchanged views are mended by their cameras' names alone.
+    Exchanged views are mended by their cameras' names alone. ``time``: what was wrong with the time
+    of the views, which is undone in ``sequence`` already.
     """
     setup = result.setup
     names = tuple(cameras.names[source] for source in setup.source)
@@ -39,11 +46,15 @@ def write_mended(
         R=setup.R,
         t=setup.t,
         distortion=setup.lens,
-        size=cameras.image_size,
+        size=torch.tensor([setup.width, setup.height]).T.round().long(),
     )
-    mended = "; ".join(finding.text for finding in result.findings if finding.mended)
+    every = (*time, *result.findings)
+    mended = "; ".join(finding.text for finding in every if finding.mended)
+    changed = sequence is not None and (bool(time) or _changes_points(setup))
+    if changed:  # they are in one time now
+        rig = replace(rig, clock=None)
     write_pose2sim(output / CAMERAS_FILE, rig, {"adjusted": True, "mended": mended})
-    if sequence is not None and _changes_points(setup):
+    if sequence is not None and changed:
         points = mend_points(sequence, setup)
         path = output / KEY_POINTS_FILE
         write_key_points(path, names, JOINTS, sequence.frame, points, sequence.rate_hz)

@@ -11,10 +11,12 @@ from torch import Tensor
 
 from ghpt.calibration.check.evidence import Evidence
 from ghpt.geometry.cameras import CameraSet
-from ghpt.geometry.lens import undistort
+from ghpt.geometry.lens import is_fisheye, undistort
 from ghpt.models.estimators.classical import person_scale
 from ghpt.skeleton import MIRROR
 
+_QUARTER = ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+"""The rotation of a camera whose image is turned clockwise by 90 degrees."""
 _FAR = 1e5
 """Pixels; a key point beyond is none."""
 
@@ -37,6 +39,8 @@ class Setup:
     """Whether left and right joints are exchanged."""
     width: tuple[float, ...]
     """Of the images, pixels."""
+    height: tuple[float, ...]
+    """The same."""
     rate: tuple[float, ...]
     """How many times as fast as the others' the numbers of its frames count."""
     unit_mm: float | None
@@ -56,6 +60,43 @@ class Setup:
             else:
                 new[name] = (*old[:view], value, *old[view + 1 :])
         return replace(self, **new)
+
+    def turned(self, views: tuple[int, ...], degrees: int) -> Setup:
+        """Return the cameras whose images are those of ``views`` turned clockwise by a multiple of
+        90 degrees. A K with skew stays as it is.
+        """
+        setup = self
+        for _ in range(degrees // 90):
+            for view in views:
+                setup = setup._turned_once(view)
+        return setup
+
+    def _turned_once(self, view: int) -> Setup:
+        """Return one camera with an image turned by 90 degrees: (u, v) is at (height - 1 - v, u)
+        then, and (x, y) at (-y, x).
+        """
+        K = self.K[view]
+        if K[0, 1] != 0:
+            return self
+        turned_K = K.clone()
+        turned_K[0, 0] = K[1, 1]
+        turned_K[1, 1] = K[0, 0]
+        turned_K[0, 2] = self.height[view] - 1 - K[1, 2]
+        turned_K[1, 2] = K[0, 2]
+        turn = torch.tensor(_QUARTER, dtype=K.dtype)
+        lens = self.lens[view].clone()
+        if not bool(is_fisheye(lens)):  # (p2, p1) is a vector of the image
+            lens[3] = -self.lens[view, 2]
+            lens[2] = self.lens[view, 3]
+        return self.changed(
+            view,
+            K=turned_K,
+            R=turn @ self.R[view],
+            t=turn @ self.t[view],
+            lens=lens,
+            width=self.height[view],
+            height=self.width[view],
+        )
 
     def given_to(
         self,
@@ -89,7 +130,7 @@ def setup_of_intrinsics(K: Float[Tensor, "V 3 3"], size: Int[Tensor, "V 2"] | No
     ``size``: of the images; None where it is not known, and twice the principal point then.
     """
     views = len(K)
-    width = 2 * K[:, 0, 2] + 1 if size is None else size[:, 0].double()
+    image = 2 * K[:, :2, 2] + 1 if size is None else size.double()
     no = (False,) * views
     return Setup(
         K=K,
@@ -100,7 +141,8 @@ def setup_of_intrinsics(K: Float[Tensor, "V 3 3"], size: Int[Tensor, "V 2"] | No
         shift=(0,) * views,
         mirrored=no,
         sides=no,
-        width=tuple(width.tolist()),
+        width=tuple(image[:, 0].tolist()),
+        height=tuple(image[:, 1].tolist()),
         rate=(1.0,) * views,
         unit_mm=None,
     )

@@ -7,6 +7,7 @@ from jaxtyping import Int
 
 from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.calibration.check.evidence import gather_rows
+from ghpt.calibration.check.recording_time import in_one_time
 from ghpt.calibration.check.setup import setup_of
 from ghpt.calibration.findings import Finding
 from ghpt.data.people.sequence import Sequence
@@ -21,12 +22,15 @@ def check_cameras(sequence: Sequence, camera_check: CameraCheck) -> tuple[Findin
     """Return what the camera check finds on a bounded number of frames; nothing where no frame
     shows enough.
     """
-    rows = _windows(len(sequence))
     try:
+        timed = in_one_time(sequence, camera_check)
+        sequence = timed.sequence
+        rows = _windows(len(sequence))
         evidence = gather_rows(sequence, rows, camera_check.frames, camera_check.shift)
     except GhptDataError:  # no frame has enough joints in two views: nothing can be told
         return ()
-    return camera_check(evidence, setup_of(sequence.cameras)).findings
+    found = camera_check(evidence, setup_of(sequence.cameras)).findings
+    return (*timed.findings, *found)
 
 
 def _windows(count: int) -> Int[np.ndarray, " N"]:

@@ -25,6 +25,8 @@ from ghpt.export.stream import Chunks
 from ghpt.files import allocate
 from ghpt.reconstruction import Reconstruction, State
 
+OWN = "trajectory"
+"""The interpolation that takes the points of a trajectory, which is known in gaps too."""
 _ORDER = 2
 """Of the filter in one direction; forwards and backwards it is twice that."""
 
@@ -33,8 +35,9 @@ _ORDER = 2
 class Gaps:
     """What is done to a joint's path over the frames.
 
-    ``longest``: gaps of at most so many frames are interpolated between the observed frames on both
-    sides (None: none). ``interpolation``: ``pchip`` or ``linear``. ``cut_off_hz``: of a zero-phase
+    ``longest``: gaps of at most so many frames are filled between the frames with a position on
+    both sides (None: none). ``interpolation``: ``pchip``, ``linear``, or ``trajectory``, which is
+    what the estimator itself has there. ``cut_off_hz``: of a zero-phase
     Butterworth low-pass filter of fourth order over every run of frames with a position (None: no
     filter), which takes ``rate_hz``.
     """
@@ -45,7 +48,7 @@ class Gaps:
     rate_hz: float | None
 
     def __post_init__(self) -> None:
-        kinds = ("pchip", "linear")
+        kinds = ("pchip", "linear", OWN)
         problem = f"is {self.interpolation!r}"
         check(self.interpolation in kinds, "interpolation", problem, f"Existing: {kinds}.")
         if self.cut_off_hz is None:
@@ -83,17 +86,20 @@ class Gaps:
         step: int,
         longest: int,
     ) -> tuple[Float[np.ndarray, "T 3"], Int[np.ndarray, " T"]]:
-        observed = np.flatnonzero(state == State.OBSERVED)
+        placed = state <= State.SUPPORTED
+        observed = np.flatnonzero(placed)
         following = np.searchsorted(observed, np.arange(len(frame)))
         inside = (following > 0) & (following < len(observed))
-        missing = state != State.OBSERVED
+        missing = ~placed
         rows = np.flatnonzero(inside & missing)
         after = following[rows]
         gap = frame[observed[after]] - frame[observed[after - 1]]
         rows = rows[gap <= (longest + 1) * step]
         points = points.copy()
         state = state.copy()
-        if len(rows):
+        if self.interpolation == OWN:
+            state[rows] = State.FILLED
+        elif len(rows):
             times = frame.astype(np.float64)
             known = points[observed].astype(np.float64)
             points[rows] = _interpolate(times[observed], known, times[rows], self.interpolation)

@@ -21,6 +21,8 @@ def commands_on(inputs: InputSettings, person: int, ckpt: str | None, output: Pa
     keys = [key for key in InputSettings.__annotations__ if key != "data"]
     values = {key: getattr(inputs, key) for key in keys}
     given = {key: value for key, value in values.items() if value is not None}
+    if inputs.time == "file":
+        del given["time"]
     if not inputs.keypoints:
         given |= {"data": inputs.data["name"]}
     own: dict[str, object] = {"person": person} if person else {}

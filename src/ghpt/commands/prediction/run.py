@@ -21,10 +21,8 @@ from ghpt.commands.lost import told
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.trainer import make_trainer
 from ghpt.data.people.sequence import Sequence
-from ghpt.observations import Observations
-from ghpt.reconstruction import Reconstruction, concatenate, move_to_cpu
+from ghpt.models.estimators.predictors import Predictor
 
-Predictor = Callable[[Observations], Reconstruction]
 _log = logging.getLogger(__name__)
 
 
@@ -74,13 +72,8 @@ class ShardPrediction(L.LightningModule):
     @torch.no_grad()
     def predict_step(self, shard: int, batch_idx: int) -> int:
         rows = np.array(self.shards.rows(int(shard)))
-        parts = []
-        for start in range(0, len(rows), self.batch):
-            batch = self.sequence.read(rows[start : start + self.batch]).to(self.device)
-            found = move_to_cpu(self.predictor(batch))
-            parts.append(self.sequence.to_world(found))
-            self.advance(len(batch))
-        self.shards.write(int(shard), concatenate(parts))
+        part = self.predictor.predict(self.sequence, rows, self.batch, self.device, self.advance)
+        self.shards.write(int(shard), self.sequence.to_world(part))
         return int(shard)
 
     def on_predict_start(self) -> None:

@@ -26,7 +26,7 @@ from ghpt.errors import GhptDataError
 from ghpt.files import acquire, atomic_write, errors_name, sweep_temporaries
 from ghpt.reconstruction import Reconstruction
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 MANIFEST = "manifest.jsonl"
 _DTYPES = {
     "frame": "<i8",

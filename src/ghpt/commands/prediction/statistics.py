@@ -5,7 +5,7 @@ Coverage, reprojection, errors in held-out views, and how constant the lengths o
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
@@ -18,12 +18,15 @@ from ghpt.data.people.sequence import Sequence
 from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
+from ghpt.models.estimators.predictors import Estimate
+from ghpt.models.estimators.trajectory.windows import spread_runs
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, stature
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import FILE_STATES, Reconstruction, State
 from ghpt.skeleton import JOINTS, Skeleton
 
-Estimate = Callable[[Observations], PoseEstimate]
+_RUN = 100
+"""Successive frames that are evaluated together."""
 _LEAST = 20
 """Key points for a median that a verdict may rest on."""
 
@@ -119,16 +122,15 @@ def evaluate(
     flips: LeftRightFlips | None,
     estimates: Mapping[str, Estimate],
     most: int,
-    batch_size: int,
 ) -> Evaluation:
-    """Return the errors of each estimator on at most so many frames, evenly spread.
+    """Return the errors of each estimator on about so many frames: runs, evenly spread.
 
     ``flips``, which are of the sequence's skeleton, are undone for all estimators.
     """
-    rows = sequence.spread(most)
+    rows = spread_runs(len(sequence), most, _RUN)
     batches = []
-    for start in range(0, len(rows), batch_size):
-        batch = sequence.read(rows[start : start + batch_size])
+    for start in range(0, len(rows), _RUN):
+        batch = sequence.read(rows[start : start + _RUN])
         batches.append(batch if flips is None else undo_flips(batch, flips)[0])
     held_out = {name: _hold_out_views(batches, estimate) for name, estimate in estimates.items()}
     common = torch.stack([found.valid for found in held_out.values()]).all(0)
@@ -139,16 +141,6 @@ def evaluate(
             batches, estimate, held_out[name], common, names, sequence.skeleton
         )
     return Evaluation(len(rows), errors)
-
-
-def pose_estimate(predictor: Callable[[Observations], Reconstruction]) -> Estimate:
-    """Return a predictor as the other estimators are: observations to a PoseEstimate."""
-
-    def estimate(batch: Observations) -> PoseEstimate:
-        found = predictor(batch)
-        return PoseEstimate(found.points, found.state == State.OBSERVED)
-
-    return estimate
 
 
 @dataclass(frozen=True)

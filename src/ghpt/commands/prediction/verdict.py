@@ -9,7 +9,14 @@ from typing import Any
 
 from ghpt.calibration.check.units import unit_for
 from ghpt.calibration.findings import Finding, Severity
-from ghpt.calibration.mistakes import FEW_VIEWS_AGREE, LEFT_OUT_ERROR, REJECTED, size_finding
+from ghpt.calibration.mistakes import (
+    FEW_VIEWS_AGREE,
+    FRAME_RATE,
+    LEFT_OUT_ERROR,
+    OUT_OF_SYNC,
+    REJECTED,
+    size_finding,
+)
 from ghpt.errors import check, check_positive
 
 
@@ -192,6 +199,8 @@ def _mistakes(
 
 
 def _command_against(mistake: Finding, cameras: tuple[str, ...], commands: Commands) -> str:
+    if mistake.code in (OUT_OF_SYNC.code, FRAME_RATE.code):
+        return commands.predict(time="estimate")
     if mistake.mended:
         return commands.cameras
     others = [name for name in cameras if name not in mistake.cameras]

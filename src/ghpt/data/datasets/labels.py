@@ -46,9 +46,8 @@ def read_labels(path: Path) -> Labels:
     """
     content = _read_pickle(path)
     subjects = _names(path, "subject_names", content)
-    cameras = _names(path, "camera_names", content)
     actions = _names(path, "action_names", content)
-    rigs = _structured(path, "cameras", content, (len(subjects), len(cameras)))
+    rigs = _cameras(path, content, len(subjects))
     table = _structured(path, "table", content, (None,))
     subject = _column(table, "subject_idx", (None,), "iu")
     action = _column(table, "action_idx", (None,), "iu")
@@ -57,16 +56,50 @@ def read_labels(path: Path) -> Labels:
     return Labels(
         path=path,
         subjects=subjects,
-        cameras=cameras,
+        cameras=rigs.names,
         actions=actions,
-        K=_column(rigs, "K", (None, None, 3, 3), "f"),
-        R=_column(rigs, "R", (None, None, 3, 3), "f"),
-        t=_column(rigs, "t", (None, None, 3, 1), "f")[..., 0],
-        distortion=_column(rigs, "dist", (None, None, 5), "f"),
+        K=rigs.K,
+        R=rigs.R,
+        t=rigs.t,
+        distortion=rigs.distortion,
         subject=subject,
         action=action,
         frame=_column(table, "frame_idx", (None,), "iu"),
         key_points=_column(table, "keypoints", (None, 17, 3), "f"),
+    )
+
+
+@dataclass(frozen=True)
+class LabelCameras:
+    """C cameras of A actions, or of A subjects, in the file's own unit."""
+
+    names: tuple[str, ...]
+    K: Float[np.ndarray, "A C 3 3"]
+    R: Float[np.ndarray, "A C 3 3"]
+    t: Float[np.ndarray, "A C 3"]
+    distortion: Float[np.ndarray, "A C 5"]
+
+
+def read_label_cameras(path: Path) -> LabelCameras:
+    """Return the cameras of a labels file of any data set.
+
+    Raises GhptDataError if it is not what it should be or holds code.
+    """
+    return _cameras(path, _read_pickle(path), None)
+
+
+def _cameras(path: Path, content: dict[str, Any], count: int | None) -> LabelCameras:
+    """Return the cameras of so many subjects or, where that is None, of any number of actions."""
+    names = _names(path, "camera_names", content)
+    rigs = _structured(path, "cameras", content, (count, len(names)))
+    if not len(rigs.array):
+        raise GhptDataError(path, "cameras", "is empty", _HINT)
+    return LabelCameras(
+        names=names,
+        K=_column(rigs, "K", (None, None, 3, 3), "f"),
+        R=_column(rigs, "R", (None, None, 3, 3), "f"),
+        t=_column(rigs, "t", (None, None, 3, 1), "f")[..., 0],
+        distortion=_column(rigs, "dist", (None, None, 5), "f"),
     )
 
 

@@ -1,8 +1,10 @@
 """CMU Panoptic Studio in its own layout, with the user's 2D detections beside it.
 
 A root holds sequences: ``<seq>/calibration_<seq>.json``,
-``<seq>/hdPose3d_stage1_coco19/body3DScene_%08d.json`` and either ``<seq>/keypoints/00_%02d.npz``
-for each HD camera, or the authors' ``<seq>/all_2d_preds.npy``.
+``<seq>/hdPose3d_stage1_coco19/body3DScene_%08d.json`` and ``<seq>/keypoints/``, with 00_%02d.npz
+for each HD camera or a detector's files in any format that is read, or the authors'
+``<seq>/all_2d_preds.npy``. Or it is the authors' own flat folder
+(``ghpt.data.datasets.cmu_authors``).
 """
 
 from __future__ import annotations
@@ -14,11 +16,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from ghpt.data.datasets.cmu_authors import authors_files, authors_recording, is_authors_folder
 from ghpt.data.datasets.detections import undistort_key_points
-from ghpt.data.datasets.panoptic_detections import detection_files, hd_name, read_detections
+from ghpt.data.datasets.panoptic_detections import (
+    HD_CAMERAS,
+    detection_files,
+    hd_name,
+    is_own_layout,
+    read_detections,
+)
+from ghpt.data.datasets.panoptic_joints import COCO19, joints17
+from ghpt.data.datasets.panoptic_key_points import read_person
 from ghpt.data.formats.validate import check_array, check_cameras, check_names, read_json
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError, check
 from ghpt.geometry.cameras import Cameras
 from ghpt.observations import LabelledRecording
@@ -27,36 +39,6 @@ from ghpt.skeleton import JOINT
 SPLITS = {"train": (0.0, 0.6), "validation": (0.6, 0.8), "test": (0.8, 1.0)}
 """Split -> its part of each sequence in time (paper, section 4.1)."""
 
-COCO19 = (
-    "neck",
-    "nose",
-    "mid_hip",
-    "left_shoulder",
-    "left_elbow",
-    "left_wrist",
-    "left_hip",
-    "left_knee",
-    "left_ankle",
-    "right_shoulder",
-    "right_elbow",
-    "right_wrist",
-    "right_hip",
-    "right_knee",
-    "right_ankle",
-    "left_eye",
-    "left_ear",
-    "right_eye",
-    "right_ear",
-)
-"""Joints of the body3DScene files, in their order."""
-
-_SOURCES = {name: (name,) for name in JOINT if name in COCO19} | {
-    "pelvis": ("mid_hip",),
-    "thorax": ("neck",),
-    "spine": ("neck", "mid_hip"),
-    "head_top": ("left_eye", "right_eye", "left_ear", "right_ear"),
-}
-"""The joints of COCO19 whose mean each joint is."""
 _RATE_HZ = 29.97
 _MM = 10.0
 """Millimetres in Panoptic's unit."""
@@ -69,6 +51,9 @@ def panoptic_files(root: Path, numbers: Sequence[int]) -> list[Path]:
 
     Raises GhptDataError if one is missing.
     """
+    if is_authors_folder(root):
+        check_names(root, numbers, range(HD_CAMERAS))
+        return authors_files(root)
     files = []
     for folder in _sequences(root):
         files.append(_calibration_file(folder))
@@ -84,12 +69,17 @@ def panoptic_recordings(
 ) -> Iterator[LabelledRecording]:
     """Yield one recording for each sequence: the split's part in time, in these HD cameras.
 
+    The authors' flat folder, in which sequences are not told apart, is one.
+
     Frames are those of the 3D files, so that the split is the same for all cameras; detections are
     matched by frame number, and a frame without them has no valid key points. Of several bodies,
     the truth is the id that is there in most of the split's frames. Raises GhptDataError if a file
     is missing, damaged or not what it should be.
     """
     check(split in SPLITS, "split", f"is {split!r}", f"Existing: {', '.join(SPLITS)}.")
+    if is_authors_folder(root):
+        yield authors_recording(root, numbers, SPLITS[split])
+        return
     for folder in _sequences(root):
         yield _read_recording(folder, numbers, split)
 
@@ -101,11 +91,45 @@ def _read_recording(folder: Path, numbers: Sequence[int], split: str) -> Labelle
     truth, truth_valid = _read_truth([scenes[number] for number in frame])
     names = tuple(hd_name(number) for number in numbers)
     cameras, distortion = _read_cameras(folder, names)
+    if is_own_layout(folder, numbers):
+        points = _read_own(folder, numbers, cameras, distortion, frame, list(scenes))
+    else:
+        own = folder / "keypoints"
+        calibration = _calibration_file(folder)
+        points = read_person(own, calibration, names, frame, truth, truth_valid)
+    return LabelledRecording(
+        name=folder.name,
+        subject=folder.name,
+        action=_action(folder.name),
+        rate_hz=_RATE_HZ,
+        camera_names=names,
+        cameras=cameras,
+        key_points=points.pixels.astype(np.float32),
+        confidence=np.where(points.valid, points.confidence, 0).astype(np.float32),
+        valid=points.valid,
+        truth=truth,
+        truth_valid=truth_valid,
+        frame=frame,
+    )
+
+
+def _read_own(
+    folder: Path,
+    numbers: Sequence[int],
+    cameras: Cameras,
+    distortion: Float[np.ndarray, "V 5"],
+    frame: Int[np.ndarray, " T"],
+    frames: Sequence[int],
+) -> KeyPoints:
+    """Return the key points [T V 17] of the npz files, or of the authors' array, undistorted.
+
+    ``frames`` are the sequence's, ``frame`` those of the split.
+    """
     shape = (len(frame), len(numbers), len(JOINT))
     key_points = np.zeros((*shape, 2), np.float32)
     valid = np.zeros(shape, np.bool_)
     confidence = np.zeros(shape, np.float32)
-    for view, found in enumerate(read_detections(folder, numbers, list(scenes))):
+    for view, found in enumerate(read_detections(folder, numbers, frames)):
         _, rows, found_rows = np.intersect1d(frame, found.frame, return_indices=True)
         confidence[rows, view] = found.confidence[found_rows]
         key_points[rows, view], valid[rows, view] = undistort_key_points(
@@ -114,38 +138,7 @@ def _read_recording(folder: Path, numbers: Sequence[int], split: str) -> Labelle
             cameras.K[view].numpy(),
             distortion[view],
         )
-    return LabelledRecording(
-        name=folder.name,
-        subject=folder.name,
-        action=_action(folder.name),
-        rate_hz=_RATE_HZ,
-        camera_names=names,
-        cameras=cameras,
-        key_points=key_points,
-        confidence=np.where(valid, confidence, 0).astype(np.float32),
-        valid=valid,
-        truth=truth,
-        truth_valid=truth_valid,
-        frame=frame,
-    )
-
-
-def joints17(
-    joints19: Float[np.ndarray, "T 19 3"],
-    valid: Bool[np.ndarray, "T 19"],
-) -> tuple[Float[np.ndarray, "T 17 3"], Bool[np.ndarray, "T 17"]]:
-    """Return the 17 joints of COCO19, by name, and which are valid.
-
-    A mean (spine, head top) is valid if all of its joints are.
-    """
-    points = np.empty((len(joints19), len(JOINT), 3))
-    joint_valid = np.empty((len(joints19), len(JOINT)), np.bool_)
-    for joint, index in JOINT.items():
-        sources = [COCO19.index(name) for name in _SOURCES[joint]]
-        points[:, index] = joints19[:, sources].mean(1)
-        joint_valid[:, index] = valid[:, sources].all(1)
-    points = np.where(joint_valid[..., None], points, 0)
-    return points.astype(np.float32), joint_valid
+    return KeyPoints(key_points, confidence, valid)
 
 
 def _sequences(root: Path) -> list[Path]:

@@ -14,7 +14,7 @@ from ghpt.data.formats.validate import check_array, check_names, read_json, read
 from ghpt.errors import GhptDataError
 from ghpt.skeleton import JOINT
 
-_HD_CAMERAS = 31
+HD_CAMERAS = 31
 
 
 @dataclass(frozen=True)
@@ -36,22 +36,34 @@ def hd_name(number: int) -> str:
 
 def detection_files(folder: Path, numbers: Sequence[int]) -> list[Path]:
     """Return a sequence's files: one per camera, or the authors' array with what lies beside it."""
-    check_names(folder, numbers, range(_HD_CAMERAS))
+    check_names(folder, numbers, range(HD_CAMERAS))
     own = folder / "keypoints"
-    if own.is_dir():
-        files = [own / f"{hd_name(number)}.npz" for number in numbers]
+    if own.is_dir() and is_own_layout(folder, numbers):
+        files = _own_files(folder, numbers)
         for file in files:
             if not file.is_file():
                 hint = "Each camera of the arrangement needs one."
                 raise GhptDataError(file, "", "there is no such file", hint)
         return files
+    if own.is_dir():
+        return sorted(file for file in own.rglob("*") if file.is_file())
     if (folder / "all_2d_preds.npy").is_file():
         names = ("all_2d_preds.npy", "all_bboxes.npy", "all_frames.npy", "all_cameras.json")
         files = [folder / name for name in names]
         return [file for file in files if file.is_file()]
-    problem = "there are neither keypoints/00_<camera>.npz nor all_2d_preds.npy"
+    problem = "there is neither keypoints/ nor all_2d_preds.npy"
     hint = "Run a 2D detector on the HD videos and put its key points there."
     raise GhptDataError(folder, "", problem, hint)
+
+
+def is_own_layout(folder: Path, numbers: Sequence[int]) -> bool:
+    """Return whether detections are an npz file for each camera, or the authors' array."""
+    own = folder / "keypoints"
+    return not own.is_dir() or any(file.is_file() for file in _own_files(folder, numbers))
+
+
+def _own_files(folder: Path, numbers: Sequence[int]) -> list[Path]:
+    return [folder / "keypoints" / f"{hd_name(number)}.npz" for number in numbers]
 
 
 def read_detections(
@@ -143,7 +155,7 @@ def _read_camera_names(folder: Path) -> list[str]:
     """Return the names of the cameras of the authors' array: all HD cameras, or those of a file."""
     path = folder / "all_cameras.json"
     if not path.is_file():
-        return [hd_name(number) for number in range(_HD_CAMERAS)]
+        return [hd_name(number) for number in range(HD_CAMERAS)]
     names = read_json(path)
     if not isinstance(names, list):
         raise GhptDataError(path, "", "is not a list", 'Write ["00_03", "00_06", ...].')

@@ -23,6 +23,11 @@ _LAYOUT = (
 )
 
 
+def is_authors_file(path: Path) -> bool:
+    """Return whether a file has the name of the authors' predictions."""
+    return re.fullmatch(r"all_2d_preds\d*\.npy", path.name) is not None
+
+
 def read_authors(path: Path, skeleton: str | None) -> Detections:
     """Return the one person of a folder of predictions, or of one of its files.
 

@@ -31,6 +31,8 @@ class CameraEntry:
     """Whether the distortion is k1 k2 k3 k4 of Kannala and Brandt's lens."""
     to_world: bool = False
     """Whether R and t take the camera to the world, not the world to the camera."""
+    time: object = None
+    """``rate`` and ``shift`` of a `Clock`; None where the file does not say it."""
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ the size of the person tells (``ghpt.calibration.check.units``).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from ghpt.clock import Clock
 from ghpt.data.formats.camera_entry import KNOWN_CAMERAS, CameraContent, CameraEntry
 from ghpt.data.formats.camera_json import read_camera_json
 from ghpt.data.formats.camera_pickle import SUFFIXES, read_camera_pickle
@@ -170,6 +172,7 @@ def _camera_set(path: Path, content: CameraContent) -> CameraSet:
         unposed=tuple(unposed),
         unit_mm=content.unit_mm,
         unit_known=content.unit_known,
+        clock=_clock(path, entries),
     )
 
 
@@ -179,6 +182,27 @@ def _tell_apart(R: Float[np.ndarray, "P 3 3"], t: Float[np.ndarray, "P 3"]) -> b
     A file before extrinsic calibration has zeros for all.
     """
     return len(R) > 1 and bool((R[0] != R).any() or (t[0] != t).any())
+
+
+def _clock(path: Path, entries: Sequence[CameraEntry]) -> Clock | None:
+    """Return when the cameras' frames are taken; None where no camera says it."""
+    if all(entry.time is None for entry in entries):
+        return None
+    pairs = [
+        (1.0, 0.0) if entry.time is None else _rate_and_shift(path, entry) for entry in entries
+    ]
+    return Clock(tuple(rate for rate, _ in pairs), tuple(shift for _, shift in pairs))
+
+
+def _rate_and_shift(path: Path, entry: CameraEntry) -> tuple[float, float]:
+    table = entry.time if isinstance(entry.time, dict) else {}
+    values = [table.get("rate", 1.0), table.get("shift", 0.0)]
+    rate, shift = _numbers(path, entry.name, "time", values, (2,)).tolist()
+    if not isinstance(entry.time, dict) or rate <= 0:
+        problem = "is not a table of a positive rate and a shift"
+        hint = "Write time = {rate = 1.0, shift = 12.5}, or leave it out."
+        raise GhptDataError(path, f"camera {entry.name}, time", problem, hint)
+    return rate, shift
 
 
 def _intrinsics(path: Path, entry: CameraEntry) -> Float[np.ndarray, "3 3"]:

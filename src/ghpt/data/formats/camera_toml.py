@@ -77,5 +77,6 @@ def _camera(path: Path, key: str, table: Mapping[str, Any], numbered: bool) -> C
         size=table.get("size"),
         R=table.get("rotation"),
         t=table.get("translation"),
+        time=table.get("time"),
         fisheye=read_flag(path, f"{key}.fisheye", table.get("fisheye", False)),
     )

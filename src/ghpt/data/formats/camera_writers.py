@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ghpt.clock import Clock
 from ghpt.data.formats.opencv_yml import read_yml
 from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
@@ -113,6 +114,7 @@ def _write_toml(
             f"rotation = {vectors[i]}",
             f"translation = {metres[i]}",
             f"fisheye = {json.dumps(fisheyes[i])}",
+            *_time(rig.clock, i),
             "",
         ]
     values = {key: json.dumps(value, ensure_ascii=False) for key, value in metadata.items()}
@@ -131,6 +133,12 @@ def _lenses(rig: CameraSet, least: int) -> list[list[float]]:
         count = next(n for n in (least, 5, 8) if not any(brown[n:]))
         found.append(brown[: 4 if fisheye else count])
     return found
+
+
+def _time(clock: Clock | None, view: int) -> list[str]:
+    if clock is None or clock.is_synchronised:
+        return []
+    return [f"time = {{ rate = {clock.rate[view]!r}, shift = {clock.shift[view]!r} }}"]
 
 
 def _matrix(key: str, values: Float[Tensor, "rows cols"]) -> list[str]:

@@ -9,20 +9,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from ghpt.data.formats.authors_npy import read_authors
-from ghpt.data.formats.coco import read_coco
-from ghpt.data.formats.mediapipe import is_caliscope, opening, read_caliscope
-from ghpt.data.formats.mmpose import read_mmpose
+from ghpt.data.formats.authors_npy import is_authors_file, read_authors
+from ghpt.data.formats.hdf5_files import ENDINGS as HDF5_ENDINGS
+from ghpt.data.formats.hdf5_files import read_hdf5
+from ghpt.data.formats.json_content import looks_like_people
+from ghpt.data.formats.json_people import read_json_people
+from ghpt.data.formats.layout import find_files
+from ghpt.data.formats.mediapipe import is_caliscope, read_caliscope
 from ghpt.data.formats.movement_files import (
-    EXTENSIONS,
-    read_deeplabcut,
+    read_deeplabcut_csv,
     read_lightning_pose,
-    read_sleap,
+    read_sleap_labels,
 )
-from ghpt.data.formats.openpose import read_openpose
+from ghpt.data.formats.names import Name
 from ghpt.data.formats.own_npz import read_own, write_key_points
 from ghpt.data.formats.skeletons import find_skeleton, skeleton_of
-from ghpt.data.formats.validate import frame_rate, open_input
+from ghpt.data.formats.source import Source
+from ghpt.data.formats.validate import frame_rate, open_input, opening
+from ghpt.data.formats.yolo import looks_like_yolo, read_yolo
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -30,11 +34,14 @@ from ghpt.errors import GhptDataError
 __all__ = ["FORMATS", "Detections", "KeyPoints", "read_key_points", "write_key_points"]
 
 _HINT = (
-    "Known: a folder with OpenPose's JSON files in a folder for each camera; COCO results or "
-    "MMPose's JSON, a file for each camera; caliscope's xy_*.csv; an npz file of ghpt; the "
-    "authors' all_2d_preds.npy; DeepLabCut, SLEAP and LightningPose files (docs/calibration.md). "
-    "Or name it: format=."
+    "Known: JSON files of OpenPose, AlphaPose, MMPose, rtmlib, EasyMocap and COCO results; "
+    "Ultralytics' labels; caliscope's xy_*.csv; DeepLabCut, anipose, SLEAP and LightningPose "
+    "files; the authors' all_2d_preds.npy; an npz file of ghpt (docs/calibration.md). Or name it: "
+    "format=."
 )
+_ENDINGS = (".json", ".csv", ".slp", *HDF5_ENDINGS, ".npy", ".npz", ".txt")
+_LOOKED_AT = 20
+"""Files of a folder that are opened to recognise the format."""
 
 
 def read_key_points(
@@ -42,11 +49,14 @@ def read_key_points(
     skeleton: str | None = None,
     rate_hz: int | float | None = None,
     format: str | None = None,
+    session: Name = None,
+    least_confidence: float = 0.0,
 ) -> Detections:
     """Return everybody in a folder or file of key points.
 
     ``skeleton`` and ``rate_hz`` say what the files do not, or overrule them; ``format`` is one of
-    ``FORMATS``, and recognised by content if None.
+    ``FORMATS``, and recognised by content if None. ``session`` chooses one of several recordings
+    in a folder. A key point whose confidence is below ``least_confidence`` is missing.
 
     Raises GhptDataError for what is damaged, empty or not known, naming file, field and hint.
     """
@@ -57,46 +67,71 @@ def read_key_points(
         raise GhptDataError(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
-    people = FORMATS[format or _format_of(path)](path, skeleton)
+    source = Source(path, skeleton, session, format)
+    form = format or _format_of(path)
+    if session is not None and form in _ONE_RECORDING:
+        problem = "files of this format hold one recording"
+        raise GhptDataError(path, "session", problem, "Leave session= out.")
+    people = read_json_people(source) if form == "json" else FORMATS[form](source)
     if wanted is None or wanted.key_points != people.joints:
         wanted = skeleton_of(path, people.joints)
     people = replace(people, own_skeleton=wanted)
+    people = people.above(least_confidence)
     seen_by = set(people.view[people.points.valid.any(-1)].tolist())
     for view, name in enumerate(people.views):
         if view not in seen_by:
-            raise GhptDataError(
-                path, f"view {name}", "has no key point", "Detect this view again, or leave it out."
-            )
+            problem = "has no key point"
+            if least_confidence > 0:
+                problem += f" with a confidence of at least {least_confidence:g}"
+            hint = "Detect this view again, or leave it out."
+            raise GhptDataError(path, f"view {name}", problem, hint)
     return people if rate_hz is None else replace(people, rate_hz=rate)
 
 
-FORMATS: dict[str, Callable[[Path, str | None], Detections]] = {
-    "openpose": read_openpose,
-    "coco": read_coco,
-    "mmpose": read_mmpose,
-    "caliscope": lambda path, _: read_caliscope(path),
-    "npz": read_own,
-    "authors": read_authors,
-    "deeplabcut": read_deeplabcut,
-    "sleap": read_sleap,
+FORMATS: dict[str, Callable[[Source], Detections]] = {
+    "openpose": read_json_people,
+    "alphapose": read_json_people,
+    "coco": read_json_people,
+    "mmpose": read_json_people,
+    "rtmlib": read_json_people,
+    "easymocap": read_json_people,
+    "yolo": read_yolo,
+    "caliscope": lambda source: read_caliscope(source.path),
+    "npz": lambda source: read_own(source.path, source.skeleton),
+    "authors": lambda source: read_authors(source.path, source.skeleton),
+    "deeplabcut": lambda source: _of_own_or_hdf5(source, ".csv", read_deeplabcut_csv),
+    "anipose": read_hdf5,
+    "sleap": lambda source: _of_own_or_hdf5(source, ".slp", read_sleap_labels),
     "lightningpose": read_lightning_pose,
 }
+_ONE_RECORDING = ("caliscope", "npz", "authors")
+
+
+def _of_own_or_hdf5(
+    source: Source, ending: str, read: Callable[[Source], Detections]
+) -> Detections:
+    """Return what a tool's own files hold, or its HDF5 where it exported nothing else."""
+    return read(source) if find_files(source.path, (ending,)) else read_hdf5(source)
 
 
 def _format_of(path: Path) -> str:
-    """Return the name of the format, by what a folder has in it or how a file begins."""
-    if not path.is_dir():
-        form = _format_of_file(path)
-        if form in (None, "openpose"):
-            raise GhptDataError(path, "", "is not a key-point format that is known", _HINT)
-        return form
-    if any(path.glob("all_2d_preds*.npy")):
+    """Return the name of the format, by how the files of a folder, or a file, begin."""
+    files = find_files(path, _ENDINGS)
+    if path.is_dir() and any(is_authors_file(file) for file in files):
         return "authors"
-    inside = (
-        file for file in sorted(path.iterdir()) if file.suffix.lower() in (".json", *EXTENSIONS)
-    )
-    first = next(inside, None)
-    return "openpose" if first is None else _format_of_file(first) or "openpose"
+    # the first files of each ending: others may lie beside the key points
+    looked_at = [
+        file
+        for ending in _ENDINGS
+        for file in [file for file in files if file.suffix.lower() == ending][:_LOOKED_AT]
+    ]
+    for file in looked_at if path.is_dir() else files:
+        form = _format_of_file(file)
+        if form is not None:
+            return form
+    if any(file.suffix.lower() == ".json" for file in files):
+        return "json"
+    raise GhptDataError(path, "", "is not a key-point format that is known", _HINT)
 
 
 def _format_of_file(path: Path) -> str | None:
@@ -110,10 +145,9 @@ def _format_of_file(path: Path) -> str | None:
         return "caliscope"
     if text.startswith("scorer,"):
         return "deeplabcut"
-    if text.startswith(("{", "[")):
-        words = (('"instance', "mmpose"), ('"meta_info"', "mmpose"), ('"people"', "openpose"))
-        return next((form for word, form in words if word in text), "coco")
-    return None
+    if looks_like_people(text):
+        return "json"
+    return "yolo" if looks_like_yolo(text) else None
 
 
 _MAGIC = {b"PK\x03\x04": "npz", b"\x93NUMPY": "authors", b"\x89HDF": "sleap"}

@@ -29,19 +29,6 @@ _JOINTS = len(SKELETONS["mediapipe_33"])
 _LARGEST_NUMBER = 1e12
 
 
-def opening(start: bytes) -> str:
-    """Return the text that a file begins with; without an encoding's mark it is UTF-8."""
-    marks = (
-        (codecs.BOM_UTF8, "utf-8"),
-        (codecs.BOM_UTF16_LE, "utf-16-le"),
-        (codecs.BOM_UTF16_BE, "utf-16-be"),
-    )
-    for mark, encoding in marks:
-        if start.startswith(mark):
-            return start[len(mark) :].decode(encoding, "replace").lstrip()
-    return start.decode("utf-8", "replace").lstrip()
-
-
 def is_caliscope(text: str) -> bool:
     """Return whether a file that starts so is one of caliscope's 2D tables.
 

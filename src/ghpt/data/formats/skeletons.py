@@ -55,26 +55,32 @@ SKELETONS: dict[str, tuple[str, ...]] = {
 }
 """The key points of the known skeletons in the detector's order. ``coco_19`` is CMU Panoptic's."""
 
-_BONES = (
-    ("nose", "left_eye"),
-    ("nose", "right_eye"),
-    *(
-        (f"{side}_{a}", f"{side}_{b}")
-        for side in ("left", "right")
-        for a, b in (
-            ("shoulder", "elbow"),
-            ("elbow", "wrist"),
-            ("shoulder", "hip"),
-            ("hip", "knee"),
-            ("knee", "ankle"),
-            ("eye", "ear"),
-            ("ankle", "heel"),
-            ("heel", "big_toe"),
-        )
-    ),
-)
-_CLEARLY = 0.8
-"""A skeleton is told from another when its bones have less than this part of the other's length."""
+_BONES: dict[tuple[str, str], float] = {
+    ("shoulder", "elbow"): 0.186,
+    ("elbow", "wrist"): 0.146,
+    ("shoulder", "hip"): 0.288,
+    ("hip", "knee"): 0.245,
+    ("knee", "ankle"): 0.246,
+    ("eye", "ear"): 0.045,
+    ("ankle", "heel"): 0.040,
+    ("heel", "big_toe"): 0.130,
+}
+"""Bones of each side, in statures (Drillis and Contini 1966; head and foot by the body model)."""
+_MIDDLE_BONES: dict[tuple[str, str], float] = {
+    ("left_shoulder", "right_shoulder"): 0.200,
+    ("left_hip", "right_hip"): 0.130,
+    ("nose", "left_eye"): 0.025,
+    ("nose", "right_eye"): 0.025,
+}
+_TYPICAL = _MIDDLE_BONES | {
+    (f"{side}_{a}", f"{side}_{b}"): length
+    for (a, b), length in _BONES.items()
+    for side in ("left", "right")
+}
+_FULL_LENGTH = 0.8
+"""The quantile over people of a bone's length in the images: most of them foreshorten it."""
+_CLEARLY = 0.7
+"""A skeleton is told from another when it misfits people at most so many times as the other."""
 
 
 def find_skeleton(where: object, skeleton: str) -> Skeleton:
@@ -143,7 +149,8 @@ def recognise(
 ) -> str:
     """Return the name of the skeleton of N people.
 
-    Of those with K joints it is the one whose bones are shortest in the images.
+    Of those with K joints it is the one whose bones, of those that both of two skeletons have, are
+    shorter in the images and more like a person's in their proportions.
 
     Raises GhptDataError if none has K joints, or if two of them are as good.
     """
@@ -153,28 +160,44 @@ def recognise(
         known = ", ".join(f"{name} ({len(joints)})" for name, joints in SKELETONS.items())
         problem = f"no known skeleton has {count} joints"
         raise GhptDataError(where, "skeleton", problem, f"Known: {known}.")
-    if len(choices) == 1:
-        return choices[0]
-    lengths = sorted((_bone_length(SKELETONS[name], key_points, valid), name) for name in choices)
-    (shortest, name) = lengths[0]
-    (second, other) = lengths[1]
-    if not shortest < _CLEARLY * second:
-        problem = f"it may be {name} or {other}: both have {count} joints"
-        raise GhptDataError(where, "skeleton", problem, f"Name it: skeleton={name}.")
-    return name
+    best = choices[0]
+    for other in choices[1:]:
+        if _misfit(other, best, key_points, valid) < 1:
+            best = other
+    for other in choices:
+        if other != best and not _misfit(best, other, key_points, valid) < _CLEARLY:
+            problem = f"it may be {best} or {other}: both have {count} joints"
+            raise GhptDataError(where, "skeleton", problem, f"Name it: skeleton={best}.")
+    return best
 
 
-def _bone_length(joints: tuple[str, ...], key_points: np.ndarray, valid: np.ndarray) -> float:
-    """Return the mean over the bones of their median length, pixels; inf if none is ever valid."""
-    bones = [(a, b) for a, b in _BONES if a in joints and b in joints]
-    starts = [joints.index(a) for a, _ in bones]
-    ends = [joints.index(b) for _, b in bones]
-    length = np.linalg.norm(key_points[:, starts] - key_points[:, ends], axis=-1)
-    length = np.where(valid[:, starts] & valid[:, ends], length, np.nan)
-    measured = ~np.isnan(length).all(0)
-    if not measured.any():
-        return np.inf
-    return float(np.nanmedian(length[:, measured], axis=0).mean())
+def _misfit(name: str, other: str, key_points: np.ndarray, valid: np.ndarray) -> float:
+    """Return how many times as badly as another skeleton the first fits people; NaN if unknown."""
+    own, its = SKELETONS[name], SKELETONS[other]
+    bones = [bone for bone in _TYPICAL if {*bone} <= {*own} and {*bone} <= {*its}]
+    lengths = [_bone_lengths(joints, bones, key_points, valid) for joints in (own, its)]
+    measured = np.isfinite(lengths).all(0)
+    if measured.sum() < 2:
+        return np.nan
+    typical = np.log([_TYPICAL[bone] for bone in bones])[measured]
+    misfits = []
+    for length in lengths:
+        found = length[measured]
+        misfits.append(found.mean() * (np.log(found) - typical).std())
+    return float(misfits[0] / misfits[1])
+
+
+def _bone_lengths(
+    joints: tuple[str, ...], bones: Sequence[tuple[str, str]], pixels: np.ndarray, valid: np.ndarray
+) -> Float[np.ndarray, " B"]:
+    """Return each bone's full length in the images, pixels; NaN if it is never valid."""
+    lengths = []
+    for start, end in bones:
+        a, b = joints.index(start), joints.index(end)
+        both = valid[:, a] & valid[:, b]
+        found = np.linalg.norm(pixels[both, a] - pixels[both, b], axis=-1)
+        lengths.append(np.quantile(found, _FULL_LENGTH).clip(1e-6) if len(found) else np.nan)
+    return np.array(lengths)
 
 
 _OTHER_WORDS = {

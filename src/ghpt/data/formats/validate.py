@@ -7,6 +7,7 @@ first.
 
 from __future__ import annotations
 
+import codecs
 import io
 import json
 import math
@@ -29,13 +30,14 @@ Shape = tuple[int | None, ...]
 
 _MAX_HEADER = 10_000
 """Bytes of an npy header; numpy's own limit."""
-_MAX_JSON = 64 << 20
+LARGE_JSON = 64 << 20
+"""Bytes of a JSON file that holds a recording."""
 SMALL_JSON = 4 << 20
 """Bytes of a JSON file that holds a rig's cameras, or one frame."""
 _MOST_OBJECTS = 400_000
 _MOST_LISTS = 1_500_000
 _MOST_VALUES = 12_000_000
-"""In a JSON file of ``_MAX_JSON`` bytes: each costs up to a hundred times as many bytes of memory
+"""In a JSON file of ``LARGE_JSON`` bytes: each costs up to a hundred times as many bytes of memory
 as of the file.
 """
 _RATES = (1e-3, 1e5)
@@ -253,12 +255,12 @@ def read_npz(path: Path, fields: dict[str, tuple[Shape, str]]) -> dict[str, np.n
     return arrays
 
 
-def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
+def read_json(path: Path, largest: int = LARGE_JSON, nan: bool = False) -> Any:
     """The content of a JSON file of at most ``largest`` bytes.
 
     Raises GhptDataError for a file that is larger or holds more values than any of its kind, and
-    for one with NaN, Infinity, or a key that is there twice: of two cameras with one name, one
-    would be lost.
+    for one with Infinity, NaN, or a key that is there twice: of two cameras with one name, one
+    would be lost. ``nan`` admits NaN, which programs write for what is missing.
     """
     with open_input(path) as handle:
         data = handle.read(largest + 1)
@@ -267,11 +269,13 @@ def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
         raise GhptDataError(path, "", f"has more than {largest >> 20} MiB", hint)
     # before they are made: a file of 64 MiB could ask for 2 GiB of memory
     for sign, of_largest in ((b"{", _MOST_OBJECTS), (b"[", _MOST_LISTS), (b",", _MOST_VALUES)):
-        most = of_largest * largest // _MAX_JSON
+        most = of_largest * largest // LARGE_JSON
         if data.count(sign) > most:
             raise GhptDataError(path, "", f"holds more than {most} times {sign.decode()!r}", hint)
 
-    def refuse(constant: str) -> None:
+    def constant_value(constant: str) -> float:
+        if nan and constant == "NaN":
+            return math.nan
         raise ValueError(f"{constant} is no JSON number")
 
     def unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -282,7 +286,7 @@ def read_json(path: Path, largest: int = _MAX_JSON) -> Any:
         return found
 
     try:
-        return json.loads(data, parse_constant=refuse, object_pairs_hook=unique)
+        return json.loads(data, parse_constant=constant_value, object_pairs_hook=unique)
     except (ValueError, RecursionError) as error:
         raise GhptDataError(
             path, "", f"is not valid JSON ({error})", "Get the file again."
@@ -301,6 +305,19 @@ def open_input(path: Path) -> io.BufferedReader:
         raise GhptDataError(
             path, "", f"cannot be read ({error.strerror})", "Check its permissions."
         ) from error
+
+
+def opening(start: bytes) -> str:
+    """Return the text that a file begins with; without an encoding's mark it is UTF-8."""
+    marks = (
+        (codecs.BOM_UTF8, "utf-8"),
+        (codecs.BOM_UTF16_LE, "utf-16-le"),
+        (codecs.BOM_UTF16_BE, "utf-16-be"),
+    )
+    for mark, encoding in marks:
+        if start.startswith(mark):
+            return start[len(mark) :].decode(encoding, "replace").lstrip()
+    return start.decode("utf-8", "replace").lstrip()
 
 
 def _check_form(

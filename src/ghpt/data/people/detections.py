@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ MOST_PEOPLE = 64
 _MOST_VALUES = 1 << 31
 _FARTHEST = 1e6
 """Pixels."""
+_NUMBERS = {int, float, type(None)}
 
 
 @dataclass(frozen=True)
@@ -39,12 +40,16 @@ class Detections:
     view: Int[np.ndarray, " N"]
     """Index into ``views``; detections are in the order of views, then of frames."""
     identity: Int[np.ndarray, " N"]
-    """Number of the person, the same in all views; -1 where the files do not say."""
+    """Number that a tracker of the view gave the person, -1 where none did. It means nothing in
+    another view.
+    """
     points: KeyPoints
     """[N K]."""
     rate_hz: float | None = None
     own_skeleton: Skeleton | None = None
     """The skeleton with these joints that was asked for; None: what their names tell."""
+    normalised: bool = False
+    """Pixels are shares of the image's width and height; see `scale_to_images`."""
 
     def __len__(self) -> int:
         return len(self.row)
@@ -76,6 +81,18 @@ class Detections:
             identity=np.full(len(row), -1),
             points=points[row, view],
             rate_hz=rate_hz,
+        )
+
+    def above(self, least_confidence: float) -> Detections:
+        """Return the detections without key points below this confidence, nor who has no other."""
+        points = self.points.above(least_confidence)
+        kept = np.flatnonzero(points.valid.any(-1) | ~self.points.valid.any(-1))
+        return replace(
+            self,
+            row=self.row[kept],
+            view=self.view[kept],
+            identity=self.identity[kept],
+            points=points[kept],
         )
 
     def counts(self) -> Int[np.ndarray, "T V"]:
@@ -228,9 +245,10 @@ def joint_values(
 ) -> Float[np.ndarray, "K per_joint"]:
     """Return a flat list of ``per_joint`` numbers for each joint as an array.
 
-    Raises GhptDataError for anything else, and for numbers from 1e6 on.
+    A joint with NaN or null among them is missing: it is all zeros. Raises GhptDataError for
+    anything else, and for numbers from 1e6 on.
     """
-    numbers = isinstance(flat, list) and {int, float}.issuperset(map(type, flat))
+    numbers = isinstance(flat, list) and _NUMBERS.issuperset(map(type, flat))
     if not isinstance(flat, list) or not numbers or len(flat) % per_joint:
         words = "x, y, confidence" if per_joint == 3 else "x, y"
         raise GhptDataError(path, field, f"is not a list of {words}", "Detect this frame again.")
@@ -238,6 +256,7 @@ def joint_values(
         joints = np.array(flat, dtype=np.float64).reshape(-1, per_joint)
     except OverflowError:
         joints = np.full((1, per_joint), np.inf)
+    joints[np.isnan(joints).any(1)] = 0
     if not (np.abs(joints) < _FARTHEST).all():
         raise GhptDataError(path, field, "holds a number beyond 1e6", "Detect this frame again.")
     return joints

@@ -16,12 +16,14 @@ from ghpt.data.people.association import associate
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.following import follow_views
 from ghpt.data.people.matching import match_views
-from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels
+from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels, scale_to_images
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
+from ghpt.skeleton import BONES
 
+_LEAST_SHARE = 0.1
 _log = logging.getLogger(__name__)
 
 Chosen = Int[np.ndarray, "T V"]
@@ -63,6 +65,7 @@ def detector_sequence(
     points of images of another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
+    people = scale_to_images(people, ordered, at)
     ideal = undistort_detections(people, ordered, at)
     if person is None:
         chosen = follow_views(people)[:, at]
@@ -124,58 +127,73 @@ def select_person(
     ideal: KeyPoints,
     person: int = 0,
 ) -> Chosen:
-    """Return the detections of one person, the most visible (``person`` = 0), the next, ...
-
-    ``cameras`` are those of the views ``at``, and ``ideal`` [N J] what `undistort_detections` gives
-    or joints made of it.
-    Persons are told apart
-
-    1. by their identities, where all detections have one;
-    2. not at all, where nobody is ever beside another: everybody is one person;
-    3. by what agrees across the views (`associate`), where the cameras have extrinsics;
-    4. otherwise, or where no two views agree in half of the frames, each view follows its own
-       person (`follow_views`), in the last case with a warning.
+    """Return the detections of one person of `tell_apart`, the most visible (0), the next, ...
 
     Raises GhptDataError if there is no such person.
     """
-    in_views = np.isin(people.view, list(at))
-    if len(people.identity) and (people.identity >= 0).all():
-        return _nth(people, _by_identity(people, in_views), person)
+    found = tell_apart(people, cameras, at, ideal)
+    if not 0 <= person < len(found):
+        problem = f"there is no person {person}: {len(found)} can be told apart"
+        hint = f"Give a number below {len(found)}; 0 is who is seen most."
+        raise GhptDataError(people.path, "person", problem, hint)
+    return found[person]
+
+
+def tell_apart(
+    people: Detections, cameras: CameraSet, at: Items[int], ideal: KeyPoints
+) -> list[Chosen]:
+    """Return the detections of everybody, of the most visible person first.
+
+    ``cameras`` are those of the views ``at``, and ``ideal`` what `undistort_detections` gives.
+
+    1. Persons are those who agree across the views (`associate`). The numbers that trackers gave
+       tell who is the same in one view; nothing is made of their being equal in two.
+    2. Where nobody is ever beside another, whatever was detected in a frame is of the person who is
+       there: in views that do not agree, too. One after another they are several persons if their
+       sizes differ.
+    3. Without extrinsics, or where no two views agree in half of the frames, there is one person,
+       whom each view follows by itself (`follow_views`), in the last case with a warning.
+    """
     counts = people.counts()[:, at]
-    if not (counts > 1).any():
-        return _nth(people, [people.first()], person)
+    crowded = bool((counts > 1).any())
+    found = _across_views(people, cameras, at, ideal) if cameras.calibrated else []
+    if not crowded:
+        return _one_by_one(people, found)
     if cameras.calibrated:
-        found = _across_views(people, cameras, at, ideal)
         frames_of_two_views = ((counts > 0).sum(1) >= 2).sum()
-        frames_of_best = (found[0] >= 0).any(1).sum() if found else 0
-        if found and 2 * frames_of_best >= frames_of_two_views:
-            return _nth(people, found, person)
+        together = [(chosen >= 0).any(1) for chosen in found]
+        if found and 2 * np.any(together, axis=0).sum() >= frames_of_two_views:
+            return found
         _log.warning(
             "%s: the views agree on nobody: check the extrinsics of %s, and that frames have the "
             "same numbers in all views. Each view follows the person that it tracks best.",
             people.path,
             cameras.path,
         )
-    return _nth(people, [follow_views(people)], person)
+    return [follow_views(people)]
 
 
-def _by_identity(people: Detections, in_views: np.ndarray) -> list[Chosen]:
-    """Return the detections of every identity, the most frequent first."""
-    numbers, counts = np.unique(people.identity[in_views], return_counts=True)
-    order = numbers[np.argsort(-counts, kind="stable")]
-    found = []
-    for number in order:
-        indices = np.flatnonzero(in_views & (people.identity == number))
-        found.append(people.first_of(indices))
-    return found
+def _one_by_one(people: Detections, found: Items[Chosen]) -> list[Chosen]:
+    """Return the detections of each person where no view ever has two.
 
-
-def _nth(people: Detections, found: Items[Chosen], person: int) -> Chosen:
-    if not 0 <= person < len(found):
-        problem = f"there is no person {person}: {len(found)} can be told apart"
-        hint = f"Give a number below {len(found)}; 0 is who is seen most."
-        raise GhptDataError(people.path, "person", problem, hint)
-    return found[person]
+    Each frame is that of the person who was found nearest in time. Whoever was found in less than
+    ``_LEAST_SHARE`` of the frames is not thought another.
+    """
+    everything = people.first()
+    there = np.array([(chosen >= 0).any(1) for chosen in found])
+    if len(found) > 1 and (there.sum(0) > 1).any():
+        return list(found)
+    if len(found) > 1:
+        there = there[there.sum(1) >= _LEAST_SHARE * there.sum()]
+    if len(there) < 2:
+        return [everything]
+    known = np.flatnonzero(there.any(0))
+    frames = np.arange(len(everything))
+    after = np.searchsorted(known, frames).clip(0, len(known) - 1)
+    before = (after - 1).clip(0)
+    later = known[after] - frames < frames - known[before]
+    owner = there.argmax(0)[np.where(later, known[after], known[before])]
+    return [np.where((owner == person)[:, None], everything, -1) for person in range(len(there))]
 
 
 def _across_views(
@@ -186,7 +204,11 @@ def _across_views(
     index = np.concatenate(indices)
     camera = np.repeat(np.arange(len(at)), [len(each) for each in indices])
     rows = people.row[index]
-    found = associate(cameras.cameras, len(people.frame), rows, camera, ideal[index])
+    frames = len(people.frame)
+    numbers = people.identity[index]
+    skeleton = people.skeleton
+    bones = BONES if skeleton.has_joints else skeleton.bones
+    found = associate(cameras.cameras, frames, rows, camera, ideal[index], numbers, bones)
     persons = []
     for members in found:
         chosen = np.full((len(people.frame), len(people.views)), -1)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from jaxtyping import Float
 
+from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
@@ -15,6 +19,25 @@ _NEARLY_ALL = 0.99
 """Nearly all coordinates of a view within this are no pixels: of the image's size, with a joint or
 two beyond it.
 """
+
+
+def scale_to_images(people: Detections, cameras: CameraSet, at: Sequence[int]) -> Detections:
+    """Return detections in pixels; those that are shares of the images become so.
+
+    ``cameras`` are those of the views ``at``. Raises GhptDataError where the images' sizes are not
+    known.
+    """
+    if not people.normalised:
+        return people
+    if cameras.size is None:
+        problem = "do not say the size of their images, of which the key points are shares"
+        hint = "Give it: in the cameras' file, size = [1920, 1080], say."
+        raise GhptDataError(cameras.path, "size", problem, hint)
+    size = np.zeros((len(people.views), 2))
+    size[list(at)] = cameras.size.numpy()
+    pixels = people.points.pixels * size[people.view][:, None]
+    points = replace(people.points, pixels=pixels)
+    return replace(people, points=points, normalised=False)
 
 
 def check_pixels(where: str, points: KeyPoints, cameras: CameraSet) -> None:
@@ -70,8 +93,8 @@ def check_image_sizes(where: str, points: KeyPoints, cameras: CameraSet) -> None
                 "turned by 90 degrees, or x and y exchanged"
             )
             hint = (
-                "Detect in images that are turned as the calibration's, "
-                "or calibrate the turned ones."
+                "Detect in images that are turned as the calibration's, or give the cameras of "
+                "the turned ones, which cameras.py writes."
             )
         raise GhptDataError(where, f"view {cameras.names[view]}", problem, hint)
 

@@ -54,6 +54,8 @@ class StoredFile:
     skeleton: Skeleton
     frame: Int[np.ndarray, " T"]
     rate_hz: float | None
+    least_confidence: float = 0.0
+    """Below it a key point is missing."""
 
     def __len__(self) -> int:
         return len(self.frame)
@@ -73,7 +75,8 @@ class StoredFile:
         if "confidence" in self.members:
             confidence = self._read("confidence", rows).astype(np.float64)
         confidence = np.where(valid, np.nan_to_num(confidence).clip(0, 1), 0)
-        return KeyPoints(np.where(valid[..., None], pixels, 0), confidence, valid)
+        points = KeyPoints(np.where(valid[..., None], pixels, 0), confidence, valid)
+        return points.above(self.least_confidence)
 
     def _read(self, name: str, rows: Rows) -> np.ndarray:
         member = self.members[name]
@@ -104,7 +107,12 @@ class StoredKeyPoints:
         return self.file.read(rows)[:, list(self.views)]
 
 
-def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -> StoredFile | None:
+def open_stored(
+    path: str | Path,
+    skeleton: str | None,
+    rate_hz: float | None,
+    least_confidence: float = 0.0,
+) -> StoredFile | None:
     """Open the file, or return None if it is not one that can be read in parts.
 
     `read_key_points` then reads it, or says what is wrong with it. Raises GhptDataError if what is
@@ -126,7 +134,7 @@ def open_stored(path: str | Path, skeleton: str | None, rate_hz: float | None) -
     if "frame" in members:
         frame = read_rows(path, members["frame"], 0, frames).astype(np.int64)
     rate = _rate(path, members, rate_hz)
-    file = StoredFile(path, members, views, HUMAN36M, frame, rate)
+    file = StoredFile(path, members, views, HUMAN36M, frame, rate, least_confidence)
     joints: tuple[str, ...] = ()
     if skeleton is None and "skeleton" not in texts:
         joints = texts.get("joints", ())

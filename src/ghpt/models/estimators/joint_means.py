@@ -71,7 +71,7 @@ class JointMeans:
             points=(share * part.points[:, parts]).sum(-2),
             state=state.to(torch.int8),
             error=square.sqrt(),
-            views=(part.views[:, :, parts] & used).any(-1) & (state == State.OBSERVED)[:, None],
+            views=(part.views[:, :, parts] & used).any(-1) & (state <= State.SUPPORTED)[:, None],
             covariance=(share.float() * part.covariance[:, parts]).sum(-2),
             score=part.score,
             flipped=part.flipped,

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import Protocol, Self
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int8
+from jaxtyping import Bool, Float, Int, Int8
 from torch import Tensor
 
 from ghpt.geometry.normal_equations import valid_key_points
@@ -16,8 +19,8 @@ from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.estimators.uncertainty import JointUncertainty, UncertaintyModel
 from ghpt.models.estimators.view_weights import ViewWeights, WeightedViews
-from ghpt.observations import Observations
-from ghpt.reconstruction import Reconstruction, State
+from ghpt.observations import Observations, PoseEstimate
+from ghpt.reconstruction import Reconstruction, State, concatenate, move_to_cpu
 from ghpt.skeleton import HUMAN36M, JOINT, JOINTS, Skeleton
 
 FAR = 20.0
@@ -28,23 +31,98 @@ _FEW = 5
 """Key points in a view of whose distances the median says nothing."""
 
 
-class Predictor(Protocol):
-    """What `predict` runs: each frame's result is its own, whatever batch it is in.
+class FrameSource(Protocol):
+    """What is predicted: frames that are read as they are asked for."""
 
-    That holds once the predictor is ``fitted``.
-    """
+    @property
+    def frame(self) -> Int[np.ndarray, " T"]:
+        """The recording's own numbers, rising."""
+
+    @property
+    def rate_hz(self) -> float | None: ...
+
+    def read(self, rows: Int[np.ndarray, " N"]) -> Observations:
+        """Return the observations of some frames; ``index`` is a frame's own number."""
+
+
+Advance = Callable[[int], None]
+"""Is told of so many more frames that are done."""
+Estimate = Callable[[Observations], PoseEstimate]
+
+
+class Predictor(Protocol):
+    """What `predict` runs. A frame's result does not depend on the rows that are asked for."""
 
     def for_skeleton(self, skeleton: Skeleton) -> Predictor:
         """Return the same for batches whose key points are this skeleton's, not the 17 joints."""
 
-    def fitted(self, batch: Observations) -> Predictor:
+    def fit(self, source: FrameSource, frames: int) -> Predictor:
+        """Return the same with what about so many frames of the recording tell of it."""
+
+    def predict(
+        self,
+        source: FrameSource,
+        rows: Int[np.ndarray, " N"],
+        batch: int,
+        device: torch.device,
+        advance: Advance,
+    ) -> Reconstruction:
+        """Return these frames, with ``frame`` = ``index``; on the CPU.
+
+        At most ``batch`` frames are worked on at a time, where frames are independent.
+        """
+
+    def estimate(self, batch: Observations) -> PoseEstimate:
+        """Return what is compared with other estimators: nothing is rejected.
+
+        The frames are successive ones.
+        """
+
+
+def spread(frames: int, most: int) -> Int[np.ndarray, " N"]:
+    """Return at most ``most`` of the rows of a recording, evenly spread."""
+    return np.unique(np.linspace(0, frames - 1, min(most, frames)).astype(np.int64))
+
+
+class FramePredictor(ABC):
+    """A predictor whose frames are independent of each other."""
+
+    @abstractmethod
+    def fitted(self, batch: Observations) -> Self:
         """Return the same with the noise of these frames: a few hundred of a recording."""
 
+    @abstractmethod
+    def rejecting_nothing(self) -> Self:
+        """Return the same with all its joints: what it is compared with others by."""
+
+    @abstractmethod
     def __call__(self, batch: Observations) -> Reconstruction:
         """Return the batch's frames, with ``frame`` = ``batch.index``; on the CPU."""
 
+    def fit(self, source: FrameSource, frames: int) -> Self:
+        return self.fitted(source.read(spread(len(source.frame), frames)))
 
-class Classical:
+    def predict(
+        self,
+        source: FrameSource,
+        rows: Int[np.ndarray, " N"],
+        batch: int,
+        device: torch.device,
+        advance: Advance,
+    ) -> Reconstruction:
+        parts = []
+        for start in range(0, len(rows), batch):
+            observations = source.read(rows[start : start + batch]).to(device)
+            parts.append(move_to_cpu(self(observations)))
+            advance(len(observations))
+        return concatenate(parts)
+
+    def estimate(self, batch: Observations) -> PoseEstimate:
+        found = self.rejecting_nothing()(batch)
+        return PoseEstimate(found.points, found.state == State.OBSERVED)
+
+
+class Classical(FramePredictor):
     """A classical estimator with what it can say of its joints.
 
     A view counts as one of those that made a joint if its residual is within the estimator's
@@ -72,7 +150,7 @@ class Classical:
         return Classical(estimator, self.uncertainty, flips, self.reject)
 
     def fitted(self, batch: Observations) -> Classical:
-        clean = _prepare(batch, self.flips, self.estimator).batch
+        clean = prepare(batch, self.flips, self.estimator).batch
         estimator = self.estimator.fitted(clean)
         result = estimator.triangulate(clean)
         views, _ = estimator.inlier_views(clean, result.points, result.has_position)
@@ -89,12 +167,12 @@ class Classical:
 
     @torch.no_grad()
     def __call__(self, batch: Observations) -> Reconstruction:
-        prepared = _prepare(batch, self.flips, self.estimator)
+        prepared = prepare(batch, self.flips, self.estimator)
         clean = prepared.batch
         points = prepared.triangulation.points
-        state = _final_states(prepared, prepared.triangulation, self.reject)
+        state = final_states(prepared, prepared.triangulation, self.reject)
         views, _ = self.estimator.inlier_views(clean, points, state == State.OBSERVED)
-        return _reconstruct(
+        return reconstruct(
             points=points,
             state=state,
             views=views,
@@ -104,7 +182,7 @@ class Classical:
         )
 
 
-class Learned:
+class Learned(FramePredictor):
     """A trained model's view weights with what can be said of their joints.
 
     The model sees the 17 joints, which are means of the ``skeleton``'s key points in the images.
@@ -137,7 +215,7 @@ class Learned:
         return Learned(self.view_weights, self.uncertainty, flips, self.reject, skeleton)
 
     def fitted(self, batch: Observations) -> Learned:
-        prepared = _prepare(batch, self.flips, self.view_weights.consensus)
+        prepared = prepare(batch, self.flips, self.view_weights.consensus)
         clean = prepared.batch
         weighted = self._weigh(prepared)
         result = weighted.triangulation
@@ -149,7 +227,7 @@ class Learned:
         """Return the same with all its joints: what it is compared with others by."""
         return Learned(self.view_weights, self.uncertainty, self.flips, None, self.skeleton)
 
-    def _weigh(self, prepared: _Prepared) -> WeightedViews:
+    def _weigh(self, prepared: Prepared) -> WeightedViews:
         """Return the key points, those of the 17 joints among them by the model."""
         clean = prepared.batch
         if self.skeleton == HUMAN36M:
@@ -173,14 +251,14 @@ class Learned:
 
     @torch.no_grad()
     def __call__(self, batch: Observations) -> Reconstruction:
-        prepared = _prepare(batch, self.flips, self.view_weights.consensus)
+        prepared = prepare(batch, self.flips, self.view_weights.consensus)
         weighted = self._weigh(prepared)
         points = weighted.triangulation.points
-        state = _final_states(prepared, weighted.triangulation, self.reject)
+        state = final_states(prepared, weighted.triangulation, self.reject)
         views = weighted.views & (state == State.OBSERVED)[:, None]
         pool = weighted.pool
         score = (pool.weights() * pool.logits).sum(-1)
-        return _reconstruct(
+        return reconstruct(
             points=points,
             state=state,
             views=views,
@@ -191,7 +269,7 @@ class Learned:
 
 
 @dataclass(frozen=True)
-class _Prepared:
+class Prepared:
     """Observations without what no detection can be, and with left-right flips undone."""
 
     batch: Observations
@@ -203,18 +281,18 @@ class _Prepared:
     """What the estimator makes of the batch."""
 
 
-def _prepare(batch: Observations, flips: LeftRightFlips | None, estimator: Estimator) -> _Prepared:
+def prepare(batch: Observations, flips: LeftRightFlips | None, estimator: Estimator) -> Prepared:
     """Prepare a batch and triangulate it, once where the estimator also looks for the flips."""
     clean, rejected = remove_outliers(batch)
     result = estimator.triangulate(clean)
     if flips is None:
-        return _Prepared(clean, rejected, torch.zeros_like(batch.valid[..., 0]), result)
+        return Prepared(clean, rejected, torch.zeros_like(batch.valid[..., 0]), result)
     known = as_poses(result, clean) if estimator == flips.estimator else None
     clean, flipped = undo_flips(clean, flips, known)
     rows = torch.nonzero(flipped.any(-1))[:, 0]
     if len(rows):
         result = result.with_rows(rows, estimator.triangulate(clean.rows(rows)))
-    return _Prepared(clean, rejected, flipped, result)
+    return Prepared(clean, rejected, flipped, result)
 
 
 def observe_joints(batch: Observations, skeleton: Skeleton) -> Observations:
@@ -251,8 +329,8 @@ def remove_outliers(batch: Observations) -> tuple[Observations, Bool[Tensor, "B 
     return replace(batch, valid=valid, key_points=key_points), batch.valid & ~valid
 
 
-def _final_states(
-    prepared: _Prepared, result: Triangulation, reject: Rejection | None
+def final_states(
+    prepared: Prepared, result: Triangulation, reject: Rejection | None
 ) -> Int8[Tensor, "B J"]:
     """Return the states of a reconstruction.
 
@@ -270,13 +348,13 @@ def _final_states(
     return state.to(torch.int8)
 
 
-def _reconstruct(
+def reconstruct(
     points: Float[Tensor, "B J 3"],
     state: Int8[Tensor, "B J"],
     views: Bool[Tensor, "B V J"],
     uncertainty: JointUncertainty,
     score: Float[Tensor, " B"],
-    prepared: _Prepared,
+    prepared: Prepared,
 ) -> Reconstruction:
     observed = state == State.OBSERVED
     return Reconstruction(

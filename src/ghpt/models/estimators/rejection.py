@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.errors import check_positive
@@ -58,14 +58,27 @@ class Rejection:
 
         These are all of them where the person's extent is not known.
         """
+        return has_position & (self.explaining(batch, points, has_position) >= 2)
+
+    @torch.no_grad()
+    def explaining(
+        self,
+        batch: Observations,
+        points: Float[Tensor, "B J 3"],
+        has_position: Bool[Tensor, "B J"],
+    ) -> Int[Tensor, "B J"]:
+        """Return the number of views that explain each joint; 0 where it has no position.
+
+        These are all views where the person's extent is not known.
+        """
         distance = _ray_distance(batch, points, has_position)
         extent = self.extent
         if extent is None:
             extent = float(_person_extent(batch, distance))
         if not extent > 0:
-            return has_position
+            return has_position * batch.valid.shape[1]
         near = (distance.mm <= self.limit * extent) & distance.valid
-        return near.sum(1) >= 2
+        return near.sum(1)
 
 
 @dataclass(frozen=True)

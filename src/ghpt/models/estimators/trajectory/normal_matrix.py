@@ -70,13 +70,12 @@ def solve(
     ``skeleton``: the bones, whose ``groups`` these are. ``start``: a position near the solution.
     Raises ArithmeticError where the matrix is not positive definite.
     """
-    inner = _InnerBones(equations.bones, skeleton, groups.inner)
-    even = _Factor(groups.even, equations, inner)
+    even = Factor(groups.even, equations, skeleton, groups.inner)
     solution = torch.empty_like(equations.right)
     if not groups.odd:
         solution[:, even.joints] = even.solve(equations.right[:, even.joints])
         return solution
-    odd = _Factor(groups.odd, equations, inner)
+    odd = Factor(groups.odd, equations, skeleton, groups.inner)
     links = _Links(equations.bones, skeleton, groups.outer, even.joints, odd.joints)
     right_even = equations.right[:, even.joints]
     right_odd = equations.right[:, odd.joints]
@@ -153,15 +152,22 @@ class _Links:
         return target @ (self.bones * along)
 
 
-class _Factor:
+class Factor:
     """Cholesky factors of groups; those of one size share a matrix.
 
-    Vectors are [3, J', T] with the joints in the order of ``joints``.
+    Vectors are [3, J', T] with the joints in the order of ``joints``. ``inner``: the indices of the
+    bones of the ``skeleton`` that are within groups. Raises ArithmeticError where a matrix is not
+    positive definite.
     """
 
     def __init__(
-        self, groups: Sequence[Sequence[int]], equations: NormalEquations, inner: _InnerBones
+        self,
+        groups: Sequence[Sequence[int]],
+        equations: NormalEquations,
+        skeleton: Bones,
+        inner: Sequence[int],
     ) -> None:
+        bones = _InnerBones(equations.bones, skeleton, inner)
         sizes = sorted({len(group) for group in groups})
         self.joints: list[int] = []
         self.parts: list[tuple[np.ndarray, slice, int]] = []
@@ -169,7 +175,7 @@ class _Factor:
             equal = [group for group in groups if len(group) == size]
             first = len(self.joints)
             self.joints += [joint for group in equal for joint in group]
-            band = _band(np.array(equal), equations, inner)
+            band = _band(np.array(equal), equations, bones)
             factor, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
             if info:
                 raise ArithmeticError(f"the normal matrix is not positive definite ({info})")

@@ -86,7 +86,7 @@ class MotionPrior:
         unseen = ~seen
         unseen[:, :-1] |= ~seen[:, 1:]
         weak = 1 / (self.speed * axis.scale) ** 2
-        first = (unseen * weak + _TINY * weak) * axis.joined
+        first = weak * (unseen.double() + _TINY) * axis.joined
         own = torch.full_like(deviation, _TINY * weak)
         near = -first
         far = torch.zeros_like(deviation)

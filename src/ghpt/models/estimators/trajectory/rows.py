@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.geometry.normal_equations import Row, weighted_sum
+from ghpt.geometry.normal_equations import Row, ViewComponents, form_equations, weighted_sum
 from ghpt.geometry.triangulation import System, flat_cameras
 from ghpt.observations import Observations
 
@@ -21,10 +22,7 @@ class ReprojectionRows:
     unit for all views, whatever their resolution and distance. Arrays are [V, J, T].
     """
 
-    a: Row
-    b: Row
-    equations: Float[Tensor, "V 9 J T"]
-    """``a a^T + b b^T`` and its right-hand side."""
+    views: ViewComponents
     millimetres: Float[Tensor, "V 1 T"]
     """One over the focal length: from the rows' unit, depth x pixels, to mm."""
     used: Bool[Tensor, "V J T"]
@@ -40,18 +38,34 @@ class ReprojectionRows:
         focal = system.local.K.diagonal(dim1=-2, dim2=-1)[..., :2]
         millimetres = (1 / focal.prod(-1).sqrt()).mT[:, None]
         return ReprojectionRows(
-            a=system.a,
-            b=system.b,
-            equations=system.equations,
+            views=system.views,
             millimetres=millimetres,
             used=system.used,
             origin=system.origin[0],
         )
 
+    @cached_property
+    def pair(self) -> tuple[Row, Row]:
+        """The two rows of each key point."""
+        return self.views.rows()
+
+    @cached_property
+    def equations(self) -> Float[Tensor, "V 9 J T"]:
+        """``a a^T + b b^T`` of the two rows and its right-hand side."""
+        return form_equations(*self.pair)
+
+    def exchange(self, joints: Int[Tensor, "V J T"]) -> ReprojectionRows:
+        """Return the rows in which each joint has the key point of another one of its view."""
+        views = replace(
+            self.views, u=self.views.u.gather(1, joints), v=self.views.v.gather(1, joints)
+        )
+        return replace(self, views=views, used=self.used.gather(1, joints))
+
     def residuals(self, points: Float[Tensor, "3 J T"]) -> Float[Tensor, "V J T"]:
         """Return the lengths of the residuals of points of the local world, mm."""
-        over = _row_residual(self.a, points)
-        down = _row_residual(self.b, points)
+        a, b = self.pair
+        over = _row_residual(a, points)
+        down = _row_residual(b, points)
         square = torch.addcmul(over.mul_(over), down, down)
         return square.sqrt_().mul_(self.millimetres)
 

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.errors import check_positive
@@ -29,9 +28,13 @@ from ghpt.models.estimators.trajectory.priors import (
     bone_equations,
 )
 from ghpt.models.estimators.trajectory.rows import ReprojectionRows
+from ghpt.models.estimators.trajectory.sides import OtherPeople, SideExchange
+from ghpt.skeleton import Skeleton
 
 _MEDIAN_LENGTH = 1.1774
 """Median length of a 2D vector whose coordinates are normal with deviation 1: sqrt(2 ln 2)."""
+_COUNTS = 0.05
+"""Weight from which a key point says that a joint is seen."""
 _START_DEVIATION = 10.0
 """Of the points that the solver starts from, mm, where they are first joined through time."""
 
@@ -60,10 +63,15 @@ class Frames:
     placed: Bool[Tensor, "J T"]
     axis: TimeAxis
 
-    @cached_property
-    def seen(self) -> Bool[Tensor, "J T"]:
-        """Whether any view sees the joint."""
-        return self.rows.used.any(0)
+
+@dataclass(frozen=True)
+class BoneTerms:
+    """The bones of the last round."""
+
+    ends: tuple[Int[Tensor, " B"], Int[Tensor, " B"]]
+    direction: Float[Tensor, "3 B T"]
+    precision: Float[Tensor, "B T"]
+    """Of their lengths, mm^-2; 0 where a bone does not count."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +83,17 @@ class Solution:
     body: Body
     precision: Float[Tensor, "V J T"]
     """Weight of each key point, mm^-2."""
+    residual: Float[Tensor, "V J T"]
+    """Length of each residual, mm."""
+    used: Bool[Tensor, "V J T"]
+    """The key points that there are, after sides have been exchanged."""
+    order: Int[Tensor, "V J T"]
+    """Which key point each joint has: another than its own where sides are exchanged."""
+    observed: Float[Tensor, "6 J T"]
+    """The normal matrices of the key points alone."""
     equations: NormalEquations
     """Of the last round."""
+    bones: BoneTerms
 
 
 @dataclass(frozen=True)
@@ -86,12 +103,15 @@ class TrajectorySolver:
     ``noise``: a key point's deviation is this multiple of the one that the median residual of its
     joint says. A residual r weighs ``(1 + (r / (kernel x deviation))^2)^-2`` (Geman-McClure), with
     a kernel for each round: ``kernels`` without bones, then ``bone_kernels`` with them. The motion
-    prior is adapted to the current estimate before every second round. ``group``: joints that are
-    solved at once.
+    prior is adapted to the current estimate before every second round. ``exchange`` and ``others``:
+    what views may do beside seeing the joints of the person; null: nothing. ``group``: joints that
+    are solved at once.
     """
 
     motion: MotionPrior
     bones: BonePrior
+    exchange: SideExchange | None
+    others: OtherPeople | None
     noise: float
     kernels: tuple[float, ...]
     bone_kernels: tuple[float, ...]
@@ -103,16 +123,18 @@ class TrajectorySolver:
         check_positive(noise=self.noise, group=self.group, tolerance=self.tolerance)
         check_positive(iterations=self.iterations, rounds=len(self.kernels))
 
-    def __call__(self, frames: Frames, bones: Bones, body: Body | None = None) -> Solution:
+    def __call__(self, frames: Frames, skeleton: Skeleton, body: Body | None = None) -> Solution:
         """Return the trajectory of frames.
 
-        ``bones``: of the skeleton; those that close a circle are not used. ``body``: of the whole
-        recording; None: these frames tell.
+        Bones of the skeleton that close a circle are not used. ``body``: of the whole recording;
+        None: these frames tell.
         """
-        state = _Rounds(self, frames, bones, body)
+        state = _Rounds(self, frames, skeleton, body)
         for number, kernel in enumerate(self.kernels):
             state.update(kernel, adapt=number in (2, 4), with_bones=False)
         for number, kernel in enumerate(self.bone_kernels):
+            if number in (0, 2):
+                state.exchange_sides()
             state.update(kernel, adapt=number % 2 == 0, with_bones=True)
         return state.solution()
 
@@ -121,10 +143,16 @@ class _Rounds:
     """The state of the rounds."""
 
     def __init__(
-        self, solver: TrajectorySolver, frames: Frames, bones: Bones, body: Body | None
+        self, solver: TrajectorySolver, frames: Frames, skeleton: Skeleton, body: Body | None
     ) -> None:
         self.solver = solver
         self.frames = frames
+        self.skeleton = skeleton
+        self.rows = frames.rows
+        self.weight = frames.weight
+        given = torch.arange(len(frames.placed))[:, None]
+        self.order: Int[Tensor, "V J T"] = given.expand(frames.rows.used.shape)
+        bones = skeleton.bones
         joints = len(frames.placed)
         kept = spanning_bones(joints, bones)
         self.bones: Bones = tuple(bones[index] for index in kept)
@@ -139,6 +167,7 @@ class _Rounds:
         self.near = solver.bones.near(self.both_placed, frames.axis)
         self.given = body
         self.deviation = solver.motion.initial(frames.axis, joints)
+        self.seen = frames.rows.used.any(0)
         self.points = self._join_start()
         self.body = body or self._measure(self.points)
 
@@ -146,31 +175,63 @@ class _Rounds:
         """Go one round."""
         solver = self.solver
         frames = self.frames
-        residual = frames.rows.residuals(self.points)
+        residual = self.rows.residuals(self.points)
         if self.given is None:
             self.body = self._measure(self.points, residual)
         if adapt:
             self.deviation = solver.motion.adapted(self.points, frames.axis)
         scale = self.body.scale[:, None]
-        robust = (1 + (residual / (kernel * scale)).square()).square().reciprocal()
-        self.precision = frames.weight * robust / scale.square()
-        blocks, right = frames.rows.sums(self.precision)
+        relative = residual / scale
+        robust = (1 + (relative / kernel).square()).square().reciprocal()
+        if solver.others is not None:
+            robust *= solver.others.weight(relative, self.rows.used, frames.axis)
+        counted = self.weight * robust
+        self.seen = (counted * self.rows.used).amax(0) > _COUNTS
+        self.precision = counted / scale.square()
+        blocks, right = self.rows.sums(self.precision)
+        self.observed = blocks.clone()
         weighted = blocks.new_zeros(3, 0, blocks.shape[-1])
         groups = self.single
         bones: Bones = ()
         if with_bones:
             groups = self.groups
             bones = self.bones
-            directions, _ = self._directions(self.points)
-            precision = self.near * self.body.precision[:, None]
+            terms = self._bone_terms()
             weighted = bone_equations(
-                directions, self.body.length, precision, self.ends, blocks, right
+                terms.direction, self.body.length, terms.precision, self.ends, blocks, right
             )
         self.equations = NormalEquations(blocks, right, self._coupling(), weighted)
         self.points = self._solve(self.equations, bones, groups)
 
+    def exchange_sides(self) -> None:
+        """Decide anew in which views left and right are exchanged."""
+        exchange = self.solver.exchange
+        if exchange is None:
+            return
+        frames = self.frames
+        self.order = exchange.order(
+            frames.rows, self.points, self.body.scale, self.skeleton, frames.axis
+        )
+        self.rows = frames.rows.exchange(self.order)
+        self.weight = frames.weight.gather(1, self.order)
+
     def solution(self) -> Solution:
-        return Solution(self.points, self.body, self.precision, self.equations)
+        return Solution(
+            points=self.points,
+            body=self.body,
+            precision=self.precision,
+            residual=self.rows.residuals(self.points),
+            used=self.rows.used,
+            order=self.order,
+            observed=self.observed,
+            equations=self.equations,
+            bones=self._bone_terms(),
+        )
+
+    def _bone_terms(self) -> BoneTerms:
+        direction, _ = self._directions(self.points)
+        precision = self.near * self.body.precision[:, None]
+        return BoneTerms(self.ends, direction, precision)
 
     def _join_start(self) -> Float[Tensor, "3 J T"]:
         """Return the start with what is missing in it carried over through time."""
@@ -184,7 +245,7 @@ class _Rounds:
         return self._solve(equations, (), self.single)
 
     def _coupling(self) -> TimeCoupling:
-        return self.solver.motion.coupling(self.deviation, self.frames.seen, self.frames.axis)
+        return self.solver.motion.coupling(self.deviation, self.seen, self.frames.axis)
 
     def _solve(
         self, equations: NormalEquations, bones: Bones, groups: BodyGroups
@@ -207,7 +268,7 @@ class _Rounds:
     ) -> Body:
         """Return what the current estimate says of the body."""
         if residual is None:
-            residual = self.frames.rows.residuals(points)
+            residual = self.rows.residuals(points)
         _, lengths = self._directions(points)
         length, precision = self.solver.bones.measure(lengths, self.both_placed)
         return Body(self._noise(residual), length, precision)
@@ -217,7 +278,7 @@ class _Rounds:
 
         That of a joint that nobody sees is the median joint's.
         """
-        measured = torch.where(self.frames.rows.used, residual, torch.nan)
+        measured = torch.where(self.rows.used, residual, torch.nan)
         median = measured.transpose(0, 1).flatten(1).nanmedian(-1).values
         typical = median.nanmedian()
         median = torch.where(median.isnan(), typical, median).nan_to_num(1.0)

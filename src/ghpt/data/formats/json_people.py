@@ -1,0 +1,215 @@
+"""Folders and files of JSON key points: OpenPose's, COCO's, AlphaPose's, MMPose's, rtmlib's and
+EasyMocap's.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath, PurePosixPath
+
+from ghpt.data.formats.frame_files import Person, read_frame_files
+from ghpt.data.formats.json_content import (
+    JsonContent,
+    JsonFrame,
+    Key,
+    looks_like_people,
+    read_content,
+    read_people,
+)
+from ghpt.data.formats.layout import (
+    arrange_frames,
+    arrange_recordings,
+    find_files,
+    frame_numbers,
+    without_strays,
+)
+from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.formats.source import Source
+from ghpt.data.formats.validate import (
+    LARGE_JSON,
+    SMALL_JSON,
+    open_input,
+    opening,
+)
+from ghpt.data.people.detections import (
+    Detections,
+    merge_views,
+    sort_people,
+)
+from ghpt.errors import GhptDataError
+
+_LAYOUT = (
+    "Put the files of each camera into a folder of its own, cam1/cam1_000000000012.json, or one "
+    "file of a whole recording for each camera, cam1.json, into one folder."
+)
+_MOST_DIGITS = 15
+"""Of a frame number."""
+
+
+def read_json_people(source: Source) -> Detections:
+    """Return everybody in JSON files, each of a frame or of a whole recording.
+
+    The layout of the files is told as ``ghpt.data.formats.layout`` says. A ``person_id`` or
+    ``track_id`` from 0 on is what a tracker of the view gave the person; OpenPose itself writes
+    -1. Raises GhptDataError.
+    """
+    files = _json_files(source.path)
+    first, content = _first(files)
+    if not content.format:
+        problem = "is empty"
+        raise GhptDataError(source.path, "people", problem, "Detect the recording again.")
+    if source.format not in (None, content.format, *_SAME.get(content.format, ())):
+        problem = f"is not of {source.format}: it looks like {content.format}'s"
+        raise GhptDataError(first, "", problem, f"Leave format= out, or format={content.format}.")
+    read = _recordings if content.is_recording else _frame_files
+    found = read(source, files)
+    skeleton = source.skeleton
+    counts = {view.points.valid.shape[1] for view in found if len(view)}
+    if skeleton is None and content.format == "coco" and counts == {len(SKELETONS["coco_17"])}:
+        skeleton = "coco_17"
+    return merge_views(source.path, found, skeleton)
+
+
+_SAME = {"coco": ("alphapose",), "openpose": ("alphapose",), "mmpose": ("rtmlib",)}
+"""Tools whose files have another's form."""
+
+
+def _json_files(root: Path) -> list[Path]:
+    files = find_files(root, (".json",))
+    if not files:
+        raise GhptDataError(root, "", "holds no JSON file", _LAYOUT)
+    return without_strays(files, _may_be_people)
+
+
+def _may_be_people(file: Path) -> bool:
+    with open_input(file) as handle:
+        return looks_like_people(opening(handle.read(4096)))
+
+
+def _first(files: Sequence[Path]) -> tuple[Path, JsonContent]:
+    """Return the first file that tells whose it is, with its content, or the first of all."""
+    for file in files:
+        content = read_content(file, LARGE_JSON)
+        if content.format:
+            return file, content
+    return files[0], content
+
+
+def _frame_files(source: Source, files: Sequence[Path]) -> list[Detections]:
+    """Return the views of files that hold one frame each."""
+    return read_frame_files(source, files, _people_of_frame)
+
+
+def _people_of_frame(file: Path) -> list[Person]:
+    content = read_content(file, SMALL_JSON)
+    if content.is_recording:
+        problem = "holds a recording, and the files beside it hold a frame each"
+        raise GhptDataError(file, "", problem, _LAYOUT)
+    return read_people(file, content.frames[0])
+
+
+@dataclass(frozen=True)
+class _Recording:
+    """The frames of one view in a file."""
+
+    file: Path
+    view: str
+    numbers: tuple[int, ...]
+    """Of each of ``frames``."""
+    frames: tuple[JsonFrame, ...]
+    joints: tuple[str, ...]
+
+
+def _recordings(source: Source, files: Sequence[Path]) -> list[Detections]:
+    """Return the views of files that hold a recording each: of one view, or in one file of all."""
+    root = source.path
+    if not root.is_dir():
+        recordings = _views_of_file(source, read_content(root, LARGE_JSON))
+    else:
+        names = [file.relative_to(root) for file in files]
+        placed = arrange_recordings(root, names, source.session)
+        recordings = [_view_of_file(files[index], view) for view, index in placed]
+    named: dict[tuple[str, ...], Path] = {}
+    found = []
+    for recording in recordings:
+        view = _read_recording(recording)
+        named.setdefault(view.joints, recording.file)
+        found.append(view)
+    if len(named) > 1:
+        problem = f"names other joints than {next(iter(named.values())).name}"
+        hint = "Detect all views with one model."
+        raise GhptDataError(list(named.values())[1], "meta_info", problem, hint)
+    return found
+
+
+def _read_recording(recording: _Recording) -> Detections:
+    file = recording.file
+    people = [
+        (number, person.joints)
+        for number, frame in zip(recording.numbers, recording.frames, strict=True)
+        for person in read_people(file, frame)
+    ]
+    view = sort_people(file, recording.view, recording.numbers, people)
+    count = view.points.valid.shape[1]
+    if recording.joints and len(view) and count != len(recording.joints):
+        problem = f"names {len(recording.joints)} joints, and people have {count}"
+        field = "meta_info.keypoint_id2name"
+        raise GhptDataError(file, field, problem, "Detect this view again.")
+    return replace(view, joints=recording.joints)
+
+
+def _view_of_file(file: Path, view: str) -> _Recording:
+    content = read_content(file, LARGE_JSON)
+    if not content.is_recording:
+        problem = "holds one frame, and the files beside it hold a recording each"
+        raise GhptDataError(file, "", problem, _LAYOUT)
+    images = _images(file, content.frames)
+    numbers = [key for key in images if isinstance(key, int)]
+    if len(numbers) < len(images):
+        names = [key for key in images if isinstance(key, PurePath)]
+        read = iter(frame_numbers(file, list(dict.fromkeys(names))))
+        by_name = dict(zip(dict.fromkeys(names), read, strict=True))
+        numbers = [key if isinstance(key, int) else by_name[key] for key in images]
+    return _Recording(file, view, tuple(numbers), content.frames, content.joints)
+
+
+def _views_of_file(source: Source, content: JsonContent) -> list[_Recording]:
+    """Return the views of one file: of the folders or names of its images, else the file's own."""
+    file = source.path
+    images = _images(file, content.frames)
+    if any(isinstance(key, int) for key in images):
+        ((name, _),) = arrange_recordings(file.parent, [PurePath(file.name)], source.session)
+        return [_view_of_file(file, name)]
+    names = [*dict.fromkeys(key for key in images if isinstance(key, PurePath))]
+    rows: dict[PurePath, list[int]] = defaultdict(list)
+    for row, key in enumerate(images):
+        if isinstance(key, PurePath):
+            rows[key].append(row)
+    recordings = []
+    for view in arrange_frames(file, names, source.session):
+        own = [(n, row) for n, index in view.files.items() for row in rows[names[index]]]
+        numbers = tuple(number for number, _ in own)
+        frames = tuple(content.frames[row] for _, row in own)
+        recordings.append(_Recording(file, view.view, numbers, frames, content.joints))
+    return recordings
+
+
+def _images(file: Path, frames: Iterable[JsonFrame]) -> list[int | PurePath]:
+    """Return each frame's number, or the name of its image. Raises GhptDataError for neither."""
+    return [_image(file, frame.key) for frame in frames]
+
+
+def _image(file: Path, key: Key) -> int | PurePath:
+    if isinstance(key, str) and key.isdecimal() and len(key) <= _MOST_DIGITS:
+        key = int(key)
+    if isinstance(key, int) and 0 <= key < 10**_MOST_DIGITS:
+        return key
+    if isinstance(key, str) and key:
+        return PurePosixPath(key.replace("\\", "/"))
+    problem = f"{key!r} is no frame number"
+    if key is None:
+        problem = "an image has neither number nor name"
+    hint = "Name the images like cam1/000012.jpg, or number them."
+    raise GhptDataError(file, "image_id", problem, hint)
