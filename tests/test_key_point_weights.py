@@ -35,7 +35,7 @@ def labelled():
 @pytest.fixture
 def model():
     def adam(parameters):
-        return torch.optim.Adam(parameters, lr=3e-3)
+        return torch.optim.Adam(parameters, lr=2e-2)
 
     return StochasticEstimator(
         problem=KeyPointWeights(**RANSAC),
@@ -57,8 +57,8 @@ def mean_error(estimate, truth):
 
 
 def test_random_recordings_have_two_to_eight_views_and_are_a_function_of_their_names():
-    first = list(random_recordings("train", 0, 8, 3))
-    again = list(random_recordings("train", 0, 8, 3))
+    first = list(random_recordings("train", 0, 5, 2))
+    again = list(random_recordings("train", 0, 5, 2))
     views = {int(recording.valid.any((0, 2)).sum()) for recording in first}
     assert views <= set(range(2, VIEWS + 1))
     assert len(views) > 2
@@ -126,9 +126,10 @@ def test_equal_weights_are_the_linear_estimate_of_equal_cameras(labelled, model)
 
 def test_training_lowers_the_error(labelled, model):
     optimizer = model.configure_optimizers()
+    part = labelled.rows(slice(0, 48))
     losses = []
-    for step in range(12):
-        pool = model.sample(labelled.observations, "hypotheses", labelled.truth, step)
+    for step in range(10):
+        pool = model.sample(part.observations, "hypotheses", part.truth, step)
         loss = model.terms(pool, pool.keys).total.mean()
         optimizer.zero_grad()
         loss.backward()

@@ -46,7 +46,9 @@ def write_weights(model: StochasticEstimator, trained: Mapping[str, Any], path: 
 
     ``trained``: what the checkpoint says of itself (``load_model``).
     """
-    meta = {"model": trained["config"]["model"], "provenance": trained["provenance"]}
-    arrays = {key: value.cpu().numpy() for key, value in model.scorer.state_dict().items()}
+    about = {"model": trained["config"]["model"], "provenance": trained["provenance"]}
+    state = model.scorer.state_dict()
+    arrays: dict[str, Any] = {key: value.cpu().numpy() for key, value in state.items()}
+    arrays[_META] = np.array(json.dumps(about))
     with atomic_write(path) as handle:
-        np.savez(handle, **arrays, **{_META: np.array(json.dumps(meta))})
+        np.savez(handle, **arrays)

@@ -122,6 +122,7 @@ def measure(observations: Observations, start: PoseEstimate) -> Geometry:
     y = pixels[..., 1] / K[..., 1, 1, None]
     x = (pixels[..., 0] - K[..., 0, 1, None] * y) / K[..., 0, 0, None]
     position = torch.stack((x, y), dim=-1)
+    position = torch.where(valid[..., None], position, 0.0)
     unit = UNIT * _stature(points, estimated)
     residual = position * depth[..., None] - in_camera[..., :2]
     residual = residual / unit[:, None, None, None]
