@@ -305,9 +305,10 @@ def check_type(value: Any, wanted: Any, key: str) -> None:
             check_type(value[name], inner, f"{key}.{name}".lstrip("."))
     elif not _fits(value, wanted):
         shown = "null" if value is None else repr(value)
-        raise GhptConfigError(
-            key, f"is {shown}, not {_words(wanted)}", "Give a value of this kind."
-        )
+        hint = "Give a value of this kind."
+        if isinstance(value, str | int | float) and _fits([value], wanted):
+            hint = f"Give a list: {key}=[{value}]."
+        raise GhptConfigError(key, f"is {shown}, not {_words(wanted)}", hint)
 
 
 def _parameters(target: Any) -> tuple[dict[str, tuple[Any, bool]], bool]:
@@ -379,7 +380,7 @@ def _words(wanted: Any) -> str:
     origin = get_origin(wanted)
     inner = get_args(wanted)
     if origin in (Union, types.UnionType):
-        plain_ones = [one for one in inner if _is_plain(one)]
+        plain_ones = [one for one in inner if _is_plain(one) or get_origin(one) is list]
         return " or ".join(dict.fromkeys(map(_words, plain_ones or inner)))
     if origin is Literal:
         return ("one of " if len(inner) > 1 else "") + ", ".join(map(repr, inner))

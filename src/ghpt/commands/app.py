@@ -39,6 +39,8 @@ from ghpt.commands.overrides import (
     Source,
     check_overrides,
     compose,
+    expand_home,
+    parse_options,
     rename_settings,
     spread_seeds,
 )
@@ -128,13 +130,13 @@ def _run(
 ) -> None:
     """Do what the command line asks for; jobs that end are added to ``ended``."""
     name = command if isinstance(command, str) else command.name
-    sys.argv[1:] = rename_settings(sys.argv[1:])
+    sys.argv[1:] = expand_home(rename_settings(sys.argv[1:]))
     if name == "reproduce":
         sys.argv[1:] = spread_seeds(sys.argv[1:])
     if "--version" in sys.argv:
         print(f"ghpt {ghpt.__version__}")
         return
-    arguments = get_args_parser().parse_args()
+    arguments = parse_options(get_args_parser(), sys.argv[1:])
     source = _source(conf, name, arguments)
     sweep = bool(arguments.multirun)
     job = _Job(command, source.folder, _program(), os.getpid(), sweep, trace, ended)
@@ -144,7 +146,7 @@ def _run(
     if arguments.hydra_help or arguments.info or arguments.shell_completion:
         _answer(start)
         return
-    overrides = check_overrides(source, arguments.overrides)
+    overrides = check_overrides(source, arguments.overrides, sweep)
     if arguments.help:
         print(_help(source, arguments.overrides))
         return

@@ -18,12 +18,13 @@ from ghpt.config import Target, build, settings, suggest
 from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.contents import explain_cameras, explain_key_points
 from ghpt.data.formats.key_points import Detections, read_key_points
 from ghpt.data.formats.names import Name
 from ghpt.data.people.persons import detector_sequence, person_sequence
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
-from ghpt.errors import GhptConfigError
+from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import CameraSet
 from ghpt.models.estimators.classical import Estimator
 from ghpt.observations import Recording
@@ -64,19 +65,28 @@ def own_cameras(inputs: InputSettings, example: str) -> CameraSet:
     """Return the user's cameras. Raises GhptConfigError, with ``example``, if no file is named."""
     if not inputs.cameras:
         raise GhptConfigError("cameras", "is missing", f"Name the file: cameras={example}")
-    return read_cameras(inputs.cameras, inputs.subject, inputs.unit_mm)
+    try:
+        return read_cameras(inputs.cameras, inputs.subject, inputs.unit_mm)
+    except GhptDataError as error:
+        key_points = Path(inputs.keypoints) if inputs.keypoints else None
+        raise explain_cameras(error, Path(inputs.cameras), key_points) from error
 
 
 def own_people(inputs: InputSettings) -> Detections:
     """Return everybody in the user's key points."""
-    return read_key_points(
-        _required_path(inputs),
-        inputs.skeleton,
-        inputs.rate_hz,
-        inputs.format,
-        inputs.session,
-        inputs.least_confidence,
-    )
+    path = _required_path(inputs)
+    try:
+        return read_key_points(
+            path,
+            inputs.skeleton,
+            inputs.rate_hz,
+            inputs.format,
+            inputs.session,
+            inputs.least_confidence,
+        )
+    except GhptDataError as error:
+        cameras = Path(inputs.cameras) if inputs.cameras else None
+        raise explain_key_points(error, path, cameras) from error
 
 
 def own_sequence(

@@ -3,6 +3,8 @@
 A mistake is named, with what exists, before anything heavy is imported.
 """
 
+import argparse
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +18,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
+from ghpt.commands.display import shell_override
 from ghpt.config import suggest
 from ghpt.errors import GhptConfigError
 
@@ -54,12 +57,16 @@ def compose(source: Source, words: Sequence[str], with_hydra: bool = False) -> A
         )
 
 
-def check_overrides(source: Source, words: Sequence[str]) -> list[Override]:
+def check_overrides(source: Source, words: Sequence[str], sweep: bool = True) -> list[Override]:
     """Return the parsed overrides of a command line.
 
-    Raises GhptConfigError, saying what exists, for a setting or a choice that does not.
+    Raises GhptConfigError, saying what exists, for a setting or a choice that does not, and for
+    several values of one where ``sweep`` is false.
     """
     overrides = [_parse(word) for word in words]
+    if not sweep:
+        for override in overrides:
+            _check_single(override)
     with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         search_path = _search_path(source, overrides)
@@ -110,11 +117,52 @@ def rename_settings(words: Sequence[str]) -> list[str]:
     return renamed
 
 
+def expand_home(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line, with the user's folder for the ~ of a value."""
+    expanded = []
+    for word in words:
+        key, equals, value = word.partition("=")
+        is_home = equals and re.match(r"~(/|\\|$)", value)
+        expanded.append(f"{key}={Path(value).expanduser()}" if is_home else word)
+    return expanded
+
+
+def parse_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
+    """Return the options of a command line.
+
+    Raises GhptConfigError for one that Hydra does not have: a setting with dashes before it.
+    """
+    arguments, unknown = parser.parse_known_args(words)
+    for word in unknown:
+        name, _, value = word.lstrip("-").partition("=")
+        following = [*words[list(words).index(word) + 1 :], "..."][0]
+        hint = f"Settings have no dashes: {name}={value or following}. --help shows all."
+        raise GhptConfigError(word, "is no option", hint)
+    return arguments
+
+
+def _check_single(override: Override) -> None:
+    """Raise GhptConfigError for several values, which only a sweep takes in turn."""
+    key = override.get_key_element()
+    if not override.is_sweep_override() or key.startswith("hydra"):
+        return
+    text = str(override.input_line).partition("=")[2]
+    hint = f"For a list, write '{key}=[{text}]'; to run with each in turn, add -m."
+    if re.fullmatch(r"-?\d+,\d+", text):
+        hint = f"A number has a point: {key}={text.replace(',', '.')}. {hint}"
+    raise GhptConfigError(key, f"has several values ({text})", hint)
+
+
 def _parse(word: str) -> Override:
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException:
+        key, equals, value = word.partition("=")
         hint = "Such as data=cmu2 or 'data.cameras=[1,2]'; --help shows all settings."
+        if equals:
+            hint = f"Quote the value: {shell_override(key, value)}."
+        elif re.fullmatch(r"[A-Za-z_.]+", word):
+            hint = f"Write {word}=VALUE. {hint}"
         raise GhptConfigError(word, "is not of the form key=value", hint) from None
 
 

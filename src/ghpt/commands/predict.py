@@ -132,6 +132,7 @@ class PredictSettings(InputSettings):
             _check_exists("compare", name, self.baselines)
         for name in self.formats or ():
             _check_exists("formats", name, WRITERS)
+            WRITERS[name].check_installed(name)
 
 
 def _check_exists(key: str, name: str, existing: Mapping[str, object]) -> None:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
 
+from ghpt.errors import check
 from ghpt.export.c3d import write_c3d
 from ghpt.export.html import write_html
 from ghpt.export.markers import MarkerSet, find_marker_set
@@ -43,14 +45,24 @@ class Writer:
     """Whether its positions have single precision, and so are relative to ``About.origin``."""
     has_markers: bool = False
     """Whether its joints may have the names of a marker set."""
+    module: str | None = None
+    """The module that it needs beside ghpt's own requirements."""
+    package: str = ""
+    """What to install for that."""
+
+    def check_installed(self, name: str) -> None:
+        """Raise GhptConfigError unless what the format needs is installed."""
+        there = self.module is None or find_spec(self.module) is not None
+        hint = f"Install it (pip install {self.package}), or leave {name} out."
+        check(there, "formats", f"{name} needs {self.package}", hint)
 
 
 WRITERS = {
     "npz": Writer("poses.npz", write_npz),
     "csv": Writer("poses.csv", write_csv),
-    "parquet": Writer("poses.parquet", write_parquet),
+    "parquet": Writer("poses.parquet", write_parquet, module="pyarrow", package="pyarrow"),
     "trc": Writer("poses.trc", write_trc, has_markers=True),
     "c3d": Writer("poses.c3d", write_c3d, single=True, has_markers=True),
     "html": Writer("poses.html", write_html, single=True),
-    "rerun": Writer("poses.rrd", write_rerun, single=True),
+    "rerun": Writer("poses.rrd", write_rerun, single=True, module="rerun", package="rerun-sdk"),
 }

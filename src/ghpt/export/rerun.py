@@ -40,7 +40,7 @@ def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = 
     try:
         import rerun as rr
     except ImportError as error:
-        hint = "pip install 'ghpt[viz]', or leave rerun out"
+        hint = "Install it (pip install rerun-sdk), or leave rerun out."
         raise GhptConfigError("rerun", "needs rerun-sdk", hint) from error
     extent(path, about, chunks)
     if scene is not None:

@@ -114,7 +114,7 @@ def write_parquet(path: Path, about: About, chunks: Chunks) -> None:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ImportError as error:
-        hint = "pip install 'ghpt[io]', or leave parquet out"
+        hint = "Install it (pip install pyarrow), or leave parquet out."
         raise GhptConfigError("parquet", "needs pyarrow", hint) from error
     notes = json.dumps(asdict(about) | {"unit": "mm"}, allow_nan=False)
     writer = None

@@ -178,6 +178,8 @@ def _median(
     values: Float[np.ndarray, "*S N"], valid: Bool[np.ndarray, "*S N"], least: int
 ) -> Float[np.ndarray, "*S"]:
     """Return the (lower) median of the valid values; inf where there are fewer than ``least``."""
+    if not values.shape[-1]:
+        return np.full(values.shape[:-1], np.inf)
     count = valid.sum(-1)
     middle = np.maximum(count - 1, 0) // 2
     ordered = np.sort(np.where(valid, values, np.inf), axis=-1)
