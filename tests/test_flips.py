@@ -7,7 +7,7 @@ from ghpt.errors import GhptConfigError
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.ransac import AdaptiveRansac
-from ghpt.skeleton import MIRROR
+from ghpt.skeleton import JOINT, JOINTS, MIRROR, make_skeleton
 from scenes import random_scene
 
 ROBUST = AdaptiveRansac(threshold=0.02, pairs=24, seed=0, adapt=5.0, quantile=0.55, rounds=4)
@@ -91,3 +91,45 @@ def test_the_order_of_the_views_is_nothing():
 def test_impossible_settings_are_refused():
     with pytest.raises(GhptConfigError):
         LeftRightFlips(ROBUST, scale=0.0, gain=6.0, rounds=3, views=4)
+
+
+def test_feet_and_hands_are_exchanged_with_their_limbs_and_the_face_is_not():
+    """The 17 in another order, with toes, finger tips and eyes."""
+    names = (*reversed(JOINTS), *EXTRA)
+    skeleton = make_skeleton("x", "extended", names)
+    batch, _ = good(4, 100)
+    near = {"big_toe": "ankle", "middle_finger4": "wrist", "eye": "shoulder"}
+    order = [JOINT[name] for name in reversed(JOINTS)]
+    order += [JOINT[f"{side}_{near[part]}"] for side, part in map(split_side, EXTRA)]
+    other = replace(
+        batch,
+        key_points=batch.key_points[:, :, order],
+        confidence=batch.confidence[:, :, order],
+        valid=batch.valid[:, :, order],
+    )
+    _, hit = flipped(batch)
+    points = other.key_points[:, :, list(skeleton.mirror)]
+    eyes = [names.index(name) for name in EXTRA if "eye" in name]
+    points[:, :, eyes] = other.key_points[:, :, eyes]
+    bad = replace(other, key_points=torch.where(hit[..., None, None], points, other.key_points))
+    mended, found = undo_flips(bad, SWAPS.for_skeleton(skeleton))
+    right = (found == hit).all(1)
+    assert right.double().mean() > 0.95
+    same = (mended.key_points == other.key_points).flatten(1).all(1)
+    assert same[right & hit.any(1)].double().mean() > 0.9
+
+
+EXTRA = tuple(
+    f"{side}_{part}" for part in ("big_toe", "middle_finger4", "eye") for side in ("left", "right")
+)
+
+
+def split_side(name):
+    return name.split("_", 1)
+
+
+def test_a_skeleton_without_limbs_has_no_flips():
+    batch, _ = good(4, 5)
+    mouse = make_skeleton("x", "mouse", [f"point_{joint}" for joint in range(17)])
+    _, found = undo_flips(flipped(batch)[0], SWAPS.for_skeleton(mouse))
+    assert not found.any()

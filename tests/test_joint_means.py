@@ -48,9 +48,9 @@ def test_the_error_of_a_mean_is_over_all_views_of_all_parts():
     count = MADE.views[:, :, EYES_AND_EARS].sum(1)
     square = (count * MADE.error[:, EYES_AND_EARS] ** 2).sum(1) / count.sum(1).clamp(min=1)
     torch.testing.assert_close(found.error[:, HEAD], square.sqrt())
-    observed = found.state[:, HEAD] == State.OBSERVED
+    measured = found.is_measured[:, HEAD]
     any_part = MADE.views[:, :, EYES_AND_EARS].any(-1)
-    assert torch.equal(found.views[:, :, HEAD], any_part & observed[:, None])
+    assert torch.equal(found.views[:, :, HEAD], any_part & measured[:, None])
 
 
 def test_the_covariance_of_a_mean_holds_whatever_its_parts_have_in_common():

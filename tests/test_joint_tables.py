@@ -83,6 +83,14 @@ DOCUMENTED |= {
     "coco_133": whole_body(f"{DOCUMENTED['coco_17']}, {COCO_FEET}", WHOLE_BODY["coco_133"]),
     "halpe_136": whole_body(DOCUMENTED["halpe_26"], WHOLE_BODY["halpe_136"]),
 }
+HANDS_75 = [
+    f"{33 + 21 * hand + i} {side} {part}"
+    for hand, side in enumerate(("right", "left"))
+    for i, part in enumerate(
+        ("hand root", *(f"{finger}{k}" for finger in FINGERS for k in (1, 2, 3, 4)))
+    )
+]
+DOCUMENTED["mediapipe_75"] = ", ".join([DOCUMENTED["mediapipe_33"], *HANDS_75])
 OUR_WORDS = {
     "Chest": "spine",
     "Nose": "nose",
@@ -268,6 +276,7 @@ SOURCES |= {
     ],
     "coco_133": SOURCES["coco_17"],
     "halpe_136": SOURCES["halpe_26"],
+    "mediapipe_75": SOURCES["mediapipe_33"],
 }
 
 

@@ -1,4 +1,4 @@
-"""caliscope's table of landmarks: long to dense, hands and face left out, gaps left gaps."""
+"""caliscope's table of landmarks: long to dense, the face left out, gaps left gaps."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_rows_become_an_array_whatever_their_order(tmp_path):
     for t, v, k in zip(*np.nonzero(there), strict=True):
         x, y = pixels[t, v, k].tolist()
         rows.append(f"{frames[t]},{ports[v]},{t},1.5,{k},{x!r},{y!r},,")
-    rows += ["5,0,0,1.5,400,1,2,,", "5,2,0,1.5,100,1,2,,"]
+    rows += ["5,0,0,1.5,400,1,2,,", "5,2,0,1.5,500,1,2,,"]
     found = read_person(table(tmp_path, *rng.permutation(rows)))
     assert found.views == ("cam_0", "cam_2", "cam_10")
     assert found.frame.tolist() == frames
@@ -60,19 +60,29 @@ def test_a_bad_table_is_named(rows, says, tmp_path):
         read_person(table(tmp_path, *rows))
 
 
+def test_hands_come_behind_the_body_the_right_one_first(tmp_path):
+    rows = ["0,0,0,0,0,1,2,,", "0,0,0,0,100,3,4,,", "0,0,0,0,220,5,6,,", "0,1,0,0,0,1,2,,"]
+    found = read_person(table(tmp_path, *rows))
+    assert found.joints == SKELETONS["mediapipe_75"]
+    assert found.key_points[0, 0, found.joints.index("right_hand_root")].tolist() == [3, 4]
+    assert found.key_points[0, 0, found.joints.index("left_pinky_finger4")].tolist() == [5, 6]
+    assert found.valid.sum() == 4
+
+
 def test_another_csv_is_not_taken_for_it(tmp_path):
     with pytest.raises(GhptDataError, match=r"not a key-point format that is known.*OpenPose"):
         read_person(table(tmp_path, "0,1", header="a,b"))
 
 
 def test_the_real_recording(shared_data):
-    """Every body landmark of the file is at its place, found by an independent count."""
+    """Every landmark of body and hands is at its place, found by an independent count."""
     path = shared_data / "caliscope" / "xy_HOLISTIC.csv"
     found = read_person(path)
     assert found.views == ("cam_0", "cam_1", "cam_2", "cam_3")
     rows = [line.split(",") for line in path.read_text().splitlines()[1:]]
-    body = [row for row in rows if int(row[4]) < 33]
+    body = [row for row in rows if int(row[4]) < 221]
     assert found.valid.sum() == len(body)
     for row in body[:: len(body) // 50]:
-        t, v, k = found.frame.tolist().index(int(row[0])), int(row[1]), int(row[4])
+        ids = [*range(33), *range(100, 121), *range(200, 221)]
+        t, v, k = found.frame.tolist().index(int(row[0])), int(row[1]), ids.index(int(row[4]))
         assert found.key_points[t, v, k].tolist() == [float(row[5]), float(row[6])]

@@ -10,7 +10,7 @@ from ghpt.config import build
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_scale
 from ghpt.models.estimators.lo_ransac import LoRansac
-from ghpt.models.estimators.predictors import Classical, Learned
+from ghpt.models.estimators.predictors import Classical, Learned, observe_joints
 from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.estimators.uncertainty import UncertaintyModel
@@ -21,6 +21,7 @@ from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.models.scorer import Scorer
 from ghpt.paper.robustness.perturbation import Outliers
 from ghpt.reconstruction import Reconstruction, State
+from ghpt.skeleton import JOINT, JOINTS, make_skeleton
 from scenes import random_scene
 
 QUALITY = UncertaintyModel(noise=0.003, prior=4.0, shared=0.0)
@@ -297,3 +298,42 @@ def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
     ):
         assert made(batch).has_position.all()
         assert made.fitted(batch).uncertainty.noise == pytest.approx(float(2 / size), rel=0.3)
+
+
+MIXED = make_skeleton("x", "mixed", ("left_eye", *reversed(JOINTS)))
+"""The 17 in another order, behind one more."""
+
+
+def mixed(batch):
+    """The batch with the nose as the eye, too."""
+    order = [JOINT["nose"], *(JOINT[name] for name in MIXED.key_points[1:])]
+    changed = {name: getattr(batch, name)[:, :, order] for name in ("key_points", "confidence")}
+    return replace(batch, valid=batch.valid[:, :, order], **changed), order
+
+
+def test_the_learned_model_sees_the_17_of_any_skeleton():
+    batch = random_scene(2, frames=3, views=5).noisy(4, 0).batch()
+    other, order = mixed(batch)
+    expected = learned()(batch)
+    found = sound(learned().for_skeleton(MIXED)(other), other)
+    torch.testing.assert_close(found.points[:, 1:], expected.points[:, order[1:]])
+    torch.testing.assert_close(found.score, expected.score)
+    eye = random_scene(2, frames=3, views=5).points[:, JOINT["nose"]]
+    assert float((found.points[:, 0] - eye).norm(dim=-1).max()) < 100
+
+
+def test_observed_joints_are_means_in_the_images_where_all_parts_are_seen():
+    batch = random_scene(3, frames=4, views=3).batch()
+    at = [JOINT[name] for name in ("left_hip", "right_hip", "nose")]
+    hips = make_skeleton("x", "hips", ("left_hip", "right_hip", "nose"))
+    valid = batch.valid[:, :, at].clone()
+    valid[0, 0, 1] = False
+    confidence = torch.rand(valid.shape, dtype=torch.float64)
+    part = replace(batch, key_points=batch.key_points[:, :, at], valid=valid, confidence=confidence)
+    joints = observe_joints(part, hips)
+    pelvis = JOINT["pelvis"]
+    assert torch.equal(joints.valid[:, :, pelvis], valid[:, :, :2].all(-1))
+    assert not joints.valid[:, :, JOINT["head_top"]].any()
+    mean = part.key_points[:, :, :2].mean(2)
+    torch.testing.assert_close(joints.key_points[1:, :, pelvis], mean[1:])
+    torch.testing.assert_close(joints.confidence[1:, :, pelvis], confidence[1:, :, :2].amin(-1))

@@ -88,6 +88,7 @@ def prediction() -> PredictionResult:
         unit_mm=1.0,
         evaluation=Evaluation(3, {"linear": found, "x": found}),
         formats=[],
+        world={},
         provenance=PROVENANCE,
         verdict=Verdict((finding,), (BAD,)),
     )

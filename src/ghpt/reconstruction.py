@@ -69,11 +69,6 @@ class Reconstruction:
     def __len__(self) -> int:
         return len(self.frame)
 
-    def frames(self, rows: Int[Tensor, " N"]) -> Reconstruction:
-        """Return the frames at these positions."""
-        values = {field.name: getattr(self, field.name)[rows] for field in fields(self)}
-        return Reconstruction(**values)
-
     def select_joints(self, joints: Int[Tensor, " j"]) -> Reconstruction:
         """Return some of the joints, in this order."""
         chosen = {name: getattr(self, name).index_select(axis, joints) for name, axis in _AXIS}

@@ -285,6 +285,20 @@ def _mean(rows: Sequence[tuple[float, ...]], weights: Sequence[float]) -> tuple[
     )
 
 
+FINGERS = ("thumb", "forefinger", "middle_finger", "ring_finger", "pinky_finger")
+"""Of a hand, by COCO-WholeBody's names; each has four points from its root on."""
+
+
+def _knuckles(finger: str) -> list[str]:
+    return [f"{finger}{number}" for number in range(1, 5)]
+
+
+def hand_points(side: str) -> tuple[str, ...]:
+    """Return the 21 points of a hand, in the order that OpenPose, MediaPipe and COCO share."""
+    fingers = [point for finger in FINGERS for point in _knuckles(finger)]
+    return tuple(f"{side}_{point}" for point in ("hand_root", *fingers))
+
+
 def _both_sides(*chain: str) -> tuple[NamePair, ...]:
     """Return the bones of a chain on the left and on the right of the body."""
     bones = pairwise(chain)
@@ -312,6 +326,8 @@ HUMAN_BONES: tuple[NamePair, ...] = (
     *_both_sides("wrist", "index"),
     *_both_sides("wrist", "pinky"),
     *_both_sides("wrist", "thumb"),
+    *_both_sides("wrist", "hand_root"),
+    *(bone for finger in FINGERS for bone in _both_sides("hand_root", *_knuckles(finger))),
 )
 """Bones between the key points of people by name, whichever of them a detector has."""
 

@@ -69,6 +69,19 @@ _OWN_FORMATS = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if na
 _TIMED_FORMATS = ("trc", "c3d")
 _NOT_OF_SHARDS = ("command", "seed")
 """What shards do not depend on; where an estimator draws by the seed, its identity holds it."""
+_DEFAULTS = {
+    "person": 0,
+    "ckpt": None,
+    "joints": "detector",
+    "world": "cameras",
+    "floor": None,
+    "markers": None,
+}
+"""Of conf/predict.yaml, which the commands to type next repeat where they are others."""
+_FEW_JOINTS = (
+    "%s: the key points give too few of the 17 joints by name: the size of the person, the cameras "
+    "and exchanged sides are not checked (docs/skeletons.md)."
+)
 _log = logging.getLogger(__name__)
 
 
@@ -120,6 +133,11 @@ class PredictSettings(InputSettings):
     verdict: Target
     strict: bool
     seed: int
+
+    def changed(self) -> dict[str, object]:
+        """Return what says whose joints are written how, where it is not the default."""
+        values = {name: getattr(self, name) for name in _DEFAULTS}
+        return {name: value for name, value in values.items() if value != _DEFAULTS[name]}
 
     def __post_init__(self) -> None:
         for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
@@ -237,7 +255,7 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     measures = _measures(result)
     asked = camera_check.is_worthwhile(measures.view_errors)
     mistakes = check_cameras(sequence.as_joints(), camera_check) if asked else ()
-    commands = commands_on(settings, settings.person, settings.ckpt, output)
+    commands = commands_on(settings, settings.changed(), output)
     verdict = judge(measures, mistakes, result.unit_mm, commands)
     result = replace(result, verdict=verdict)
     _write_report(result, output)
@@ -360,6 +378,8 @@ def needed_key_points(settings: PredictSettings, sequence: Sequence) -> Sequence
     skeleton = sequence.skeleton
     if settings.ckpt or settings.joints == "human36m":
         skeleton.require_joints(sequence.source)
+    if not skeleton.has_joints:
+        _log.warning(_FEW_JOINTS, sequence.source)
     if settings.joints == "detector":
         return sequence
     parts = np.flatnonzero(skeleton.joint_weights.any(0))

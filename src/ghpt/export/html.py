@@ -31,7 +31,10 @@ from ghpt.geometry.masking import where
 from ghpt.reconstruction import About, Reconstruction
 
 MOST_FRAMES = 6000
-"""A page holds no more: 2.5 MB. Of longer recordings it has every n-th frame, and says so."""
+"""A page holds no more: 2.5 MB with 17 joints. Of longer recordings it has every n-th frame, and
+says so."""
+_MOST_JOINTS = 300_000
+"""In all frames of a page: those of 50 joints at the most frames, 7 MB."""
 _FRUSTUM = 300.0
 """Depth at which cameras are drawn, mm."""
 
@@ -58,7 +61,8 @@ def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = N
     ``about.origin``, which the page tells.
     """
     whole = extent(path, about, chunks)
-    stride = math.ceil(whole.count / MOST_FRAMES)
+    most = min(MOST_FRAMES, max(1, _MOST_JOINTS // max(len(about.joints), 1)))
+    stride = math.ceil(whole.count / most)
     parts = []
     up = torch.zeros(3, dtype=torch.float64)
     count = 0

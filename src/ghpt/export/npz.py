@@ -263,14 +263,14 @@ _OLD_WORLD = "the cameras' own"
 
 def _parse_meta(path: Path, meta: Any) -> _Meta:
     """Return the checked text ``meta``. Raises GhptDataError."""
-    content = meta if isinstance(meta, dict) else {}
+    content: dict[str, Any] = {"world": _OLD_WORLD}
+    content |= meta if isinstance(meta, dict) else {}
     version = content.get("format_version")
     own = content.get("format") == _FORMAT
     if type(version) is not int or version not in _POINTS or not own:
         known = " and ".join(map(str, _POINTS))
         problem = f"is {version!r}; this ghpt reads {known}"
         raise GhptDataError(path, "meta.format_version", problem, _HINT)
-    content = {"world": _OLD_WORLD} | content
     for field, types in _META_TYPES.items():
         if not isinstance(content.get(field, ...), types):
             raise GhptDataError(path, f"meta.{field}", f"is {content.get(field)!r}", _HINT)

@@ -16,8 +16,11 @@ _HEIGHT = 1750
 """mm: stands for the person's own."""
 
 
-def commands_on(inputs: InputSettings, person: int, ckpt: str | None, output: Path) -> Commands:
-    """Return the commands for what predict.py was given; each writes beside ``output``."""
+def commands_on(inputs: InputSettings, own: Mapping[str, object], output: Path) -> Commands:
+    """Return the commands for what predict.py was given; each writes beside ``output``.
+
+    ``own``: the settings of predict.py alone that are to stay as they are.
+    """
     keys = [key for key in InputSettings.__annotations__ if key != "data"]
     values = {key: getattr(inputs, key) for key in keys}
     given = {key: value for key, value in values.items() if value is not None}
@@ -25,9 +28,6 @@ def commands_on(inputs: InputSettings, person: int, ckpt: str | None, output: Pa
         del given["time"]
     if not inputs.keypoints:
         given |= {"data": inputs.data["name"]}
-    own: dict[str, object] = {"person": person} if person else {}
-    if ckpt:
-        own["ckpt"] = ckpt
 
     def command(script: str, suffix: str, values: Mapping[str, Any]) -> str:
         words = [setting(key, value) for key, value in values.items()]
@@ -36,7 +36,7 @@ def commands_on(inputs: InputSettings, person: int, ckpt: str | None, output: Pa
         )
 
     def predict(**more: Any) -> str:
-        return command("predict.py", "_again", given | own | more)
+        return command("predict.py", "_again", {**given, **own, **more})
 
     return Commands(
         cameras=command("cameras.py", "_checked", given),

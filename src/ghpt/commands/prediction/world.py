@@ -15,7 +15,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.similarity import Similarity
 from ghpt.geometry.upright import upright
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES
-from ghpt.reconstruction import About, Reconstruction, State, concatenate
+from ghpt.reconstruction import About, Reconstruction, State, concatenate, select_frames
 from ghpt.skeleton import JOINTS
 
 WORLDS = ("cameras", "people", "first")
@@ -131,6 +131,6 @@ def _sample(chunks: Chunks, total: int) -> Reconstruction:
     frames = 0
     for chunk in chunks():
         rows = torch.arange(-frames % step, len(chunk), step)
-        parts.append(chunk.frames(rows))
+        parts.append(select_frames(chunk, rows))
         frames += len(chunk)
     return concatenate(parts)

@@ -24,7 +24,11 @@ _LARGEST = 2 << 30
 _LONGEST_LINE = 1 << 12
 _MOST_PORTS = 1000
 _WRITE = "It must be an xy_*.csv that caliscope wrote."
-_JOINTS = len(SKELETONS["mediapipe_33"])
+_PLACES = np.full(221, -1)
+"""The place in ``mediapipe_75`` of a ``point_id``: of the body, the right and the left hand."""
+_PLACES[:33] = np.arange(33)
+_PLACES[100:121] = np.arange(33, 54)
+_PLACES[200:221] = np.arange(54, 75)
 
 _LARGEST_NUMBER = 1e12
 
@@ -42,34 +46,40 @@ def is_caliscope(text: str) -> bool:
 def read_caliscope(path: Path) -> Detections:
     """Return the one person of the table: 33 landmarks in the views ``cam_<port>``.
 
-    The frame numbers are ``sync_index``. Points beyond the body's (hands, face) are left out. There
-    is no confidence in these files. Raises GhptDataError for a table that is damaged, or that has a
-    point twice.
+    They are 75 with hands; points of the face are left out. The frame numbers are ``sync_index``.
+    There is no confidence in these files. Raises GhptDataError for a table that is damaged, or that
+    has a point twice.
     """
     table = _table(path)
     landmark = table[:, 2]
-    body = (landmark >= 0) & (landmark < _JOINTS)
-    table = table[body & np.isfinite(table).all(1)]
-    if not len(table):
-        problem = f"has no body landmark (0 to {_JOINTS - 1})"
+    known = (landmark >= 0) & (landmark < len(_PLACES))
+    table = table[known & np.isfinite(table).all(1)]
+    place = _PLACES[table[:, 2].astype(np.int64)]
+    table = table[place >= 0]
+    joint = place[place >= 0]
+    body = len(SKELETONS["mediapipe_33"])
+    if not (joint < body).any():
+        problem = f"has no body landmark (0 to {body - 1})"
         raise GhptDataError(path, "point_id", problem, _WRITE)
-    frame, port, joint = table[:, :3].astype(np.int64).T
+    has_hands = bool((joint >= body).any())
+    names = SKELETONS["mediapipe_75" if has_hands else "mediapipe_33"]
+    frame, port = table[:, :2].astype(np.int64).T
     frames, row = np.unique(frame, return_inverse=True)
     ports, view = np.unique(port, return_inverse=True)
     if len(ports) > _MOST_PORTS:
         raise GhptDataError(path, "port", f"names {len(ports)} cameras", _WRITE)
-    cell = (row * len(ports) + view) * _JOINTS + joint
+    cell = (row * len(ports) + view) * len(names) + joint
     if len(np.unique(cell)) != len(cell):
         problem = "a point is there twice in a frame of a camera"
         raise GhptDataError(path, "point_id", problem, _WRITE)
-    shape = (len(frames), len(ports), _JOINTS)
+    shape = (len(frames), len(ports), len(names))
     points = np.zeros((*shape, 2))
     valid = np.zeros(shape, np.bool_)
     points.reshape(-1, 2)[cell] = table[:, 3:5]
     valid.reshape(-1)[cell] = True
     views = tuple(f"cam_{port}" for port in ports)
     key_points = KeyPoints(points, valid.astype(np.float64), valid)
-    return Detections.of_person(path, views, SKELETONS["mediapipe_33"], frames, key_points)
+    return Detections.of_person(path, views, names, frames, key_points)
 
 
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:

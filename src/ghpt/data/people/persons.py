@@ -82,7 +82,7 @@ def detector_sequence(
         cameras=ordered,
         frame=people.frame.astype(np.int64),
         rate_hz=people.rate_hz,
-        points=KeyPointArrays(ideal.take(chosen), raw),
+        points=KeyPointArrays(ideal.take(chosen), raw.masked()),
         skeleton=people.skeleton,
     )
 

@@ -90,6 +90,7 @@ def spread_runs(frames: int, total: int, length: int) -> Rows:
     """Return at most about ``total`` of the rows of a recording: runs of ``length``, spread."""
     if frames <= total:
         return np.arange(frames)
+    length = min(length, total)
     count = max(1, total // length)
     starts = np.linspace(0, frames - length, count).astype(np.int64)
     return np.unique(starts[:, None] + np.arange(length))
