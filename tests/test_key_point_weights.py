@@ -1,6 +1,7 @@
 """The weight of each key point: features, network, training, and the weights that ship."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -158,3 +159,12 @@ def test_no_frames_give_no_poses(labelled: Labelled):
 def test_an_unknown_name_of_weights_is_refused():
     with pytest.raises(GhptConfigError, match="key_points"):
         load_shipped("none")
+
+
+def test_a_schedule_changes_the_learning_rate_step_by_step(model):
+    model.schedule = partial(torch.optim.lr_scheduler.ExponentialLR, gamma=0.5)
+    configured = model.configure_optimizers()
+    configured["optimizer"].step()
+    configured["lr_scheduler"]["scheduler"].step()
+    assert configured["optimizer"].param_groups[0]["lr"] == pytest.approx(1e-2)
+    assert configured["lr_scheduler"]["interval"] == "step"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -62,6 +62,9 @@ class Estimator(ABC):
 
     Its points have the dtype of the key points.
     """
+
+    sort: ClassVar[str] = "a classical estimator"
+    """What it is, in a sentence."""
 
     @abstractmethod
     def triangulate(self, batch: Observations) -> Triangulation:

@@ -32,6 +32,8 @@ class FrameLearned(Estimator):
     Those of them that are key points themselves are its own; all others have the first estimate.
     """
 
+    sort = "by weights that come with ghpt"
+
     weights: str
     skeleton: Skeleton = HUMAN36M
 
