@@ -23,7 +23,7 @@ from ghpt.observations import Labelled
 from ghpt.skeleton import JOINTS
 
 RANSAC = {"threshold": 0.02, "pairs": 24, "adapt": 5.0, "quantile": 0.55, "rounds": 4}
-LEARNED = FrameLearned("key_points")
+LEARNED = FrameLearned("key_points", trust=1.0)
 
 
 @pytest.fixture(scope="module")

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ghpt.errors import check
 from ghpt.geometry.triangulation import Triangulation, concatenate
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.predictors import observe_joints
@@ -28,6 +29,10 @@ class FrameLearned(Estimator):
     AdaptiveRansac, which also stands where the weights leave a joint without a point; a view counts
     as one that made a joint as it does there.
 
+    ``trust``: in a frame whose views disagree as a whole (cameras that are off, much noise) the
+    logits are multiplied by the smallest threshold of RANSAC over that of the frame, to this power:
+    what a network says of single views is worth little there. 0: they never are.
+
     The network knows the 17 joints, which are means of the ``skeleton``'s key points in the images.
     Those of them that are key points themselves are its own; all others have the first estimate.
     """
@@ -35,7 +40,11 @@ class FrameLearned(Estimator):
     sort = "by weights that come with ghpt"
 
     weights: str
+    trust: float
     skeleton: Skeleton = HUMAN36M
+
+    def __post_init__(self) -> None:
+        check(self.trust >= 0, "trust", f"is {self.trust}", "It must be >= 0.")
 
     def for_skeleton(self, skeleton: Skeleton) -> FrameLearned:
         return replace(self, skeleton=skeleton)
@@ -67,7 +76,10 @@ class FrameLearned(Estimator):
         start = problem.start.triangulate(batch)
         key_points = KeyPoints(batch, PoseEstimate(start.points, start.has_position))
         logits = model.scorer(problem.featurize(key_points))
-        result = problem.triangulate(key_points, logits.softmax(dim=-1))
+        threshold = problem.start.inlier_threshold(batch, start.points)
+        trust = (problem.start.threshold / threshold) ** self.trust
+        weights = (logits * trust[:, None]).softmax(dim=-1)
+        result = problem.triangulate(key_points, weights)
         return result.with_fallback(result.ok, start)
 
     def inlier_threshold(
