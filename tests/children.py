@@ -30,6 +30,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import IO
 
+import quick_yaml
 import sizes
 
 ADDRESS = "GHPT_TEST_FORK_SERVER"
@@ -302,6 +303,7 @@ def fork_ranks() -> None:
 
 
 def import_modules() -> None:
+    quick_yaml.use_libyaml()
     for module in MODULES:
         importlib.import_module(module)
     gc.collect()

@@ -1,5 +1,7 @@
 """Fixtures shared by all tests."""
 
+from __future__ import annotations
+
 import logging
 import os
 import shutil
@@ -8,25 +10,26 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import pytest
-import torch
 import yaml
 
 import children
-import toys
-from ghpt.commands.app import Command, run
-from ghpt.data.synthetic import recordings as synthetic
-from ghpt.report import pair_tensorboard, tensorboard
+import quick_yaml
+
+if TYPE_CHECKING:  # the process that only hands out tests to others does not import torch
+    from ghpt.commands.app import Command
 
 ROOT = Path(__file__).resolve().parents[1]
 WORKER = "PYTEST_XDIST_WORKER" in os.environ
 if WORKER:  # each of several test processes has its own core, and so have the commands that it runs
+    import torch
+
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
+quick_yaml.use_libyaml()
 
 FIRST = (
     "test_docs.py",
@@ -116,6 +119,8 @@ def little_data(monkeypatch: pytest.MonkeyPatch) -> None:
     """Synthetic data sets of one subject a split and some frames, in a cache of their own, which
     all tests share.
     """
+    from ghpt.data.synthetic import recordings as synthetic
+
     frames = {"train": 16, "validation": 16, "test": 80}
     subjects = {"train": ("S1",), "validation": ("S8",), "test": ("S9",)}
     monkeypatch.setattr(synthetic, "HUMAN36M_FRAMES", frames)
@@ -126,16 +131,19 @@ def little_data(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """TensorBoard's figures stay blank: to draw them is most of what a small test costs."""
-    blank = np.zeros((8, 8, 3), np.uint8)
-    monkeypatch.setattr(tensorboard, "image", lambda figure: blank)
-    monkeypatch.setattr(pair_tensorboard, "image", lambda figure: blank)
+def blank_figures() -> Iterator[None]:
+    """Figures stay blank, see `blank`."""
+    import blank
+
+    with blank.blank_figures():
+        yield
 
 
 @pytest.fixture(scope="session")
 def conf(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The project's configuration with one more data set, ``toy``, which is made at once."""
+    import toys
+
     folder = tmp_path_factory.mktemp("conf") / "conf"
     shutil.copytree(ROOT / "conf", folder)
     (folder / "data" / "toy.yaml").write_text(yaml.safe_dump(toys.DATA))
@@ -148,6 +156,8 @@ def typed(
 ) -> Callable[..., tuple[int, str, str]]:
     """``typed(conf, command, words)`` runs train.py in this process: (exit status, stdout,
     stderr)."""
+    from ghpt.commands.app import run
+
     handlers, level = list(logging.root.handlers), logging.root.level
     monkeypatch.setenv("HYDRA_FULL_ERROR", "0")
 

@@ -9,13 +9,14 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import torch
 from torch import Tensor
 
+from composed import CONF as CONF
+from composed import compose
 from ghpt.commands.predict import PredictSettings, predict
-from ghpt.config import plain, settings
+from ghpt.config import settings
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.people.sequence import Sequence
 from ghpt.data.points import KeyPoints
@@ -23,7 +24,6 @@ from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
 QUICK = (
     "trainer.accelerator=cpu",
     "progress_bar=false",
@@ -35,9 +35,7 @@ QUICK = (
 
 def config(*words: str) -> PredictSettings:
     """conf/predict.yaml with these overrides, as predict.py gets it."""
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = hydra.compose("predict", overrides=[*QUICK, *map(str, words)])
-        return settings(PredictSettings, plain(composed))
+    return settings(PredictSettings, compose("predict", *QUICK, *words))
 
 
 def numbers_of(settings: PredictSettings, output: Path) -> dict[str, Any]:

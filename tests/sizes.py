@@ -31,7 +31,7 @@ KILLED_PREDICTIONS = _size(6, 200)
 """B3: kills of a prediction."""
 PREDICTED_FRAMES = _size(1_000, 100_000)
 """B3: frames of that prediction."""
-TRAINING_STEPS = _size(450, 20_000)
+TRAINING_STEPS = _size(240, 20_000)
 """E3: steps of a long training."""
 STREAMED_FRAMES = _size(18_000, 1_000_000)
 """E2: frames of a prediction whose memory stays flat."""
@@ -45,6 +45,10 @@ BATCHED_FRAMES = _size(3, 64)
 """C4: frames that are computed one by one."""
 ADJUSTMENTS = _size(75, 10_000)
 """D5: starts of the bundle adjustment."""
+SCENE_FRAMES = _size(28, 64)
+"""C4: frames of their batch."""
+CALIBRATED_RIGS = _size(8, 24)
+"""Rigs whose uncertainty is compared with their error."""
 GOOD_RIGS = _size(2, 100)
 """D6: recordings that give a good rig."""
 SCALED_RIGS = _size(8, 300)

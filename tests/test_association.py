@@ -14,6 +14,7 @@ from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.data.people.association import associate
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.persons import (
+    follow_anybody,
     person_sequence,
     select_person,
     tell_apart,
@@ -237,6 +238,45 @@ def test_detections_of_nobody_make_nobody(detector):
     owners = [recording.owner[chosen[chosen >= 0]] for chosen in everybody(recording)]
     assert sorted(np.bincount(owner + 1).argmax() - 1 for owner in owners) == [0, 1]
     assert all((owner >= 0).mean() > 0.97 for owner in owners)
+
+
+@pytest.fixture(scope="module")
+def crossing(detector) -> PeopleRecording:
+    """Two people of whom each view shows another one larger for a while."""
+    stays = [Stay("Walking", (0, 0)), Stay("Walking", (500, 300))]
+    return record_people("crossing", Scene([3, 8, 12, 18], stays, 60, 30.0), detector, 0)
+
+
+def owners_of(recording: PeopleRecording, cameras: CameraSet) -> np.ndarray:
+    """Whom the cameras are judged by, in each frame and view; -1 where by nobody."""
+    people = recording.detections
+    chosen = follow_anybody(people, cameras, range(len(people.views)), people.points)
+    return np.where(chosen >= 0, recording.owner[chosen], -1)
+
+
+def test_cameras_are_judged_by_one_person_in_all_views(crossing):
+    owners = owners_of(crossing, crossing.cameras)
+    assert (owners >= 0).mean() > 0.95
+    mixed = [len(set(row[row >= 0])) > 1 for row in owners]
+    assert np.mean(mixed) < 0.02
+
+
+def test_a_camera_that_is_off_is_not_left_out_of_its_judgement(crossing):
+    """Turned by 15 degrees it agrees with nobody, and goes on with whom it tracks best."""
+    rig = crossing.cameras
+    angle = np.deg2rad(15)
+    turn = np.array(
+        [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
+    )
+    R = rig.cameras.R.clone()
+    t = rig.cameras.t.clone()
+    R[1] = R.new_tensor(turn) @ R[1]
+    t[1] = t.new_tensor(turn) @ t[1]
+    owners = owners_of(crossing, replace(rig, R=R, t=t))
+    assert (owners[:, 1] >= 0).mean() > 0.95
+    others = owners[:, [0, 2, 3]]
+    mixed = [len(set(row[row >= 0])) > 1 for row in others]
+    assert np.mean(mixed) < 0.02
 
 
 def everybody(recording: PeopleRecording) -> list[np.ndarray]:

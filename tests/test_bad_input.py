@@ -11,23 +11,20 @@ import math
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import pytest
 import torch
 
 import toys
-from ghpt.config import build, plain
+from composed import compose
+from ghpt.config import build
 from ghpt.errors import GhptConfigError, GhptDataError, GhptError
 from ghpt.files import atomic_write
 from toys import train
 
-CONF = Path(__file__).resolve().parents[1] / "conf"
-
 
 def config(*overrides: str) -> dict[str, Any]:
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        composed = plain(hydra.compose("train", ["output=none", "progress_bar=false", *overrides]))
+    composed = compose("train", "progress_bar=false", *overrides)
     composed["model"]["scorer"]["layers"] = [4]
     composed["trainer"] |= {"accelerator": "cpu", "devices": 1}
     return composed
@@ -189,8 +186,7 @@ def _whole(path: tuple[str, ...]) -> bool:
 
 @pytest.mark.parametrize("baseline", ["ransac", "m_estimator", "lo_ransac", "weighted_linear"])
 def test_every_number_of_a_baseline_too(baseline):
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        settings = plain(hydra.compose("test", ["output=none"]))["baselines"][baseline]
+    settings = compose("test")["baselines"][baseline]
     for path in numbers(settings):
         if path[-1] != "seed":
             with pytest.raises(GhptConfigError, match=f"^baselines.{baseline}.{path[-1]}: is -1"):

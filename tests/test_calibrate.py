@@ -4,6 +4,7 @@ fails.
 
 import json
 import re
+import shutil
 import tomllib
 from dataclasses import replace
 from pathlib import Path
@@ -13,11 +14,13 @@ import numpy as np
 import pytest
 import torch
 
-from composed import cameras_settings
+from blank import blank_figures
+from composed import calibrate_settings, cameras_settings
 from ghpt.calibration.comparison import rig_difference
 from ghpt.calibration.findings import Severity
-from ghpt.commands.calibrate import COMMAND, people_findings
+from ghpt.commands.calibrate import COMMAND, calibrate, files, people_findings
 from ghpt.commands.cameras import check_cameras
+from ghpt.commands.outputs import OutputFolder
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.synthetic.recordings import draw_motion
@@ -29,6 +32,8 @@ from predicting import config, numbers_of
 from single_person import SinglePerson, write_person
 
 ROOT = Path(__file__).resolve().parents[1]
+QUICK_CHECK = ("camera_check.frames=16", "camera_check.shift=2")
+"""The check of the file's own extrinsics, which tests/test_camera_check.py tests, made small."""
 OUTPUTS = {
     "calibration.json",
     "report.md",
@@ -43,7 +48,7 @@ OUTPUTS = {
 
 
 @pytest.fixture
-def command(monkeypatch, typed):
+def command(monkeypatch, typed, blank_figures):
     """``command(*words)`` runs calibrate.py in this process: (exit status, stdout, stderr)."""
     monkeypatch.setenv("COLUMNS", "120")
     return lambda *words: typed(ROOT / "conf", COMMAND, words)
@@ -86,19 +91,38 @@ def write(folder, scene, extrinsics: bool = True):
         f"cameras={folder / 'cameras.toml'}",
         f"output={folder / 'rig'}",
         "evaluated_frames=20",
+        *QUICK_CHECK,
     )
 
 
-def test_intrinsics_and_a_height_give_the_rig_in_every_format(command, scene, tmp_path):
+@pytest.fixture(scope="module")
+def earlier_run(scene, tmp_path_factory):
+    """A folder with a scene and the rig that calibrate.py has made of it."""
+    folder = tmp_path_factory.mktemp("earlier")
+    words = write(folder, scene)
+    settings = calibrate_settings(*words)
+    with blank_figures(), OutputFolder(folder / "rig", files(settings)):
+        calibrate(settings, folder / "rig")
+    return folder
+
+
+@pytest.fixture
+def after_a_run(earlier_run, tmp_path):
+    """The same in a folder of the test's own, as a command finds it."""
+    shutil.copytree(earlier_run, tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+def test_intrinsics_and_a_height_give_the_rig_in_every_format(typed, scene, tmp_path):
     rig, _, truth = scene
     thigh = float(
         np.median(
             np.linalg.norm(truth[:, JOINT["left_hip"]] - truth[:, JOINT["left_knee"]], axis=-1)
         )
     )
-    status, said, errors = command(
-        *write(tmp_path, scene, extrinsics=False), f"scale.segments={{left_thigh: {thigh}}}"
-    )
+    words = write(tmp_path, scene, extrinsics=False)
+    words = (*words, f"scale.segments={{left_thigh: {thigh}}}")
+    status, said, errors = typed(ROOT / "conf", COMMAND, words)
     assert status == 0, errors
     output = tmp_path / "rig"
     assert {file.name for file in output.iterdir()} >= OUTPUTS
@@ -137,17 +161,14 @@ def test_a_height_comes_back_from_every_command(command, scene, tmp_path):
     keypoints, *words = write(tmp_path, scene)
     assert command(keypoints, *words, "scale.height=1750")[0] == 0
     again = f"cameras={tmp_path / 'rig' / 'rig.toml'}"
-    checked = check_cameras(cameras_settings(keypoints, again), tmp_path)
+    checked = check_cameras(cameras_settings(keypoints, again, *QUICK_CHECK), tmp_path)
     assert checked.stature_mm == pytest.approx(1750, rel=0.01)
-    predicted = numbers_of(
-        config(keypoints, again, "evaluated_frames=80", "formats=[npz]"), tmp_path / "out"
-    )
+    predicted = numbers_of(config(keypoints, again, "formats=[npz]"), tmp_path / "out")
     assert predicted["stature_mm"] == pytest.approx(1750, rel=0.01)
 
 
 def test_extrinsics_in_the_file_are_compared_with_and_not_used(command, scene, tmp_path):
     rig, _, _ = scene
-    write(tmp_path, scene)
     words = write(tmp_path, scene)
     status, said, errors = command(*words, "scale.baseline=[cam_00,cam_03,8000]")
     assert status == 0, errors
@@ -220,31 +241,30 @@ def test_bad_input_ends_in_one_line(words, says, command, scene, tmp_path):
     assert not any((tmp_path / "rig" / name).exists() for name in OUTPUTS)
 
 
-def test_a_camera_that_an_error_concerns_is_in_no_file(command, scene, tmp_path):
+def test_a_camera_that_an_error_concerns_is_in_no_file(command, scene, after_a_run):
     """Its key points are another person's: noise."""
     rig, points, _ = scene
     values = points.key_points.copy()
     values[:, 2] = np.random.default_rng(1).uniform(100, 900, values[:, 2].shape)
-    write(tmp_path, scene)
-    assert command(*write(tmp_path, scene))[0] == 0  # an earlier run, whose files must not survive
-    status, _, errors = command(*write(tmp_path, (rig, replace(points, key_points=values), None)))
+    words = write(after_a_run, (rig, replace(points, key_points=values), None))
+    status, _, errors = command(*words)  # the files of the earlier run must not survive
     assert status == 1
     assert "only cam_00, cam_01, cam_03 are in the rig's files" in errors
     for name in ("rig.toml", "rig_anipose.toml", "intri.yml"):
-        assert read_cameras(tmp_path / "rig" / name).names == ("cam_00", "cam_01", "cam_03")
-    numbers = json.loads((tmp_path / "rig" / "calibration.json").read_text())
+        assert read_cameras(after_a_run / "rig" / name).names == ("cam_00", "cam_01", "cam_03")
+    numbers = json.loads((after_a_run / "rig" / "calibration.json").read_text())
     assert [camera["calibrated"] for camera in numbers["cameras"]] == [True, True, False, True]
     assert numbers["cameras"][2]["R"] is None
 
 
-def test_without_a_usable_rig_there_is_none(command, scene, tmp_path):
+def test_without_a_usable_rig_there_is_none(command, scene, after_a_run):
     rig, points, _ = scene
     noise = np.random.default_rng(1).uniform(100, 900, points.key_points.shape)
-    assert command(*write(tmp_path, scene))[0] == 0
-    status, said, errors = command(*write(tmp_path, (rig, replace(points, key_points=noise), None)))
+    words = write(after_a_run, (rig, replace(points, key_points=noise), None))
+    status, said, errors = command(*words)
     assert status == 1
     assert "no rig is written" in errors
-    left = {file.name for file in (tmp_path / "rig").iterdir()} & OUTPUTS
+    left = {file.name for file in (after_a_run / "rig").iterdir()} & OUTPUTS
     assert left <= {"calibration.json", "report.md", "rig.png", "rig.svg"}
     assert "error" in said
 

@@ -6,12 +6,12 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import hydra
 import numpy as np
 import pytest
 import torch
 
 import sizes
+from composed import compose
 from ghpt.calibration.check.agreement import agreement, errors, median
 from ghpt.calibration.check.breakages import BREAKAGES, POSE_BREAKAGES, Case
 from ghpt.calibration.check.camera_check import merge_steps
@@ -20,7 +20,7 @@ from ghpt.calibration.check.resection import resect
 from ghpt.calibration.check.setup import RayCache, setup_of
 from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.mistakes import exchanged
-from ghpt.config import build, plain
+from ghpt.config import build
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.people.persons import person_sequence
@@ -38,8 +38,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @cache
 def camera_check(**changed):
-    with hydra.initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-        config = plain(hydra.compose("cameras", ["output=unused"]))["camera_check"]
+    config = compose("cameras")["camera_check"]
     return build(config | {"frames": 24, "shift": 12} | changed, "camera_check")
 
 

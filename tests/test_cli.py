@@ -19,7 +19,7 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 import children
 import ghpt.commands.test as testing
 import toys
-from ghpt.commands.display import shell_override
+from ghpt.commands.display import as_started, shell_override
 from ghpt.commands.train import COMMAND
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
@@ -109,7 +109,9 @@ def test_train_then_test_as_typed(command, tmp_path):
     assert f"{metrics['selections']['weight']['mpjpe_relative']:.1f}" in table
 
 
-def test_a_frame_with_too_few_views_is_missing_in_the_file_and_never_invented(command, tmp_path):
+def test_a_frame_with_too_few_views_is_missing_in_the_file_and_never_invented(
+    command, blank_figures, tmp_path
+):
     few = ("data=toy", "data.missing=0.6", "progress_bar=false", "trainer.accelerator=cpu")
     assert (
         command(
@@ -398,3 +400,27 @@ def test_an_interrupt_while_the_data_are_prepared_leaves_nothing(tmp_path, monke
         )
     assert stop.value.code == 130
     assert files(tmp_path) == []
+
+
+@pytest.mark.parametrize("words", [("--help",), ("train", "--help")])
+def test_help_that_nobody_reads_ends_without_a_word(words):
+    reading, writing = os.pipe()
+    os.close(reading)
+    program = [sys.executable, "-m", "ghpt", *words]
+    environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
+    ended = subprocess.run(program, stdout=writing, stderr=subprocess.PIPE, env=environment)
+    os.close(writing)
+    assert (ended.returncode, ended.stderr) == (1, b"")
+
+
+@pytest.mark.parametrize(
+    ("program", "said"),
+    [
+        ("train.py", "Run python test.py ckpt=x; train.py wrote it, mytrain.py did not"),
+        ("ghpt train", "Run ghpt test ckpt=x; ghpt train wrote it, mytrain.py did not"),
+    ],
+)
+def test_commands_are_named_as_the_program_was_started(monkeypatch, program, said):
+    monkeypatch.setattr(sys, "argv", [program])
+    text = "Run python test.py ckpt=x; train.py wrote it, mytrain.py did not"
+    assert as_started(text) == said

@@ -28,7 +28,7 @@ CHANGES = {
     "a figure": ("report/figures.py", "\nONE = 1\n"),
 }
 PROGRAM = """
-import json, sys
+import ast, functools, json, sys
 from pathlib import Path
 from ghpt.paper.engine import code
 names = frozenset({
@@ -36,6 +36,10 @@ names = frozenset({
     "ghpt.models.relative_pose.baselines.PoseLib",
     "ghpt.data.datasets.arrangements.Human36M",
 })
+@functools.cache
+def parsed(content):
+    return ast.parse(content)
+code._parse = lambda file: parsed(file.read_bytes())
 def digest():
     code.code_digest.cache_clear()
     code.source_meaning.cache_clear()

@@ -1,27 +1,18 @@
 """Every choice of the configuration composes and builds, and its numbers are the paper's."""
 
-import functools
 from pathlib import Path
-from typing import Any
 
-import hydra
 import lightning as L
 import pytest
 
-from ghpt.config import build, check_arguments, plain
+from composed import compose
+from ghpt.config import build, check_arguments
 
 CONF = Path(__file__).resolve().parents[1] / "conf"
 
 
 def choices(group: str) -> list[str]:
     return sorted(path.stem for path in (CONF / group).glob("[!_]*.yaml"))
-
-
-@functools.cache
-def compose(name: str, *overrides: str) -> dict[str, Any]:
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        config = hydra.compose(name, overrides=["output=none", *overrides])
-    return plain(config)
 
 
 def test_the_groups_hold_the_issue_s_choices():

@@ -9,14 +9,13 @@ import signal
 import subprocess
 from pathlib import Path
 
-import hydra
 import numpy as np
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import children
 import toys
-from ghpt.config import plain
+from composed import compose
 from ghpt.models.checkpoint import read_checkpoint
 from toys import train
 
@@ -70,11 +69,7 @@ def typed_for_two(conf, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def composed(conf):
-    def compose(name, *words):
-        with hydra.initialize_config_dir(str(conf), version_base="1.3"):
-            return plain(hydra.compose(name, overrides=[*SMALL, "output=none", *words]))
-
-    return compose
+    return lambda name, *words: compose(name, *SMALL, *words, conf=conf)
 
 
 @pytest.fixture(scope="module", params=MODELS)

@@ -60,6 +60,12 @@ class Accepted(Exception):
 
 
 @pytest.fixture(scope="module")
+def workplace(tmp_path_factory):
+    """The files that the pages name; each page works in a copy."""
+    return documented.workplace(tmp_path_factory.mktemp("workplace"))
+
+
+@pytest.fixture(scope="module")
 def models(tmp_path_factory):
     """A folder in which the models of ``LAID_OUT`` will lie."""
     return tmp_path_factory.mktemp("models")
@@ -71,7 +77,7 @@ class Page:
     def __init__(
         self, folder: Path, typed: Callable[..., tuple[int, str, str]], monkeypatch: Any
     ) -> None:
-        self.folder, self.typed, self.monkeypatch = documented.workplace(folder), typed, monkeypatch
+        self.folder, self.typed, self.monkeypatch = folder, typed, monkeypatch
         self.conf = documented.own_conf(folder)
         self.names: dict[str, Any] = {"detect": documented.detected}
         self.laid_out: set[str] = set()
@@ -264,11 +270,12 @@ def lay_out(runner: Page, models: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_commands_and_the_code_of_a_page_run(
-    page, tmp_path, models, little_data, blank_figures, typed, monkeypatch
+    page, tmp_path, workplace, models, little_data, blank_figures, typed, monkeypatch
 ):
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
+    shutil.copytree(workplace, tmp_path, dirs_exist_ok=True)
     runner = Page(tmp_path, typed, monkeypatch)
     for block in documented.blocks(page):
         if not block.language:

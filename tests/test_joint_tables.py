@@ -83,14 +83,23 @@ DOCUMENTED |= {
     "coco_133": whole_body(f"{DOCUMENTED['coco_17']}, {COCO_FEET}", WHOLE_BODY["coco_133"]),
     "halpe_136": whole_body(DOCUMENTED["halpe_26"], WHOLE_BODY["halpe_136"]),
 }
-HANDS_75 = [
-    f"{33 + 21 * hand + i} {side} {part}"
-    for hand, side in enumerate(("right", "left"))
-    for i, part in enumerate(
-        ("hand root", *(f"{finger}{k}" for finger in FINGERS for k in (1, 2, 3, 4)))
-    )
-]
-DOCUMENTED["mediapipe_75"] = ", ".join([DOCUMENTED["mediapipe_33"], *HANDS_75])
+
+
+def with_hands(body: str, first: int, sides: tuple[str, str]) -> str:
+    parts = ("hand root", *(f"{finger}{k}" for finger in FINGERS for k in (1, 2, 3, 4)))
+    words = [
+        f"{first + 21 * hand + i} {side} {part}"
+        for hand, side in enumerate(sides)
+        for i, part in enumerate(parts)
+    ]
+    return ", ".join([DOCUMENTED[body], *words])
+
+
+DOCUMENTED |= {
+    "mediapipe_75": with_hands("mediapipe_33", 33, ("right", "left")),
+    "body_25_hands": with_hands("body_25", 25, ("left", "right")),
+    "coco_18_hands": with_hands("coco_18", 18, ("left", "right")),
+}
 OUR_WORDS = {
     "Chest": "spine",
     "Nose": "nose",
@@ -277,6 +286,8 @@ SOURCES |= {
     "coco_133": SOURCES["coco_17"],
     "halpe_136": SOURCES["halpe_26"],
     "mediapipe_75": SOURCES["mediapipe_33"],
+    "body_25_hands": SOURCES["body_25"],
+    "coco_18_hands": SOURCES["coco_18"],
 }
 
 

@@ -45,7 +45,7 @@ def child(folder: str, frames: int) -> None:
     config = toys.TRAIN | {
         "data": data,
         "ckpt": f"{folder}/last.ckpt",
-        "hypotheses": None,
+        "hypotheses": 4,
         "baselines": baselines,
     }
     peak = [0.0]

@@ -250,3 +250,58 @@ def test_the_real_recording(shared_data):
     )
     # of the other person, at the edge of two views, less than 500 pixels are seen
     assert (np.linalg.norm(size[1] - size[0], axis=-1) > 500).all()
+
+
+def write_with_hands(folder, hands):
+    """Two frames of a walker's body in two views; ``hands`` of each frame, by OpenPose's name."""
+    body = person_of("body_25")
+    for view in ("cam1", "cam2"):
+        (folder / view).mkdir(parents=True)
+        for frame, own in enumerate(hands):
+            points = {name: values.ravel().tolist() for name, values in own.items()}
+            content = {"people": [{"pose_keypoints_2d": body.ravel().tolist(), **points}]}
+            (folder / view / f"{view}_{frame}_keypoints.json").write_text(json.dumps(content))
+    return folder
+
+
+def person_of(skeleton):
+    """A standing person of a skeleton, with distinct places."""
+    height = {"ankle": 0, "heel": 0, "toe": 0, "knee": 50, "hip": 95, "neck": 145, "shoulder": 143}
+    height |= {"elbow": 115, "wrist": 95}
+    rows = []
+    for name in SKELETONS[skeleton]:
+        side = 20 if "left" in name else -20 if "right" in name else 0
+        up = next((h for part, h in height.items() if part in name), 160)
+        rows.append((500 + side, 500 - up + len(rows) / 100, 0.9))
+    return np.array(rows)
+
+
+HAND = np.stack([np.arange(21) + 300.0, np.arange(21) + 400.0, np.full(21, 0.8)], axis=-1)
+
+
+def test_openpose_s_hands_come_behind_the_body(tmp_path):
+    """A hand that is not found in a frame is missing there."""
+    found = read_key_points(
+        write_with_hands(
+            tmp_path, [{"hand_left_keypoints_2d": HAND}, {"hand_left_keypoints_2d": HAND[:0]}]
+        )
+    )
+    assert found.joints == SKELETONS["body_25_hands"]
+    left = [found.joints.index(name) for name in SKELETONS["body_25_hands"][25:46]]
+    first, second = found.points[:2].valid
+    assert first[left].all()
+    assert not second[left].any()
+    assert not first[46:].any()
+    np.testing.assert_array_equal(found.points.pixels[0][left], HAND[:, :2])
+
+
+def test_hands_are_left_out_for_a_skeleton_without_them(tmp_path):
+    folder = write_with_hands(tmp_path, [{"hand_right_keypoints_2d": HAND}])
+    assert read_key_points(folder, "body_25").joints == SKELETONS["body_25"]
+    assert read_key_points(folder, "body_25_hands").joints == SKELETONS["body_25_hands"]
+
+
+def test_half_a_hand_is_named(tmp_path):
+    folder = write_with_hands(tmp_path, [{"hand_left_keypoints_2d": HAND[:20]}])
+    with pytest.raises(GhptDataError, match=r"hand_left_keypoints_2d: are 20 points, not 21"):
+        read_key_points(folder)

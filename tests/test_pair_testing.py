@@ -4,15 +4,14 @@ import json
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import toys
+from composed import compose
 from ghpt.commands.test import summary
-from ghpt.config import plain
 from ghpt.errors import GhptConfigError
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.predictions import open_predictions
@@ -31,10 +30,7 @@ BASELINES = {"eight_point": {"_target_": "ghpt.models.relative_pose.baselines.Ei
 
 
 def model() -> dict[str, Any]:
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return plain(hydra.compose("train", overrides=["output=none", "model=camera", *SMALL]))[
-            "model"
-        ]
+    return compose("train", "model=camera", *SMALL)["model"]
 
 
 @pytest.fixture(scope="module")

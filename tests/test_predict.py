@@ -5,15 +5,15 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import hydra
 import numpy as np
 import pytest
 import torch
 
 import children
+from composed import compose
 from ghpt.commands import predict as module
 from ghpt.commands.predict import COMMAND, predict
-from ghpt.config import build, plain
+from ghpt.config import build
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.export import read_reconstruction
@@ -76,8 +76,7 @@ def result(folder: Path):
 def checkpoint(folder: Path, model: str) -> Path:
     """An untrained model, as train.py stores it."""
     small = [f"model={model}", "model.hypotheses=8", "model.scorer.layers=[4]"]
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        settings = plain(hydra.compose("train", overrides=small))["model"]
+    settings = compose("train", *small)["model"]
     built = build(settings, "model")
     built.scorer.standardise.fit(torch.randn(100, built.problem.feature_size))
     ours = {

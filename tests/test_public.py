@@ -1,5 +1,6 @@
 """The names that `import ghpt` promises, and that asking for them costs nothing before."""
 
+import json
 import subprocess
 import sys
 import time
@@ -131,6 +132,14 @@ def test_arrays_are_written_in_every_format(tmp_path, suffix):
     points[3, 5] = np.nan
     ghpt.write_poses(tmp_path / f"walk.{suffix}", points, rate_hz=50)
     assert (tmp_path / f"walk.{suffix}").stat().st_size > 1000
+
+
+def test_a_page_shows_the_cameras_that_made_the_poses(key_points, tmp_path):
+    poses = ghpt.triangulate(key_points, ARRAYS)
+    ghpt.write_poses(tmp_path / "walk.html", poses, rate_hz=50)
+    page = (tmp_path / "walk.html").read_text(encoding="utf-8")
+    data, _ = json.JSONDecoder().raw_decode(page[page.index('{"title"') :])
+    assert [camera["name"] for camera in data["cameras"]] == list(poses.about.camera_names)
 
 
 def test_an_unknown_suffix_is_named(tmp_path):

@@ -10,18 +10,17 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-import hydra
 import numpy as np
 import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
-from composed import cameras_settings
+from composed import cameras_settings, compose
 from ghpt.calibration.check.units import unit_for, unit_of
 from ghpt.commands.cameras import CamerasSettings, check_cameras
 from ghpt.commands.prediction.next_commands import commands_on, setting
 from ghpt.commands.prediction.verdict import Commands, Judge, Level, Measures
-from ghpt.config import build, plain
+from ghpt.config import build
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.camera_writers import write_aniposelib, write_pose2sim
 from ghpt.data.people.persons import person_sequence
@@ -30,7 +29,7 @@ from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
-from predicting import CONF, cameras_file, config, numbers_of, walk
+from predicting import cameras_file, config, numbers_of, walk
 from single_person import SinglePerson, write_person
 
 RIG = human36m_rig("S9")
@@ -39,9 +38,11 @@ QUICKLY = (
     "evaluated_frames=40",
     "fitted_frames=40",
     "camera_check.frames=24",
-    "camera_check.shift=12",
+    "camera_check.shift=2",
     "formats=[npz]",
 )
+SHIFTED = "camera_check.shift=12"
+"""Where a view is late: that more shifts are tried costs a second."""
 NAMES = tuple(f"cam_{i:02d}" for i in range(4))
 
 
@@ -181,7 +182,7 @@ def test_a_view_that_is_late_is_said_with_a_command_and_strict_fails_after_writi
     with pytest.raises(
         GhptDataError, match=r"verdict: .*cam_03 is 10 frames late.* Next: python cameras\.py"
     ):
-        judged(tmp_path, values, None, "strict=true")
+        judged(tmp_path, values, None, "strict=true", SHIFTED)
     numbers = json.loads((tmp_path / "out" / "prediction.json").read_text())
     assert codes(numbers) == ["out_of_sync"]
     assert (tmp_path / "out" / "poses.npz").exists()
@@ -194,11 +195,12 @@ def test_most_views_out_of_time_are_not_to_be_used(tmp_path):
 
 
 def check_settings(points: Path, cameras: Path) -> CamerasSettings:
-    return cameras_settings(f"keypoints={points}", f"cameras={cameras}")
+    quick = ("camera_check.frames=24", SHIFTED)
+    return cameras_settings(f"keypoints={points}", f"cameras={cameras}", *quick)
 
 
 def test_another_frame_rate_is_named_by_both_commands_and_matched_by_time(tmp_path):
-    numbers = judged(tmp_path, half_rate(pixels(), 2))
+    numbers = judged(tmp_path, half_rate(pixels(), 2), None, SHIFTED)
     assert codes(numbers) == ["frame_rate"]
     assert numbers["verdict"]["findings"][0]["value"] == 0.5
     assert "cam_02" in numbers["verdict"]["findings"][0]["text"]
@@ -258,8 +260,7 @@ def test_images_that_are_turned_are_named(tmp_path):
 
 
 def judge() -> Judge:
-    with hydra.initialize_config_dir(str(CONF), version_base="1.3"):
-        return build(plain(hydra.compose("predict", []))["verdict"], "verdict")
+    return build(compose("predict")["verdict"], "verdict")
 
 
 def said(

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from blank import blank_figures
 from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.geometry.cameras import Cameras, project
 from ghpt.observations import LabelledRecording
@@ -88,14 +89,17 @@ def train(config: Mapping[str, Any], output: Path) -> dict[str, float]:
 
 
 def run_test(config: Mapping[str, Any], output: Path) -> Any:
-    """Test as test.py does; of the configuration, which may be a training's, what a test takes."""
+    """Test as test.py does, with blank figures; of the configuration, which may be a training's,
+    what a test takes.
+    """
     from ghpt.commands.test import TestSettings, test
     from ghpt.config import settings
 
     names = {field.name for field in fields(TestSettings)}
     values = {"hypotheses": None, "frames": None, "output": str(output)}
     values |= {name: value for name, value in config.items() if name in names}
-    return test(settings(TestSettings, values), output)
+    with blank_figures():
+        return test(settings(TestSettings, values), output)
 
 
 class ToyData(KeyPointDataModule):

@@ -8,6 +8,7 @@ from importlib.util import find_spec
 import __main__
 import ghpt
 from ghpt.commands.catalogue import SUMMARIES, run_by_name
+from ghpt.commands.display import until_reader_leaves
 
 _USAGE = "Usage: ghpt COMMAND [key=value ...]; ghpt COMMAND --help says more."
 _COMPLETION = {"-sc", "--shell-completion"}
@@ -18,7 +19,11 @@ def main(words: Sequence[str] | None = None) -> None:
 
     Without a command it prints the usage. A word that names none ends the program with status 1.
     """
-    given = list(sys.argv[1:] if words is None else words)
+    with until_reader_leaves():
+        _main(list(sys.argv[1:] if words is None else words))
+
+
+def _main(given: list[str]) -> None:
     first = given[0] if given else "--help"
     if first in {"-h", "--help"}:
         print(_help())

@@ -64,6 +64,8 @@ class Poses:
     """The names of joints and views, the rate, and what made them."""
     reconstruction: Reconstruction
     """The same as tensors, with covariances; see `ghpt.reconstruction.Reconstruction`."""
+    cameras: CameraSet | None = None
+    """The V views, which html and rrd show; None where they are not known."""
 
     def __len__(self) -> int:
         return len(self.reconstruction)
@@ -128,7 +130,7 @@ def triangulate(key_points: Array, cameras: CamerasLike, confidence: Array | Non
     observations = _observe(points, rig)
     source = _ArraySource(np.arange(len(points)), None, observations)
     part = _estimate(predictor, source, defaults["fitted_frames"], defaults["batch"])
-    return Poses(_about(name, names, rig.names, None), part)
+    return Poses(_about(name, names, rig.names, None), part, rig)
 
 
 class Predictor:
@@ -169,7 +171,8 @@ class Predictor:
         rig = as_camera_set(cameras)
         people = as_detections(key_points, rig, confidence, rate_hz)
         wanted = self.settings
-        sequence = detector_sequence(people, rig, wanted.match, wanted.views, wanted.person)
+        person = wanted.person or 0
+        sequence = detector_sequence(people, rig, wanted.match, wanted.views, person)
         sequence = needed_key_points(wanted, sequence)
         sequence.cameras.check_calibrated(sequence.source)
         sequence = resolve_unit(
@@ -182,7 +185,7 @@ class Predictor:
         about = _about(self.estimator.name, joints.joints, names, sequence.rate_hz)
         x, y, z = sequence.origin.tolist()
         about = replace(about, origin=(x, y, z), bones=joints.bones)
-        return Poses(about, joints(sequence.to_world(part)))
+        return Poses(about, joints(sequence.to_world(part)), sequence.cameras)
 
 
 def calibrate_rig(
@@ -248,17 +251,21 @@ def write_poses(path: str | Path, poses: Poses | Array, rate_hz: int | float | N
 
     Formats are npz, csv, parquet, trc, c3d, html and rrd (rerun). ``poses`` may be points [T J 3]
     (mm; NaN is missing); 17 joints are named as `ghpt.skeleton.JOINTS`. ``rate_hz`` is of the
-    frames, which trc and c3d need. Raises GhptConfigError for an unknown suffix and for what the
-    format lacks, GhptDataError for what it cannot hold.
+    frames, which trc and c3d need. html and rrd show the cameras that ``poses`` has. Raises
+    GhptConfigError for an unknown suffix and for what the format lacks, GhptDataError for what it
+    cannot hold.
     """
-    from ghpt.export import WRITERS
+    from ghpt.export import WRITERS, Scene
 
     writers = {Path(writer.file).suffix: writer for writer in WRITERS.values()}
     suffix = Path(path).suffix
     check(suffix in writers, str(path), f"has the suffix {suffix!r}", f"Use {', '.join(writers)}.")
     whole = poses if isinstance(poses, Poses) else _poses_of(poses)
     about = whole.about if rate_hz is None else replace(whole.about, rate_hz=float(rate_hz))
-    writers[suffix].write(Path(path), about, lambda: iter([whole.reconstruction]))
+    writer = writers[suffix]
+    scene = {} if whole.cameras is None else {"scene": Scene(whole.cameras.cameras)}
+    shown = scene if writer.pictures else {}
+    writer.write(Path(path), about, lambda: iter([whole.reconstruction]), **shown)
 
 
 def mpjpe(estimate: Array, truth: Array, kind: Kind = "absolute") -> float:

@@ -294,7 +294,8 @@ def everything(scene, valid):
 
 @pytest.mark.parametrize("views", [3, 7, 31])
 def test_c4_a_frame_s_geometry_is_the_same_in_any_batch_on_any_threads(views, record_row):
-    scene = random_scene(views, 64, views).noisy(2, 0)
+    count = sizes.SCENE_FRAMES
+    scene = random_scene(views, count, views).noisy(2, 0)
     valid = (
         torch.rand(scene.key_points.shape[:-1], generator=torch.Generator().manual_seed(0)) < 0.8
     )
@@ -304,9 +305,9 @@ def test_c4_a_frame_s_geometry_is_the_same_in_any_batch_on_any_threads(views, re
         torch.set_num_threads(1)
         whole = everything(scene, valid)
         for threads, size, frames in (
-            (2, 64, 64),
+            (2, count, count),
             (1, 1, sizes.BATCHED_FRAMES),
-            (2, 7, min(7 * sizes.BATCHED_FRAMES, 64)),
+            (2, 7, min(7 * sizes.BATCHED_FRAMES, count)),
         ):
             torch.set_num_threads(threads)
             for start in range(0, frames, size):

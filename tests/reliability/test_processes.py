@@ -24,7 +24,7 @@ def run(folder, processes, samples, **changes):
         "model": {"optimizer": {"_target_": "torch.optim.SGD", "_partial_": True, "lr": 0.1}},
         **changes,
     }
-    children.output_of(SCRIPT, folder, json.dumps(wanted))
+    children.output_of(SCRIPT, folder, json.dumps(wanted), env=children.RANKS)
     return torch.load(folder / "last.ckpt", weights_only=True)
 
 

@@ -380,6 +380,17 @@ TIME_UNKNOWN = Mistake(
     "let somebody walk and turn before all cameras, or clap",
     Severity.WARNING,
 )
+FOCAL_UNKNOWN = Mistake(
+    "focal_unknown",
+    "the focal length is not determined by the people in view ({why})",
+    "give it (cameras=intrinsics.toml), or let somebody walk and turn before three cameras or more",
+)
+FOCAL_DIFFERS = Mistake(
+    "focal_differs",
+    "{cameras} have another focal length than the others, by {value:.1f} standard deviations",
+    "estimate one for each: intrinsics.focal=each",
+    Severity.WARNING,
+)
 MOVED = Mistake(
     "moved",
     "{camera} is not where the file has it: its key points lie as if it were rotated by "
@@ -395,7 +406,7 @@ OFF = Mistake(
 NOTHING_AGREES = Mistake(
     "nothing_agrees",
     "no two views agree, and no mistake that is known explains it",
-    "calibrate again: python calibrate.py",
+    "calibrate the rig again",
 )
 UNIT = Mistake(
     "unit",

@@ -3,7 +3,6 @@
 import argparse
 import logging
 import os
-import re
 import string
 import sys
 import warnings
@@ -14,7 +13,10 @@ from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import hydra
-from hydra._internal.utils import get_args_parser
+from hydra._internal.hydra import Hydra
+from hydra._internal.utils import create_config_search_path, get_args_parser
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
@@ -24,6 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 import __main__
 import ghpt
 from ghpt.commands.catalogue import load
+from ghpt.commands.display import as_started, until_reader_leaves
 from ghpt.commands.jobs import (
     Job,
     Program,
@@ -37,6 +40,7 @@ from ghpt.commands.jobs import (
 from ghpt.commands.outputs import Files, OutputFolder, SweepFolder
 from ghpt.commands.overrides import (
     Source,
+    check_choices,
     check_overrides,
     compose,
     expand_home,
@@ -108,17 +112,15 @@ def run(conf: Path, command: Command[Any, Any] | str) -> None:
     os.environ[_FULL] = "1"  # Hydra then lets errors through, to be said here
     ended: list[Job[Any, Any]] = []
     try:
-        _run(conf.resolve(), command, trace, ended)
-    except BrokenPipeError:  # whoever read what is printed has had enough, as `head` does
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        sys.exit(1)
+        with until_reader_leaves():
+            _run(conf.resolve(), command, trace, ended)
     except (*USERS_ERRORS, ValueError) as error:
         cause = error if isinstance(error, OSError) else error.__cause__
         if trace or not (isinstance(error, USERS_ERRORS) or isinstance(cause, OSError)):
             raise
         if isinstance(cause, OSError):  # Hydra makes the folder
             error = GhptConfigError("output", one_line(cause), "Name a folder that can be written.")
-        sys.exit(f"error: {one_line(error)}")
+        sys.exit(as_started(f"error: {one_line(error)}"))
     except KeyboardInterrupt:
         sys.exit(130)
     if any(job.failed for job in ended):
@@ -146,6 +148,9 @@ def _run(
     if arguments.hydra_help or arguments.info or arguments.shell_completion:
         _answer(start)
         return
+    if _is_single(arguments):
+        _run_single(source, job, arguments.overrides)
+        return
     overrides = check_overrides(source, arguments.overrides, sweep)
     if arguments.help:
         print(_help(source, arguments.overrides))
@@ -165,6 +170,40 @@ def _run(
             after = job.loaded().after
             if after is not None:
                 after(ended)
+
+
+def _is_single(arguments: argparse.Namespace) -> bool:
+    """Return whether the command line asks for one job, and for nothing else."""
+    options = (arguments.multirun, arguments.help, arguments.cfg, arguments.experimental_rerun)
+    words = arguments.overrides
+    return not any(options) and not any(word.startswith("hydra.mode=") for word in words)
+
+
+def _run_single(source: Source, job: Callable[[Any], object], words: list[str]) -> None:
+    """Compose once and run the job.
+
+    `hydra.main` would compose a second time, and `check_overrides` a third; the latter is asked
+    when Hydra refuses the words, or where Hydra would take what the project has no use for.
+    """
+    overrides = check_choices(source, words)
+    chosen_launcher(overrides, compose_only=False)
+    if any(override.is_add() or override.is_force_add() for override in overrides):
+        check_overrides(source, words)
+    hydra.version.setbase("1.3")
+    search_path = create_config_search_path(str(source.folder))
+    if source.more is not None:
+        before = SearchPathQuery(provider="schema", path=None)
+        search_path.prepend("command-line", f"file://{source.more}", before)
+    refused = None
+    try:
+        Hydra.create_main_hydra2(source.name, search_path).run(source.name, job, list(words))
+    except HydraException as error:
+        refused = error
+    finally:
+        GlobalHydra.instance().clear()
+    if refused is not None:
+        check_overrides(source, words)
+        raise refused
 
 
 def _source(conf: Path, name: str, arguments: argparse.Namespace) -> Source:
@@ -207,10 +246,7 @@ def _help(source: Source, words: Sequence[str]) -> str:
     template = string.Template(config.hydra.help.template)
     with open_dict(config):
         del config["hydra"]
-    text = template.safe_substitute(CONFIG=OmegaConf.to_yaml(config))
-    if sys.argv[0].startswith("ghpt "):
-        text = re.sub(r"python (\w+)\.py", r"ghpt \1", text)
-    return text
+    return as_started(template.safe_substitute(CONFIG=OmegaConf.to_yaml(config)))
 
 
 @dataclass(frozen=True)
@@ -271,7 +307,7 @@ class _Job:
                 users = isinstance(error, USERS_ERRORS)
                 if users or elsewhere:
                     kind = "" if users else f"{type(error).__name__}: "
-                    said = f"error: {kind}{one_line(error)}"
+                    said = as_started(f"error: {kind}{one_line(error)}")
                     _log.error(said, exc_info=elsewhere and (self.trace or not users))
                 if not elsewhere and (self.trace or not users):
                     raise

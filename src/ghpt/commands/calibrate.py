@@ -22,6 +22,7 @@ from ghpt.calibration.comparison import (
     triangulate_recording,
 )
 from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.intrinsics import IntrinsicsEstimation
 from ghpt.calibration.millimetres import (
     RigScale,
     ScaleSettings,
@@ -48,11 +49,12 @@ from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.time import calibrate_sequence, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.detections import Detections
+from ghpt.data.people.persons import with_lenses
 from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.similarity import Similarity
 from ghpt.geometry.upright import upright
 from ghpt.models.estimators.classical import Estimator
@@ -88,12 +90,20 @@ class CalibrateSettings(InputSettings):
     camera_check: Target
     estimator: str
     start_times: Target
+    intrinsics: Target
+    image_size: list[int] | None
     evaluated_frames: int
     seed: int
 
     def __post_init__(self) -> None:
         frames = self.evaluated_frames
         check(frames >= 1, "evaluated_frames", f"is {frames}", "Give 1 or more.")
+        if self.image_size is not None:
+            sane = len(self.image_size) == 2 and min(self.image_size) > 0
+            example = "Give width and height: image_size=[1920,1080]."
+            check(sane, "image_size", f"is {self.image_size}", example)
+            hint = "Give the image size or the cameras' file."
+            check(not self.cameras, "image_size", "is given beside cameras", hint)
         name = self.estimator
         hint = suggest(name, self.baselines)
         check(name in self.baselines, "estimator", f"is {name!r}", hint)
@@ -112,6 +122,8 @@ class Case:
     is_own: bool
     """Whether they are the user's, which may be wrong."""
     notes: tuple[Finding, ...] = ()
+    intrinsics: str | None = None
+    """What was estimated of the intrinsics, in words; None where they were given."""
 
     @property
     def reference_cameras(self) -> Cameras | None:
@@ -184,6 +196,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     estimator: Estimator = build(settings.baselines[name], f"baselines.{name}")
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
     case = in_one_time(settings, open_case(settings, estimator), calibration, camera_check)
+    case = with_intrinsics(settings, case, calibration)
     cameras = case.sequence.cameras
     source = read_scale(settings.scale, cameras.names)
     sweep_temporaries(output)
@@ -211,6 +224,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         frames=len(case.sequence),
         seed=settings.seed,
         scale=scale,
+        intrinsics=case.intrinsics,
         world=solution.world,
         reference=None if reference is None else case.reference,
         triangulation=settings.estimator,
@@ -290,14 +304,42 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     """
     if not settings.keypoints:
         return Case(recording_sequence(settings), "the truth", is_own=False)
-    cameras = own_cameras(settings, "intrinsics.toml")
-    if cameras.unposed:
-        cameras = cameras.without_extrinsics()
     people = own_people(settings)
+    cameras = _given_cameras(settings, people)
     sequence = own_sequence(settings, people, cameras, person=None)
     sequence = resolve_unit(sequence, estimator, ask=False)
     notes = people_findings(people)
     return Case(sequence, "the file's own calibration", is_own=True, notes=notes)
+
+
+def _given_cameras(settings: CalibrateSettings, people: Detections) -> CameraSet:
+    """Return the user's cameras, or without a file first guesses by the size of the images."""
+    if settings.image_size is None:
+        cameras = own_cameras(settings, "intrinsics.toml, or image_size=[1920,1080]")
+        return cameras.without_extrinsics() if cameras.unposed else cameras
+    estimation: IntrinsicsEstimation = build(settings.intrinsics, "intrinsics")
+    return estimation.guessed(people.views, torch.tensor(settings.image_size))
+
+
+def with_intrinsics(settings: CalibrateSettings, case: Case, calibration: RigCalibration) -> Case:
+    """Return the case with estimated focal lengths where only the image size is known."""
+    if settings.image_size is None:
+        return case
+    estimation: IntrinsicsEstimation = build(settings.intrinsics, "intrinsics")
+    sequence = case.sequence
+    points = sequence.detected()
+    found = estimation(
+        calibration,
+        sequence.cameras,
+        torch.from_numpy(points.pixels).double(),
+        torch.from_numpy(points.confidence).double(),
+        torch.from_numpy(points.valid),
+        settings.seed,
+    )
+    cameras = replace(sequence.cameras, K=found.K, distortion=found.distortion)
+    sequence = with_lenses(sequence, cameras)
+    notes = (*case.notes, *found.findings)
+    return replace(case, sequence=sequence, notes=notes, intrinsics=found.text)
 
 
 def in_one_time(

@@ -1,8 +1,32 @@
-"""How paths and settings are said, so that a reader can type them."""
+"""How paths, settings and commands are said, so that a reader can type them."""
 
 import os
 import re
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+
+_SCRIPTS = re.compile(r"(?:python )?\b(train|test|predict|calibrate|cameras|reproduce)\.py\b")
+
+
+@contextmanager
+def until_reader_leaves() -> Iterator[None]:
+    """End the program with status 1, and without a word, when nobody reads its output any more."""
+    try:
+        yield
+        sys.stdout.flush()
+    except BrokenPipeError:  # as `head` does when it has its lines
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+
+
+def as_started(text: str) -> str:
+    """Return a text with the project's scripts named as this program was started.
+
+    Where that was ``ghpt train``, ``python test.py`` becomes ``ghpt test``.
+    """
+    return _SCRIPTS.sub(r"ghpt \1", text) if sys.argv[0].startswith("ghpt ") else text
 
 
 def display_path(path: Path) -> str:

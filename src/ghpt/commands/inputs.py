@@ -21,7 +21,11 @@ from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.contents import explain_cameras, explain_key_points
 from ghpt.data.formats.key_points import Detections, read_key_points
 from ghpt.data.formats.names import Name
-from ghpt.data.people.persons import detector_sequence, person_sequence
+from ghpt.data.people.persons import (
+    detector_sequence,
+    detector_sequences,
+    person_sequence,
+)
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptConfigError, GhptDataError
@@ -106,19 +110,27 @@ def own_sequence(
     return replace(sequence, source=str(_required_path(inputs).resolve()))
 
 
-def own_detector_sequence(
-    inputs: InputSettings, people: Detections, cameras: CameraSet, person: int
-) -> Sequence:
-    """Return one person with all key points of the detector, as `own_sequence` else."""
+def own_detector_sequences(
+    inputs: InputSettings, people: Detections, cameras: CameraSet, person: int | None
+) -> list[Sequence]:
+    """Return everybody with all key points of the detector, or one person alone.
+
+    `detector_sequences` and `detector_sequence` say what is raised.
+    """
     title = own_title(inputs)
-    sequence = detector_sequence(people, cameras, inputs.match, inputs.views, person, title)
-    return replace(sequence, source=str(_required_path(inputs).resolve()))
+    rig = (cameras, inputs.match, inputs.views)
+    if person is None:
+        found = detector_sequences(people, *rig, title)
+    else:
+        found = [detector_sequence(people, *rig, person, title)]
+    source = str(_required_path(inputs).resolve())
+    return [replace(sequence, source=source) for sequence in found]
 
 
 def own_title(inputs: InputSettings) -> str:
     """Return what a report calls the user's files."""
     name = _required_path(inputs).resolve().name
-    return f"{name} with {Path(inputs.cameras or '').name}"
+    return f"{name} with {Path(inputs.cameras).name}" if inputs.cameras else name
 
 
 def _required_path(inputs: InputSettings) -> Path:

@@ -57,26 +57,28 @@ def compose(source: Source, words: Sequence[str], with_hydra: bool = False) -> A
         )
 
 
+def check_choices(source: Source, words: Sequence[str]) -> list[Override]:
+    """Return the parsed overrides of a command line that is no sweep's.
+
+    Raises GhptConfigError, saying what exists, for a choice of a group that does not, and for
+    several values of a setting.
+    """
+    overrides = _parse_all(words, sweep=False)
+    with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
+        _chosen_groups(source, overrides)
+    return overrides
+
+
 def check_overrides(source: Source, words: Sequence[str], sweep: bool = True) -> list[Override]:
     """Return the parsed overrides of a command line.
 
     Raises GhptConfigError, saying what exists, for a setting or a choice that does not, and for
     several values of one where ``sweep`` is false.
     """
-    overrides = [_parse(word) for word in words]
-    if not sweep:
-        for override in overrides:
-            _check_single(override)
+    overrides = _parse_all(words, sweep)
     with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
-        loader = GlobalHydra.instance().config_loader()
-        search_path = _search_path(source, overrides)
-        groups = {}
-        for override in overrides:
-            group = override.key_or_group
-            choices = _choices(loader, source, group, search_path)
-            if choices and not override.is_delete():
-                groups[group] = _first_choice(override, choices)
-        chosen = [*search_path, *groups.values()]
+        groups = _chosen_groups(source, overrides)
+        chosen = [*_search_path(source, overrides), *groups.values()]
         composed = hydra.compose(source.name, overrides=chosen)
     config = OmegaConf.to_container(composed)
     for override in overrides:
@@ -141,6 +143,14 @@ def parse_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> argp
     return arguments
 
 
+def _parse_all(words: Sequence[str], sweep: bool) -> list[Override]:
+    overrides = [_parse(word) for word in words]
+    if not sweep:
+        for override in overrides:
+            _check_single(override)
+    return overrides
+
+
 def _check_single(override: Override) -> None:
     """Raise GhptConfigError for several values, which only a sweep takes in turn."""
     key = override.get_key_element()
@@ -179,12 +189,35 @@ def _search_path(source: Source, overrides: Sequence[Override]) -> list[str]:
     return [f"{_SEARCH_PATH}=[{quoted}]"] if places else []
 
 
+def _chosen_groups(source: Source, overrides: Sequence[Override]) -> dict[str, str]:
+    """Return the first choice of each group that the command line names, within Hydra's block.
+
+    Raises GhptConfigError for a choice that does not exist.
+    """
+    loader = GlobalHydra.instance().config_loader()
+    search_path = _search_path(source, overrides)
+    groups = {}
+    for override in overrides:
+        group = override.key_or_group
+        choices = _choices(loader, source, group, search_path)
+        if choices and not override.is_delete():
+            groups[group] = _first_choice(override, choices)
+    return groups
+
+
 def _choices(loader: ConfigLoader, source: Source, group: str, search_path: list[str]) -> list[str]:
     """Return what a group of the configuration offers; nothing for what is no group of ours."""
-    if group.startswith("hydra/"):
+    is_ours = (source.folder / group).is_dir() or search_path or _names_more_folders(source)
+    if not is_ours or group.startswith("hydra/"):  # to ask Hydra costs as much as to read a file
         return []
     names = loader.get_group_options(group, config_name=source.name, overrides=search_path)
     return sorted(name for name in names if not name.startswith("_"))
+
+
+def _names_more_folders(source: Source) -> bool:
+    """Return whether the first yaml file itself says where else groups are."""
+    first = source.folder / f"{source.name}.yaml"
+    return first.is_file() and "searchpath" in first.read_text(encoding="utf-8")
 
 
 def _values(override: Override) -> list[Any]:

@@ -29,8 +29,9 @@ from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
 from ghpt.commands.prediction.gaps import OWN, Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
+from ghpt.commands.prediction.pictures import write_pictures
 from ghpt.commands.prediction.report import report_document, summary_document, verdict_document
-from ghpt.commands.prediction.result import PredictionResult
+from ghpt.commands.prediction.result import PersonSummary, PredictionResult
 from ghpt.commands.prediction.run import RunSettings, predict_shards
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.prediction.statistics import (
@@ -40,7 +41,7 @@ from ghpt.commands.prediction.statistics import (
 )
 from ghpt.commands.prediction.verdict import Judge, Level, Measures
 from ghpt.commands.prediction.world import World, choose_world
-from ghpt.commands.time import clock_of, person_in_one_time
+from ghpt.commands.time import clock_of, people_in_one_time
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Sequence
@@ -48,7 +49,7 @@ from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Chunks, Evidence, Scene, find_marker_set
 from ghpt.export.scene import origin_note
-from ghpt.files import sweep_temporaries, write_json
+from ghpt.files import remove, sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.flips import LeftRightFlips
@@ -69,8 +70,10 @@ _OWN_FORMATS = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if na
 _TIMED_FORMATS = ("trc", "c3d")
 _NOT_OF_SHARDS = ("command", "seed")
 """What shards do not depend on; where an estimator draws by the seed, its identity holds it."""
+_LEAST_FRAMES = 10
+"""Of a person beside the first, seen by two views: fewer tell nothing of the noise."""
 _DEFAULTS = {
-    "person": 0,
+    "person": None,
     "ckpt": None,
     "joints": "detector",
     "world": "cameras",
@@ -104,7 +107,7 @@ class PredictorSettings:
 class PredictSettings(InputSettings):
     """The settings of predict.py."""
 
-    person: int
+    person: int | None
     joints: Literal["detector", "human36m"]
     ckpt: str | None
     trust: list[str]
@@ -184,28 +187,105 @@ def files(settings: PredictSettings) -> Files:
 
 
 def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
-    """Predict the 3D joints of the user's key points, or of a recording of the data set.
+    """Predict the 3D joints of everybody in the user's key points, or of a recording of the data
+    set.
 
-    Writes poses.<format>, prediction.json and report.md into ``output`` and prints the tables; the
-    shards that an interrupted run left are gone on with. Returns what prediction.json holds, and
-    None in the processes beside the first.
+    Writes poses.<format>, prediction.json and report.md of the most visible person into ``output``,
+    those of the others into its folders person_1, person_2, ..., and prints the tables; the shards
+    that an interrupted run left are gone on with. The pictures in ``output`` show everybody.
+    Returns what prediction.json holds, and None in the processes beside the first.
     """
-    estimator = build_estimator(settings)
-    compared: dict[str, Estimator] = {
-        name: build(settings.baselines[name], f"baselines.{name}") for name in settings.compare
-    }
-    camera_check: CameraCheck = build(settings.camera_check, "camera_check")
-    judge: Judge = build(settings.verdict, "verdict")
-    sequence = open_sequence(settings, camera_check)
+    setup = _prepare(settings)
+    sequences = open_sequences(settings, setup.camera_check)
+    sweep_temporaries(output)
+    results: list[PredictionResult] = []
+    world: World | None = None
+    for person, sequence in enumerate(sequences):
+        folder = _person_folder(output, person)
+        folder.mkdir(parents=True, exist_ok=True)
+        shards = _person_folder(output / SHARDS, person)
+        result, world = _predict_person(settings, setup, sequence, world, folder, shards)
+        if result is not None:
+            results.append(_judged(settings, setup, sequence, result, person, output))
+    if not results:
+        return None
+    _remove_others(output, len(sequences))
+    first = results[0]
+    if len(results) > 1 and world is not None:
+        scene = Scene(world.cameras(sequences[0].cameras.cameras))
+        folders = [_person_folder(output, person) for person in range(len(results))]
+        write_pictures(output, folders, own_title(settings), first.formats, scene)
+        first = replace(first, people=tuple(map(_about_person, results)))
+    for person, result in enumerate([first, *results[1:]]):
+        _write_report(result, _person_folder(output, person))
+    verdict = first.verdict
+    if settings.strict and verdict is not None and verdict.level != Level.GOOD:
+        worst = verdict.findings[0]
+        problem = f"{verdict.level.words}: {worst.text}"
+        raise GhptDataError(first.source, "verdict", problem, f"Next: {worst.command}")
+    return first
+
+
+@dataclass(frozen=True)
+class _Setup:
+    """What a prediction is made with, for everybody alike."""
+
+    estimator: PoseEstimator
+    compared: dict[str, Estimator]
+    camera_check: CameraCheck
+    judge: Judge
+    origin: dict[str, Any]
+
+
+def _prepare(settings: PredictSettings) -> _Setup:
+    return _Setup(
+        estimator=build_estimator(settings),
+        compared={
+            name: build(settings.baselines[name], f"baselines.{name}") for name in settings.compare
+        },
+        camera_check=build(settings.camera_check, "camera_check"),
+        judge=build(settings.verdict, "verdict"),
+        origin=provenance(settings.seed),
+    )
+
+
+def _person_folder(output: Path, person: int) -> Path:
+    """Return where a person's files are: the first person's are those of the output itself."""
+    return output / f"person_{person}" if person else output
+
+
+def _remove_others(output: Path, count: int) -> None:
+    """Remove the files of people of an earlier run who are not among the ``count`` of this one."""
+    names = (*(writer.file for writer in WRITERS.values()), "prediction.json", "report.md")
+    for folder in output.glob("person_*"):
+        number = folder.name.removeprefix("person_")
+        if number.isdecimal() and int(number) >= count:
+            for name in names:
+                remove(folder / name)
+
+
+def _predict_person(
+    settings: PredictSettings,
+    setup: _Setup,
+    sequence: Sequence,
+    world: World | None,
+    output: Path,
+    folder: Path,
+) -> tuple[PredictionResult | None, World | None]:
+    """Predict one person and write their poses into ``output``, with shards in ``folder``.
+
+    ``world`` is that of the files, None where it is to be chosen by this person. Returns what was
+    found, without a verdict, and the world; None twice in the processes beside the first.
+    """
+    estimator = setup.estimator
     gaps = Gaps(
         longest=gap_frames(settings.fill, sequence.rate_hz),
         interpolation=settings.interpolation or _interpolation(estimator),
         cut_off_hz=settings.smooth,
         rate_hz=sequence.rate_hz,
     )
-    origin = provenance(settings.seed)
     joints = joints_of(settings, sequence.skeleton)
-    about = _about(sequence, joints, estimator, gaps, origin)
+    about = _about(sequence, joints, estimator, gaps, setup.origin)
     if settings.markers:
         find_marker_set(settings.markers).check_joints(about.joints)
     formats = _formats(settings, sequence)
@@ -217,24 +297,23 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         len(about.camera_names),
         estimator.text,
     )
-    sweep_temporaries(output)
     predictor = _fitted(estimator, sequence, settings)
-    key = _shard_key(sequence, estimator, origin)
+    key = _shard_key(sequence, estimator, setup.origin)
     how = RunSettings(
         settings.shard_frames, settings.batch, settings.progress_bar, settings.trainer
     )
     weights = estimator.weights
-    with predict_shards(sequence, predictor, weights, output / SHARDS, key, how) as shards:
+    with predict_shards(sequence, predictor, weights, folder, key, how) as shards:
         if shards is None:
-            return None
+            return None, None
         with apply_gaps(gaps, shards, len(sequence.skeleton), output) as key_points:
             own = _mapped(key_points, joints)
-            world = _choose_world(settings, sequence, about, own)
+            world = world or _choose_world(settings, sequence, about, own)
             chunks = _mapped(own, world.reconstruction)
             _write_formats(settings, output, world, about, chunks, formats, sequence, shards)
             views = about.camera_names
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
-    evaluation = _evaluate(estimator, compared, sequence, settings)
+    evaluation = _evaluate(estimator, setup.compared, sequence, settings)
     result = PredictionResult(
         data=sequence.title,
         source=sequence.source,
@@ -252,18 +331,31 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         world=world.numbers(),
         provenance=about.provenance,
     )
+    return result, world
+
+
+def _judged(
+    settings: PredictSettings,
+    setup: _Setup,
+    sequence: Sequence,
+    result: PredictionResult,
+    person: int,
+    output: Path,
+) -> PredictionResult:
+    """Return the result with its verdict. The first person alone is asked what the cameras lack."""
     measures = _measures(result)
-    asked = camera_check.is_worthwhile(measures.view_errors)
-    mistakes = check_cameras(sequence.as_joints(), camera_check) if asked else ()
-    commands = commands_on(settings, settings.changed(), output)
-    verdict = judge(measures, mistakes, result.unit_mm, commands)
-    result = replace(result, verdict=verdict)
-    _write_report(result, output)
-    if settings.strict and verdict.level != Level.GOOD:
-        worst = verdict.findings[0]
-        problem = f"{verdict.level.words}: {worst.text}"
-        raise GhptDataError(sequence.source, "verdict", problem, f"Next: {worst.command}")
-    return result
+    asked = not person and setup.camera_check.is_worthwhile(measures.view_errors)
+    mistakes = check_cameras(sequence.as_joints(), setup.camera_check) if asked else ()
+    own = settings.changed() | ({"person": person} if person else {})
+    commands = commands_on(settings, own, output)
+    verdict = setup.judge(measures, mistakes, result.unit_mm, commands)
+    return replace(result, verdict=verdict)
+
+
+def _about_person(result: PredictionResult) -> PersonSummary:
+    coverage = result.coverage
+    level = result.verdict.level.words if result.verdict else ""
+    return PersonSummary(coverage.share["observed"], coverage.stature_mm, level)
 
 
 def _measures(result: PredictionResult) -> Measures:
@@ -361,14 +453,20 @@ def _with_flips(settings: PredictSettings, group: Target) -> dict[str, Any]:
     return dict(group) if settings.flips else dict(group) | {"flips": None}
 
 
-def open_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Sequence:
-    """Return what is predicted: the user's own key points, or a recording of the data set."""
+def open_sequences(settings: PredictSettings, camera_check: CameraCheck) -> list[Sequence]:
+    """Return who is predicted: the people in the user's own key points, or a recording of the data
+    set.
+
+    The most visible person comes first, and tells the unit of length.
+    """
     if not settings.keypoints:
-        return recording_sequence(settings)
-    found = _files_sequence(settings, camera_check)
-    sequence = needed_key_points(settings, found)
-    sequence.cameras.check_calibrated(sequence.source)
-    return resolve_unit(sequence, camera_check.consensus, ask=True)
+        return [recording_sequence(settings)]
+    found = _files_sequences(settings, camera_check)
+    sequences = [needed_key_points(settings, sequence) for sequence in found]
+    first = sequences[0]
+    first.cameras.check_calibrated(first.source)
+    first = resolve_unit(first, camera_check.consensus, ask=True)
+    return [replace(sequence, cameras=first.cameras) for sequence in sequences]
 
 
 def needed_key_points(settings: PredictSettings, sequence: Sequence) -> Sequence:
@@ -387,7 +485,7 @@ def needed_key_points(settings: PredictSettings, sequence: Sequence) -> Sequence
     return sequence.select_key_points(parts.tolist())
 
 
-def _files_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Sequence:
+def _files_sequences(settings: PredictSettings, camera_check: CameraCheck) -> list[Sequence]:
     cameras = own_cameras(settings, "Calib.toml")
     cameras.check_calibrated(str(settings.cameras))
     if settings.format in (None, "npz") and settings.session is None:
@@ -397,16 +495,32 @@ def _files_sequence(settings: PredictSettings, camera_check: CameraCheck) -> Seq
         if stored is not None:
             title = own_title(settings)
             sequence = stored_sequence(stored, cameras, settings.match, settings.views, title)
-            return retime(sequence, clock_of(settings.time, sequence, camera_check.time))
+            return [retime(sequence, clock_of(settings.time, sequence, camera_check.time))]
     people = own_people(settings)
-    sequence = person_in_one_time(settings, people, cameras, settings.person, camera_check.time)
+    found = people_in_one_time(settings, people, cameras, settings.person, camera_check.time)
+    if settings.person is None:
+        return _long_enough(found)
     crowded = people.crowded_frames()
     if crowded:
         words = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
-        _log.warning(
-            "Several people are in %s: person %d is followed (person=).", words, settings.person
-        )
-    return sequence
+        _log.warning("Several people are in %s: person %d is followed.", words, settings.person)
+    return found
+
+
+def _long_enough(found: list[Sequence]) -> list[Sequence]:
+    """Return the first person, and those of the others who can be predicted, with their numbers."""
+    frames = [int((each.detected().valid.any(-1).sum(1) >= 2).sum()) for each in found]
+    kept = [each for each, count in zip(found, frames, strict=True) if count >= _LEAST_FRAMES]
+    left_out = sum(count < _LEAST_FRAMES for count in frames[1:])
+    if left_out:
+        text = "Left out: %d more, of whom each is seen by two views in fewer than %d frames."
+        _log.warning(text, left_out, _LEAST_FRAMES)
+    if len(kept) < 2:
+        return found[:1]
+    if frames[0] < _LEAST_FRAMES:
+        kept = [found[0], *kept]
+    names = enumerate(kept)
+    return [replace(each, title=f"{each.title}, person {number}") for number, each in names]
 
 
 def _interpolation(estimator: PoseEstimator) -> str:

@@ -47,12 +47,15 @@ class TestSettings(OutputSettings):
     view_weights: Target | None = None
     baselines: Target = field(default_factory=dict)
     camera_baselines: Target = field(default_factory=dict)
+    trajectory: Target | None = None
     seed: int
     progress_bar: bool
 
     def estimators(self) -> BaselineSettings:
         """Return what is tested beside the model."""
-        return BaselineSettings(self.baselines, self.camera_baselines, self.view_weights)
+        return BaselineSettings(
+            self.baselines, self.camera_baselines, self.view_weights, self.trajectory
+        )
 
 
 @dataclass(frozen=True)

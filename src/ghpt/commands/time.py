@@ -16,7 +16,7 @@ from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.estimation import TimeEstimate, TimeEstimation
 from ghpt.calibration.time.uncalibrated import UncalibratedShifts
 from ghpt.clock import Clock
-from ghpt.commands.inputs import InputSettings, own_detector_sequence, own_sequence
+from ghpt.commands.inputs import InputSettings, own_detector_sequences, own_sequence
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.matching import match_views
 from ghpt.data.people.retimed import retime, shift_detections
@@ -50,28 +50,31 @@ def clock_of(time: str, sequence: Sequence, estimation: TimeEstimation) -> Clock
     return estimate.clock
 
 
-def person_in_one_time(
+def people_in_one_time(
     inputs: InputSettings,
     people: Detections,
     cameras: CameraSet,
-    person: int,
+    person: int | None,
     estimation: TimeEstimation,
-) -> Sequence:
-    """Return one person with all key points of the detector, and all views in one time.
+) -> list[Sequence]:
+    """Return everybody with all key points of the detector, and all views in one time.
+
+    ``person`` is the one who is wanted alone.
 
     Who is tracked best in each view tells the time. Views are shifted by whole frames before people
     are told apart across them, and by parts of a frame afterwards.
     """
     check_time(inputs.time)
     if inputs.time != "estimate" and (inputs.time == "none" or cameras.clock is None):
-        return own_detector_sequence(inputs, people, cameras, person)
+        return own_detector_sequences(inputs, people, cameras, person)
     tracked = own_sequence(inputs, people, cameras, person=None)
     whole, rest = clock_of(inputs.time, tracked, estimation).split()
     at, _ = match_views(people.path, people.views, cameras, inputs.match, inputs.views)
     by = np.zeros(len(people.views), np.int64)
     by[at] = whole
     shifted = shift_detections(people, by)
-    return retime(own_detector_sequence(inputs, shifted, cameras, person), rest)
+    found = own_detector_sequences(inputs, shifted, cameras, person)
+    return [retime(sequence, rest) for sequence in found]
 
 
 def log_time(names: tuple[str, ...], estimate: TimeEstimate) -> None:

@@ -10,7 +10,7 @@ import torch
 
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
-from ghpt.commands.display import display_path, shell_override
+from ghpt.commands.display import as_started, display_path, shell_override
 from ghpt.commands.lost import told
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
 from ghpt.commands.resume import Start, resumable
@@ -189,7 +189,7 @@ def _say_finished(
     _log.info("Validation on %s, %s:", display_name(data.name, data.source), measures)
     _log.info("  %s", summary(errors))
     _log.info("Checkpoint: %s", display_path(last))
-    words = ["python test.py", shell_override("ckpt", display_path(last))]
+    words = [as_started("python test.py"), shell_override("ckpt", display_path(last))]
     if data.root is None:
         words.append("data=h36m")
     else:

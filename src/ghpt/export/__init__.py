@@ -43,6 +43,8 @@ class Writer:
     write: Callable[..., None]
     single: bool = False
     """Whether its positions have single precision, and so are relative to ``About.origin``."""
+    pictures: bool = False
+    """Whether it shows a `Scene`, its setting ``scene``, besides the skeleton."""
     has_markers: bool = False
     """Whether its joints may have the names of a marker set."""
     module: str | None = None
@@ -63,6 +65,13 @@ WRITERS = {
     "parquet": Writer("poses.parquet", write_parquet, module="pyarrow", package="pyarrow"),
     "trc": Writer("poses.trc", write_trc, has_markers=True),
     "c3d": Writer("poses.c3d", write_c3d, single=True, has_markers=True),
-    "html": Writer("poses.html", write_html, single=True),
-    "rerun": Writer("poses.rrd", write_rerun, single=True, module="rerun", package="rerun-sdk"),
+    "html": Writer("poses.html", write_html, single=True, pictures=True),
+    "rerun": Writer(
+        "poses.rrd",
+        write_rerun,
+        single=True,
+        pictures=True,
+        module="rerun",
+        package="rerun-sdk",
+    ),
 }

@@ -26,6 +26,7 @@ from ghpt.export.scene import (
     upward,
 )
 from ghpt.export.stream import Chunks, extent, local_points, pieces
+from ghpt.export.together import persons_of
 from ghpt.files import atomic_write
 from ghpt.geometry.masking import where
 from ghpt.reconstruction import About, Reconstruction
@@ -80,6 +81,7 @@ def write_html(path: Path, about: About, chunks: Chunks, scene: Scene | None = N
         "rate_hz": about.rate_hz,
         "joints": about.joints,
         "bones": bones_of(about),
+        "people": persons_of(about.joints),
         "sides": [side_of(joint) for joint in about.joints],
         "stride": int(np.median(intervals)) if len(intervals) else 1,
         "frame": _base64(frames.frame, "<f8"),

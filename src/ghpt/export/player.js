@@ -52,6 +52,15 @@ function drawn(data, index) {
   return { joints, bones };
 }
 
+// The highest drawn joint of each of several people, where their names are written.
+function heads(data, joints) {
+  if (data.people.length < 2) return [];
+  return data.people.map((places, person) => {
+    const own = joints.filter(joint => places.includes(joint.j));
+    return { person, point: own.reduce((top, joint) => !top || joint.point[2] > top[2] ? joint.point : top, null) };
+  }).filter(head => head.point);
+}
+
 function load(text) {
   const data = JSON.parse(text);
   data.frame = unpack(data.frame, Float64Array);
@@ -136,6 +145,7 @@ function start(document, window) {
       context.strokeStyle = COLOURS[data.sides[joint.j]]; context.lineWidth = 1.5; context.stroke();
       if (element("names").checked) write(context, joint.point, data.joints[joint.j], "#333333");
     }
+    for (const { person, point } of heads(data, joints)) write(context, point, `person ${person}`, "#333333");
   }
 
   function paintPlot() {
@@ -234,4 +244,4 @@ function start(document, window) {
 }
 
 if (typeof module === "undefined") start(document, window);
-else module.exports = { drawn, indexAt, load, look, overview, quantile };
+else module.exports = { drawn, heads, indexAt, load, look, overview, quantile };

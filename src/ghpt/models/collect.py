@@ -3,7 +3,7 @@
 import shutil
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import lightning as L
 import torch
@@ -13,6 +13,14 @@ from ghpt.models.pool import Pool
 from ghpt.models.predictions import PredictionWriter
 from ghpt.models.problem import Problem
 from ghpt.observations import Labelled
+
+
+@runtime_checkable
+class OfRecordings(Protocol):
+    """A baseline that sees whole recordings and not the batches alone."""
+
+    def open(self, dataset: Any) -> None:
+        """Take the data set that is tested."""
 
 
 class CollectPredictions(Callback):
@@ -37,6 +45,9 @@ class CollectPredictions(Callback):
 
     def open(self, dataset: Any) -> None:
         """Make room for the samples of a data set."""
+        for baseline in self.baselines.values():
+            if isinstance(baseline, OfRecordings):
+                baseline.open(dataset)
         names = [*self.problem.aggregations, *self.baselines]
         self._dataset = dataset
         self._writer = PredictionWriter(self._folder, len(dataset), names, self.problem.schema)

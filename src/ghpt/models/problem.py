@@ -60,6 +60,8 @@ class BaselineSettings:
     """Classical estimators of relative camera poses."""
     view_weights: Target | None = None
     """How a model of poses weights the views; None: not at all."""
+    trajectory: Target | None = None
+    """How whole recordings are estimated; None: not at all."""
 
 
 class Problem(ABC):

@@ -22,6 +22,7 @@ from ghpt.models.key_points.problem import KeyPointWeights
 from ghpt.models.key_points.scorer import KeyPointScorer
 from ghpt.models.loss import PrecisionLoss, StochasticLoss
 from ghpt.models.module import StochasticEstimator
+from ghpt.models.pose.authors import AuthorsScorer, WorldPoses
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.models.problem import Problem
 from ghpt.models.relative_pose.problem import RelativePose
@@ -70,9 +71,9 @@ def register(part: str, *classes: type) -> None:
 
 
 register("model", StochasticEstimator)
-register("model.problem", PoseTriangulation, KeyPointWeights, RelativePose)
+register("model.problem", PoseTriangulation, KeyPointWeights, WorldPoses, RelativePose)
 register("model.problem.scale", KnownScale, BodyHeight, BoneLengths)
-register("model.scorer", Scorer, KeyPointScorer)
+register("model.scorer", Scorer, KeyPointScorer, AuthorsScorer)
 register("model.loss", StochasticLoss, PrecisionLoss)
 register("model.schedule", lr_scheduler.ExponentialLR)
 for _name, _one in vars(optim).items():

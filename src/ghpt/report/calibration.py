@@ -83,6 +83,8 @@ class CalibrationResult:
     """How well each calibration explains the key points, by its name."""
     findings: tuple[Finding, ...]
     provenance: dict[str, Any]
+    intrinsics: str | None = None
+    """What was estimated of the intrinsics, in words; None where they were given."""
 
     def plain(self) -> dict[str, Any]:
         """Return the result as plain data."""
@@ -154,6 +156,8 @@ def _camera_cells(camera: CalibratedCamera, difference: Differences | None) -> l
 def _rig_lines(result: CalibrationResult) -> list[Text]:
     """Return sentences on the rig as a whole."""
     lines: list[Text] = [f"Scale: {result.scale.text}."]
+    if result.intrinsics is not None:
+        lines.append(f"Intrinsics: {result.intrinsics}.")
     if result.difference is not None:
         scale = result.difference.scale
         lines.append(f"Size: {result.reference} is {scale:.4f} times as large.")

@@ -152,6 +152,7 @@ def write_rig_figure(
     for name, canvas in _FIGURES.items():
         data = io.BytesIO()
         canvas(figure).print_figure(data, dpi=150, format=name.rpartition(".")[2])
+        figure.set_layout_engine("none")  # it is laid out
         with atomic_write(output / name) as handle:
             handle.write(data.getvalue())
 

@@ -25,6 +25,7 @@ NAMES = {
     "panoptic": "Panoptic",
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
     "view_weights": "view weights",
+    "trajectory": "trajectory",
     "frame_learned": "key-point weights",
     "weighted_linear": "weighted linear",
     "ransac": "RANSAC",

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ghpt.commands.display import display_path, shell_override
+from ghpt.commands.display import as_started, display_path, shell_override
 from ghpt.commands.inputs import InputSettings
 from ghpt.commands.prediction.verdict import Commands
 
@@ -31,9 +31,8 @@ def commands_on(inputs: InputSettings, own: Mapping[str, object], output: Path) 
 
     def command(script: str, suffix: str, values: Mapping[str, Any]) -> str:
         words = [setting(key, value) for key, value in values.items()]
-        return " ".join(
-            ["python", script, *words, shell_override("output", display_path(output) + suffix)]
-        )
+        beside = shell_override("output", display_path(output) + suffix)
+        return " ".join([as_started(f"python {script}"), *words, beside])
 
     def predict(**more: Any) -> str:
         return command("predict.py", "_again", {**given, **own, **more})

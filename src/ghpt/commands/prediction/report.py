@@ -119,6 +119,7 @@ def report_document(result: PredictionResult) -> Document:
         [
             Paragraph(_origin(result.provenance)),
             Bullets(summary_lines(result)),
+            *_people_blocks(result),
             *(_verdict_blocks(verdict) if verdict else []),
             Heading("Errors by view"),
             Paragraph(
@@ -150,6 +151,20 @@ def report_document(result: PredictionResult) -> Document:
             _segment_table(result),
         ],
     )
+
+
+def _people_blocks(result: PredictionResult) -> list[Block]:
+    """Return the table of several people, of whom this report is the first one's."""
+    if not result.people:
+        return []
+    rows: list[list[Text]] = []
+    for number, person in enumerate(result.people):
+        stature = None if person.stature_mm is None else person.stature_mm / 1000
+        folder = Code(f"person_{number}") if number else "this one"
+        observed = format_number(person.observed, 1, 100)
+        rows.append([str(number), folder, observed, format_number(stature, 2), person.verdict])
+    header = ["person", "folder", "joints %", "height m", "verdict"]
+    return [Heading("People"), Table(header, rows)]
 
 
 def _origin(provenance: Mapping[str, Any]) -> Text:

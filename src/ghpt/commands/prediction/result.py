@@ -10,6 +10,16 @@ from ghpt.commands.prediction.verdict import Verdict
 
 
 @dataclass(frozen=True)
+class PersonSummary:
+    """One of several people, in the order of their folders."""
+
+    observed: float
+    """Share of the joints that are observed, over all frames of the recording."""
+    stature_mm: float | None
+    verdict: str
+
+
+@dataclass(frozen=True)
 class PredictionResult:
     """What prediction.json holds."""
 
@@ -30,6 +40,8 @@ class PredictionResult:
     """The world of the files, and the way there from that of the cameras."""
     provenance: dict[str, Any]
     verdict: Verdict | None = None
+    people: tuple[PersonSummary, ...] = ()
+    """All of several people, in the first person's result."""
 
     def plain(self) -> dict[str, Any]:
         """Return the result as plain data; the coverage is not a group of its own."""

@@ -33,6 +33,9 @@ _PEOPLE = {
 """What the people of a frame are called, and by whom."""
 _POINTS = ("pose_keypoints_2d", "pose_keypoints", "keypoints", "joints")
 """What a person's key points are called: OpenPose's, its own before 1.3, all others', CMU's."""
+_HANDS = ("hand_left_keypoints_2d", "hand_right_keypoints_2d")
+"""OpenPose's names of what is behind the body in the skeletons with hands, in their order."""
+HAND_POINTS = 21
 _SCORES = ("keypoint_scores", "scores")
 _NUMBERS = ("frame_id", "frame_index", "frame_idx", "frame")
 _KNOWN = (
@@ -88,15 +91,34 @@ def looks_like_people(text: str) -> bool:
     return text.startswith(("{", "[")) and any(f'"{word}"' in text for word in _WORDS)
 
 
-def read_people(path: Path, frame: JsonFrame) -> list[Person]:
-    """Return the people of a frame who have key points. Raises GhptDataError."""
+def read_people(path: Path, frame: JsonFrame, with_hands: bool = False) -> list[Person]:
+    """Return the people of a frame who have key points.
+
+    ``with_hands``: OpenPose's 21 points of the left and of the right hand are behind those of the
+    body, without confidence where there are none. Raises GhptDataError.
+    """
     found = []
     for index, person in enumerate(frame.people):
         place = frame.field if frame.is_person else f"{frame.field}[{index}]"
         joints = _joints(path, place, person)
         if len(joints):
-            found.append(Person(joints, _identity(person)))
+            hands = [_hand(path, place, person, name) for name in _HANDS] if with_hands else []
+            found.append(Person(np.concatenate([joints, *hands]), _identity(person)))
     return found
+
+
+def has_hands(content: JsonContent) -> bool:
+    """Return whether somebody's hands are in a file of OpenPose's."""
+    people = chain.from_iterable(frame.people for frame in content.frames)
+    return any(person.get(name) for person in people for name in _HANDS)
+
+
+def _hand(path: Path, place: str, person: dict[str, Any], name: str) -> Float[np.ndarray, "21 3"]:
+    points = joint_values(path, f"{place}.{name}", person.get(name) or [])
+    if len(points) not in (0, HAND_POINTS):
+        problem = f"are {len(points)} points, not {HAND_POINTS}"
+        raise GhptDataError(path, f"{place}.{name}", problem, "Detect this frame again.")
+    return points if len(points) else np.zeros((HAND_POINTS, 3))
 
 
 def _of_dict(path: Path, content: dict[str, Any]) -> JsonContent | None:

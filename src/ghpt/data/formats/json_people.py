@@ -7,13 +7,16 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path, PurePath, PurePosixPath
 
 from ghpt.data.formats.frame_files import Person, read_frame_files
 from ghpt.data.formats.json_content import (
+    HAND_POINTS,
     JsonContent,
     JsonFrame,
     Key,
+    has_hands,
     looks_like_people,
     read_content,
     read_people,
@@ -44,6 +47,10 @@ _LAYOUT = (
     "Put the files of each camera into a folder of its own, cam1/cam1_000000000012.json, or one "
     "file of a whole recording for each camera, cam1.json, into one folder."
 )
+_WITH_HANDS = "_hands"
+"""What the name of a skeleton with OpenPose's hands ends in."""
+_LOOKED_AT = 20
+"""Files that are looked at for hands."""
 _MOST_DIGITS = 15
 """Of a frame number."""
 
@@ -63,8 +70,12 @@ def read_json_people(source: Source) -> Detections:
     if source.format not in (None, content.format, *_SAME.get(content.format, ())):
         problem = f"is not of {source.format}: it looks like {content.format}'s"
         raise GhptDataError(first, "", problem, f"Leave format= out, or format={content.format}.")
-    read = _recordings if content.is_recording else _frame_files
-    found = read(source, files)
+    if content.is_recording:
+        found = _recordings(source, files)
+    elif _any_hands(files):
+        return _merge_with_hands(source, _frame_files(source, files, with_hands=True))
+    else:
+        found = _frame_files(source, files)
     skeleton = source.skeleton
     counts = {view.points.valid.shape[1] for view in found if len(view)}
     if skeleton is None and content.format == "coco" and counts == {len(SKELETONS["coco_17"])}:
@@ -97,17 +108,52 @@ def _first(files: Sequence[Path]) -> tuple[Path, JsonContent]:
     return files[0], content
 
 
-def _frame_files(source: Source, files: Sequence[Path]) -> list[Detections]:
+def _any_hands(files: Sequence[Path]) -> bool:
+    """Return whether OpenPose was asked for hands: then the first people have them."""
+    return any(_holds_hands(file) for file in files[:_LOOKED_AT])
+
+
+def _holds_hands(file: Path) -> bool:
+    try:
+        return has_hands(read_content(file, SMALL_JSON))
+    except GhptDataError:  # is said in its turn, after what is wrong with the files' names
+        return False
+
+
+def _merge_with_hands(source: Source, found: Sequence[Detections]) -> Detections:
+    """Return the detections of body and hands; of the body alone where that skeleton is not known
+    with hands, or is the one that is asked for.
+    """
+    count = max(view.points.valid.shape[1] for view in found) - 2 * HAND_POINTS
+    bodies = [
+        replace(view, points=view.points.select(range(count))) if len(view) else view
+        for view in found
+    ]
+    body = merge_views(source.path, bodies, _without_hands(source.skeleton))
+    known = next((name for name, points in SKELETONS.items() if points == body.joints), "")
+    name = f"{known}{_WITH_HANDS}"
+    if name not in SKELETONS or source.skeleton == known:
+        return body
+    return merge_views(source.path, found, name)
+
+
+def _without_hands(skeleton: str | None) -> str | None:
+    return skeleton and skeleton.removesuffix(_WITH_HANDS)
+
+
+def _frame_files(
+    source: Source, files: Sequence[Path], with_hands: bool = False
+) -> list[Detections]:
     """Return the views of files that hold one frame each."""
-    return read_frame_files(source, files, _people_of_frame)
+    return read_frame_files(source, files, partial(_people_of_frame, with_hands=with_hands))
 
 
-def _people_of_frame(file: Path) -> list[Person]:
+def _people_of_frame(file: Path, with_hands: bool) -> list[Person]:
     content = read_content(file, SMALL_JSON)
     if content.is_recording:
         problem = "holds a recording, and the files beside it hold a frame each"
         raise GhptDataError(file, "", problem, _LAYOUT)
-    return read_people(file, content.frames[0])
+    return read_people(file, content.frames[0], with_hands)
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from collections.abc import Sequence as Items
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Int
@@ -16,7 +17,7 @@ from ghpt.data.people.association import associate
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.following import follow_views
 from ghpt.data.people.matching import match_views
-from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels, scale_to_images
+from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -61,28 +62,60 @@ def detector_sequence(
     """Return one person with their cameras, the lens distortion undone, and all their key points.
 
     Views and cameras are matched as `match_views` says. ``person`` chooses as `select_person` says;
-    None follows the most prominent person of each view by itself. ``check_sizes`` refuses key
+    None is whoever shows what the cameras are (`follow_anybody`). ``check_sizes`` refuses key
     points of images of another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
-    people = scale_to_images(people, ordered, at)
     ideal = undistort_detections(people, ordered, at)
+    told_apart_by = _association_points(people, ideal)
     if person is None:
-        chosen = follow_views(people)[:, at]
+        chosen = follow_anybody(people, ordered, at, told_apart_by)
     else:
-        told_apart_by = _association_points(people, ideal)
-        chosen = select_person(people, ordered, at, told_apart_by, person)[:, at]
-    raw = people.points.take(chosen)
-    check_pixels(people.path, raw, ordered)
+        chosen = select_person(people, ordered, at, told_apart_by, person)
+    return _sequence(people, ordered, at, ideal, chosen, title, check_sizes)
+
+
+def detector_sequences(
+    people: Detections,
+    cameras: CameraSet,
+    match: Mapping[Name, Name] | None = None,
+    views: Items[Name] | None = None,
+    title: str = "",
+) -> list[Sequence]:
+    """Return everybody of `tell_apart`, the most visible first, each as `detector_sequence` does.
+
+    All have the same frames. The most visible person tells whether key points are of images of
+    another size. Raises GhptDataError.
+    """
+    at, ordered = match_views(people.path, people.views, cameras, match, views)
+    ideal = undistort_detections(people, ordered, at)
+    found = tell_apart(people, ordered, at, _association_points(people, ideal))
+    return [
+        _sequence(people, ordered, at, ideal, chosen, title, check_sizes=not person)
+        for person, chosen in enumerate(found)
+    ]
+
+
+def _sequence(
+    people: Detections,
+    cameras: CameraSet,
+    at: Items[int],
+    ideal: KeyPoints,
+    chosen: Chosen,
+    title: str,
+    check_sizes: bool,
+) -> Sequence:
+    raw = people.points.take(chosen[:, at])
+    check_pixels(people.path, raw, cameras)
     if check_sizes:
-        check_image_sizes(people.path, raw, ordered)
+        check_image_sizes(people.path, raw, cameras)
     return Sequence(
         title=title,
         source=people.path,
-        cameras=ordered,
+        cameras=cameras,
         frame=people.frame.astype(np.int64),
         rate_hz=people.rate_hz,
-        points=KeyPointArrays(ideal.take(chosen), raw.masked()),
+        points=KeyPointArrays(ideal.take(chosen[:, at]), raw.masked()),
         skeleton=people.skeleton,
     )
 
@@ -107,6 +140,15 @@ def undistort_detections(people: Detections, cameras: CameraSet, at: Items[int])
         pixels[indices] = points.pixels
         valid[indices] = points.valid
     return KeyPoints(pixels, people.points.confidence, valid).masked()
+
+
+def with_lenses(sequence: Sequence, cameras: CameraSet) -> Sequence:
+    """Return the sequence before the same cameras with other intrinsics and lenses, in memory."""
+    detected = sequence.detected()
+    views = [undistort_view(detected[:, view], cameras, view) for view in range(len(cameras))]
+    return replace(
+        sequence, cameras=cameras, points=KeyPointArrays(KeyPoints.stack(views), detected)
+    )
 
 
 def undistort_view(points: KeyPoints, cameras: CameraSet, camera: int) -> KeyPoints:
@@ -171,6 +213,36 @@ def tell_apart(
             cameras.path,
         )
     return [follow_views(people)]
+
+
+def follow_anybody(
+    people: Detections, cameras: CameraSet, at: Items[int], ideal: KeyPoints
+) -> Chosen:
+    """Return the detections of one person in each frame, by whom the cameras can be judged.
+
+    The arguments are those of `tell_apart`.
+
+    1. It is the most visible of the persons on whom two views agree in this frame.
+    2. A view that agrees in less than half of the frames in which it has anybody may be off: it
+       follows the person whom it tracks best (`follow_views`), as all views do without extrinsics
+       and where nobody is ever beside another.
+    """
+    own = follow_views(people)
+    counts = people.counts()[:, at]
+    if not cameras.calibrated or not (counts > 1).any():
+        return own
+    chosen = np.full_like(own, -1)
+    for person in _across_views(people, cameras, at, ideal):
+        free = (chosen < 0).all(1)
+        chosen[free] = person[free]
+    together = (chosen >= 0).any(1)
+    if 2 * together.sum() < ((counts > 0).sum(1) >= 2).sum():
+        return own
+    for place, view in enumerate(at):
+        there = together & (counts[:, place] > 0)
+        if 2 * (chosen[there, view] >= 0).sum() < there.sum():
+            chosen[:, view] = own[:, view]
+    return chosen
 
 
 def _one_by_one(people: Detections, found: Items[Chosen]) -> list[Chosen]:

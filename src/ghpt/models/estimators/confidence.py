@@ -22,6 +22,7 @@ def confidence_exponent(
     residuals: Float[Tensor, "B V J"],
     confidence: Float[Tensor, "B V J"],
     valid: Bool[Tensor, "B V J"],
+    least: float = LEAST_EXPONENT,
 ) -> float:
     """Return the p by which ``confidence ** p`` weights squared residuals.
 
@@ -30,7 +31,7 @@ def confidence_exponent(
     of the confidence, among the views of one joint in one frame, so that hard joints, hard frames
     and the definition of a joint say nothing; divided by the share of the residuals that V views
     leave a point free, 1 - 3 / 2V. It is 0 where the confidences are constant, where they say the
-    opposite, and where p, less two standard errors, is below ``LEAST_EXPONENT``.
+    opposite, and where p, less two standard errors, is below ``least``.
 
     ``residuals``: reprojection errors in any unit in which views compare, such as fractions of the
     person's scale, of points that outliers do not spoil; ``valid``: which of them are measured.
@@ -53,7 +54,7 @@ def confidence_exponent(
     surely = slope - 2 * (unexplained / spread).sqrt()
     mean_views = views.expand_as(measured)[measured].double().mean()
     freedom = 1 - 1.5 / mean_views
-    if not surely / freedom >= LEAST_EXPONENT:
+    if not surely / freedom >= least:
         return 0.0
     return min(float(slope / freedom), LARGEST_EXPONENT)
 

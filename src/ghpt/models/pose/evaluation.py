@@ -30,6 +30,7 @@ NAMES = (
     "best",
     "worst",
     "view_weights",
+    "trajectory",
     "frame_learned",
     "linear",
     "weighted_linear",

@@ -72,8 +72,11 @@ class PoseProblem(Problem):
     def baselines(
         self, settings: BaselineSettings, model: Any
     ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
-        """Return the estimators of the settings."""
-        return build(settings.baselines, "baselines")
+        """Return trajectories, where there are settings for them, and the rest."""
+        others: dict[str, Callable[[Observations], PoseEstimate]] = {}
+        if settings.trajectory:
+            others["trajectory"] = build(settings.trajectory, "trajectory")
+        return others | build(settings.baselines, "baselines")
 
     def record(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
         """Return the frames' true poses, recordings and numbers."""
@@ -161,8 +164,8 @@ class PoseTriangulation(PoseProblem):
     def baselines(
         self, settings: BaselineSettings, model: Any
     ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
-        """Return the model's view weights, where there are settings for them, and the rest."""
-        learned = {}
+        """Return view weights, where there are settings for them, and the rest."""
+        learned: dict[str, Callable[[Observations], PoseEstimate]] = {}
         if settings.view_weights:
             view_weights = build(settings.view_weights, "view_weights")
             learned["view_weights"] = view_weights(model)

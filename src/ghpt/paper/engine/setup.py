@@ -116,7 +116,7 @@ class Setup:
         config = self.configuration("test", data, *overrides)
         of_pairs = "frames" in model.config["model"]["problem"]
         unused = ("baselines", "view_weights") if of_pairs else ("camera_baselines",)
-        config = _without(config, ("ckpt", *unused))
+        config = _without(config, ("ckpt", "trajectory", *unused))
         for key in ("baselines", "camera_baselines"):
             if key in config and not baselines:
                 config[key] = {}

@@ -28,6 +28,9 @@ from ghpt.models.estimators.trajectory.windows import Clock, dense
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import HUMAN36M, Skeleton
 
+_LEAST_EXPONENT = 0.0
+"""Of the confidences: any that is surely positive counts, since many frames are averaged."""
+
 
 @dataclass(frozen=True)
 class TrajectoryPart:
@@ -85,20 +88,33 @@ class Trajectory:
 
         A joint is estimated where it is observed or supported.
         """
+        return self._estimate(batch, least_views=1)
+
+    @torch.no_grad()
+    def complete(self, batch: Observations) -> PoseEstimate:
+        """Return the same with joints that no view sees, near frames in which they are observed."""
+        return self._estimate(batch, least_views=0)
+
+    def _estimate(self, batch: Observations, least_views: int) -> PoseEstimate:
         pieces = []
         for rows in _recordings(batch):
             part = batch.rows(rows)
             found = self.solve(part, self.start(part))
-            count = found.views.sum(1)
-            observed = count >= 2
-            supported = (count == 1) & self.within_reach(part, observed)
+            agreeing = found.views.sum(1)
+            observed = agreeing >= 2
+            carried = (agreeing >= least_views) & self.within_reach(part, observed)
             points = found.points.to(part.key_points.dtype)
-            pieces.append(PoseEstimate(points, observed | supported))
+            pieces.append(PoseEstimate(points, observed | carried))
         points = torch.cat([piece.points for piece in pieces])
         return PoseEstimate(points, torch.cat([piece.estimated for piece in pieces]))
 
+    def at_rate(self, batch: Observations, rate_hz: float | None) -> Trajectory:
+        """Return the same for a recording with these frames, so many in a second."""
+        clock = Clock.of_frames(batch.index.numpy(), rate_hz, self.longest_gap_s)
+        return replace(self, clock=clock)
+
     def fitted(self, batch: Observations) -> Trajectory:
-        """Return the same with the body, and the inflation, that these frames show.
+        """Return the same with the body that these frames show, and the worth of confidences.
 
         They are of one recording, in the order of time; there may be gaps between them.
         """
@@ -108,16 +124,21 @@ class Trajectory:
         exchanged = found.exchanged
         error = reprojection_error(batch.cameras, exchanged.key_points, found.points)
         relative = error / person_scale(batch.key_points, batch.valid)[..., None]
-        exponent = confidence_exponent(relative, exchanged.confidence, exchanged.valid)
+        exponent = confidence_exponent(
+            relative, exchanged.confidence, exchanged.valid, _LEAST_EXPONENT
+        )
         weighted = replace(self, exponent=min(exponent, self.largest_exponent))
         frames, _ = weighted._frames(batch, first)
-        fitted = replace(weighted, body=self.solver(frames, self.skeleton).body)
+        return replace(weighted, body=self.solver(frames, self.skeleton).body)
+
+    def calibrated(self, batch: Observations) -> Trajectory:
+        """Return the same with the inflation of the covariances that these frames show."""
         views = int(batch.valid.any(-1).any(0).sum())
-        fitted = replace(fitted, inflation=self.inflation * LEAST_VIEWS / max(views, 2))
-        test = fitted.test_halves(batch)
+        prior = replace(self, inflation=self.inflation * LEAST_VIEWS / max(views, 2))
+        test = prior.test_halves(batch)
         if not test.is_decidable:
-            return fitted
-        return replace(fitted, inflation=fitted.inflation * test.inflation())
+            return prior
+        return replace(prior, inflation=prior.inflation * test.inflation())
 
     def test_halves(self, batch: Observations) -> DisjointTest:
         """Return how far the trajectories of two halves of the views are from each other.

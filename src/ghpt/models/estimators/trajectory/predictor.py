@@ -52,6 +52,7 @@ class TrajectoryPredictor:
         clock = self._clock(source)
         start = self.trajectory.start.fitted(clean)
         trajectory = replace(self.trajectory, start=start, clock=clock).fitted(clean)
+        trajectory = trajectory.calibrated(clean)
         reject = self.reject
         if reject is not None:
             first = start.triangulate(clean)

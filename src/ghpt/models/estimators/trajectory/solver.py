@@ -35,6 +35,8 @@ _MEDIAN_LENGTH = 1.1774
 """Median length of a 2D vector whose coordinates are normal with deviation 1: sqrt(2 ln 2)."""
 _COUNTS = 0.05
 """Weight from which a key point says that a joint is seen."""
+_EARLIER = 20.0
+"""By how much the tolerance of rounds before the last is larger."""
 _START_DEVIATION = 10.0
 """Of the points that the solver starts from, mm, where they are first joined through time."""
 
@@ -135,6 +137,8 @@ class TrajectorySolver:
         for number, kernel in enumerate(self.bone_kernels):
             if number in (0, 2):
                 state.exchange_sides()
+            last = number == len(self.bone_kernels) - 1
+            state.tolerance = self.tolerance * (1 if last else _EARLIER)
             state.update(kernel, adapt=number % 2 == 0, with_bones=True)
         return state.solution()
 
@@ -165,6 +169,7 @@ class _Rounds:
         start, end = self.ends
         self.both_placed = frames.placed[start] & frames.placed[end]
         self.near = solver.bones.near(self.both_placed, frames.axis)
+        self.tolerance = solver.tolerance
         self.given = body
         self.deviation = solver.motion.initial(frames.axis, joints)
         self.seen = frames.rows.used.any(0)
@@ -250,7 +255,7 @@ class _Rounds:
     def _solve(
         self, equations: NormalEquations, bones: Bones, groups: BodyGroups
     ) -> Float[Tensor, "3 J T"]:
-        limit = ConjugateGradients(self.solver.tolerance, self.solver.iterations)
+        limit = ConjugateGradients(self.tolerance, self.solver.iterations)
         start = self.points if bones else equations.right
         return solve(equations, bones, groups, start, limit)
 
