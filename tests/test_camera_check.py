@@ -245,6 +245,20 @@ def test_views_that_nothing_explains_are_said_to_be_off():
     ]
 
 
+def test_a_repair_that_leaves_a_view_worse_than_the_others_is_said_and_not_made():
+    spoilt = BREAKAGES["moved"].spoil(case())
+    generator = torch.Generator().manual_seed(1)
+    pixels = spoilt.evidence.pixels.clone()
+    pixels[-1] += 20 * torch.randn(pixels[-1].shape, dtype=pixels.dtype, generator=generator)
+    noisy = replace(spoilt, evidence=replace(spoilt.evidence, pixels=pixels))
+    result = check(noisy)
+    found = {finding.code: finding for finding in result.findings}
+    assert found["moved"].cameras == (spoilt.evidence.names[-1],)
+    assert not found["moved"].mended
+    torch.testing.assert_close(result.setup.R, spoilt.setup.R)
+    torch.testing.assert_close(result.setup.t, spoilt.setup.t)
+
+
 def test_steps_of_one_kind_are_one_finding():
     first = Finding("out_of_sync", Severity.ERROR, "3 late", ("a",), 3.0)
     first = replace(first, before_px=20.0, after_px=8.0, mended=True)

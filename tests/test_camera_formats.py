@@ -81,6 +81,8 @@ def test_a_json_file_for_each_camera(form, tmp_path):
         (tmp_path / f"{name}.json").write_text(json.dumps(form(view)))
     check_rig(read_cameras(tmp_path, unit_mm=1000))
     assert not read_cameras(tmp_path).unit_known
+    with pytest.raises(GhptDataError, match=f"holds 1 camera. .*cameras={tmp_path}"):
+        read_cameras(tmp_path / f"{RIG.names[0]}.json")
 
 
 def test_a_json_file_of_cameras_by_name(tmp_path):

@@ -1,6 +1,9 @@
 """predict.py with several people in view: everybody, one of them, and another run on fewer."""
 
 import json
+import shutil
+import subprocess
+from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +18,7 @@ from ghpt.geometry.cameras import project
 from predicting import cameras_file, config, walk, write_people
 
 FRAMES = 16
-WORDS = ("rate_hz=50", "estimator=linear", "'formats=[npz,html]'".strip("'"))
+WORDS = ("rate_hz=50", "estimator=linear", "formats=[npz,html]")
 
 
 def truths() -> list[torch.Tensor]:
@@ -93,6 +96,28 @@ def test_the_player_shows_everybody(everybody):
     alone = (output / "person_1" / "poses.html").read_text(encoding="utf-8")
     data = json.loads(alone.partition('application/json">')[2].partition("</script>")[0])
     assert [len(person) for person in data["people"]] == [17]
+
+
+HEADS = """
+const fs = require("fs"), p = require(process.argv[1]);
+const page = fs.readFileSync(process.argv[2], "utf8");
+const data = p.load(/application\\/json">(.*?)<\\/script>/s.exec(page)[1]);
+console.log(JSON.stringify(p.heads(data, p.drawn(data, 0).joints).map(head => head.person)));
+"""
+
+
+def test_the_player_writes_names_where_there_are_several(everybody):
+    _, output = everybody
+    node = shutil.which("node")
+    if node is None:
+        pytest.skip("no node")
+    named = []
+    for folder in (output, output / "person_1"):
+        with resources.as_file(resources.files("ghpt.export") / "player.js") as player:
+            command = [node, "-e", HEADS, str(player), str(folder / "poses.html")]
+            run = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+        named.append(json.loads(run.stdout))
+    assert named == [[0, 1], []]
 
 
 def test_one_who_is_asked_for_is_alone_and_the_others_files_go(everybody, folder):

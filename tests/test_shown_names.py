@@ -123,6 +123,7 @@ def calibration() -> CalibrationResult:
         converged=True,
         usable=(BAD,),
         cameras=(camera,),
+        evidence=None,
         difference=Differences({BAD: 1.0}, {BAD: 1.0}, 1.0),
         explains={},
         findings=(Finding("x", Severity.ERROR, BAD),),

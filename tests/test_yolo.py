@@ -6,6 +6,7 @@ import torch
 
 from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.people.persons import detector_sequences, person_sequence
 from ghpt.data.people.pixel_checks import scale_to_images
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
@@ -31,7 +32,7 @@ def test_labels_are_shares_of_the_images(extra, tmp_path):
     (tmp_path / "classes.txt").write_text("person\n")
     found = read_key_points(tmp_path)
     assert found.joints == SKELETONS["coco_17"]
-    assert found.frame.tolist() == [1, 2]
+    assert found.frame.tolist() == [0, 1]
     assert found.normalised
     K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64)
     size = torch.tensor([[1920, 1080], [640, 480]])
@@ -44,6 +45,27 @@ def test_labels_are_shares_of_the_images(extra, tmp_path):
     np.testing.assert_allclose(scaled.points.confidence[0], BODY[:, 2])
     with pytest.raises(GhptDataError, match="size of their images"):
         scale_to_images(found, CameraSet(cameras.names, cameras.K, cameras.distortion), [1, 0])
+
+
+@pytest.mark.parametrize("make", [person_sequence, lambda *to: detector_sequences(*to)[0]])
+def test_a_person_of_labels_is_in_pixels(make, tmp_path):
+    for view in ("cam1", "cam2"):
+        write(tmp_path / view, [label()])
+    K = torch.tensor([[1000.0, 0, 500], [0, 1000, 500], [0, 0, 1]], dtype=torch.float64)
+    size = torch.tensor([[1920, 1080], [640, 480]])
+    cameras = CameraSet(("cam1", "cam2"), K.expand(2, 3, 3), torch.zeros(2, 5), size=size)
+    sequence = make(read_key_points(tmp_path), cameras)
+    ankle = sequence.skeleton.key_points.index("right_ankle")
+    found = sequence.detected().pixels[0, :, ankle]
+    np.testing.assert_allclose(found, BODY[16, :2] * size.numpy(), rtol=1e-6)
+
+
+def test_labels_of_images_keep_the_images_numbers(tmp_path):
+    for view in ("a", "b"):
+        (tmp_path / view).mkdir()
+        for number in (1, 2):
+            (tmp_path / view / f"{view}_{number:06d}.txt").write_text(label() + "\n")
+    assert read_key_points(tmp_path).frame.tolist() == [1, 2]
 
 
 def test_joints_without_confidence_and_at_zero(tmp_path):

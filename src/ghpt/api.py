@@ -211,8 +211,10 @@ def calibrate_rig(
     rig = as_camera_set(cameras)
     rig = rig.without_extrinsics() if rig.unposed else rig
     people = as_detections(key_points, rig, confidence)
-    sequence = person_sequence(people, rig, wanted.match, wanted.views, person=None)
-    case = Case(sequence, "the given calibration", is_own=True)
+    people.skeleton.require_joints(people.path)
+    evidence = detector_sequence(people, rig, wanted.match, wanted.views, person=None)
+    sequence = evidence.as_joints()
+    case = Case(sequence, evidence, "the given calibration", is_own=True)
     calibration = build(wanted.calibration, "calibration")
     name = wanted.estimator
     estimator = build(wanted.baselines[name], f"baselines.{name}")

@@ -188,6 +188,13 @@ def npy(folder: Path) -> Path:
     return folder / "all_2d_preds.npy"
 
 
+def freemocap(folder: Path) -> Path:
+    points = np.concatenate([BODY[:, :2], BODY[:16, :2]])
+    array = np.broadcast_to(points, (2, 3, 33, 2)).astype(np.float32)
+    np.save(folder / "mediapipe_2dData_pixelXY.npy", array)
+    return folder / "mediapipe_2dData_pixelXY.npy"
+
+
 def toml(folder: Path) -> Path:
     write_pose2sim(folder / "rig.toml", panoptic_rig((1, 2)), {"adjusted": False})
     return folder / "rig.toml"
@@ -452,8 +459,11 @@ FORMATS: dict[str, Format] = {
     "yolo": Format(yolo, read_key_points, mutate_text),
     "sleap": Format(sleap, read_key_points, mutate_records),
     "deeplabcut": Format(deeplabcut, read_key_points, mutate_records),
-    "caliscope": Format(caliscope, lambda folder: read_key_points(folder / "xy.csv"), mutate_text),
+    "caliscope": Format(
+        caliscope, lambda folder: read_key_points(folder / "xy.csv", "coco_17"), mutate_text
+    ),
     "npz": Format(npz, lambda folder: read_key_points(folder / "points.npz"), mutate_npz),
+    "freemocap": Format(freemocap, read_key_points, mutate_npy),
     "npy": Format(npy, read_key_points, mutate_npy),
     "toml": Format(toml, lambda folder: read_cameras(folder / "rig.toml"), mutate_text),
     "yaml": Format(yaml, read_cameras, mutate_text),

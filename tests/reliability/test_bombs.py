@@ -157,6 +157,11 @@ def openpose(one: str, times: int) -> Callable[[Path], None]:
     return write
 
 
+def label_of_a_line(path: Path) -> None:
+    (path / "a").mkdir(parents=True)
+    sparse(path / "a" / "1.txt", b"0" + b" 0.5" * 2000, 1 << 30, b"\n")
+
+
 def many_views(path: Path, save: Callable[..., None] = np.savez) -> None:
     points = np.ones((2, 100_000, 2, 2), np.float32)
     save(path, key_points=points, views=np.array(["x"] * 100_000), joints=np.array(["a", "b"]))
@@ -219,6 +224,22 @@ BOMBS: dict[str, Bomb] = {
         read_key_points,
     ),
     "MMPose of depth 2e5": ("a.json", written('{"instance_info": ' + DEEP), read_key_points),
+    "results of depth 2e5": ("a.json", written('{"predictions": ' + DEEP), read_key_points),
+    "rtmlib of depth 900": (
+        "a.json",
+        written('{"keypoints": ' + "[" * 900 + "]" * 900 + ', "scores": []}'),
+        read_key_points,
+    ),
+    "label of 1 GB in a line": (
+        "labels",
+        label_of_a_line,
+        read_key_points,
+    ),
+    "freemocap of 1e12 elements": (
+        "mediapipe_2dData_pixelXY.npy",
+        written(npy_header((10**6, 10**6, 33, 2), "<f4")),
+        read_key_points,
+    ),
     "JSON of 1 GB in a line": (
         "a.json",
         lambda path: sparse(path, b'[{"image_id": 1, "x": "', 1 << 30),

@@ -24,6 +24,7 @@ FORMATS = (
     "caliscope",
     "npz",
     "npy",
+    "freemocap",
     "toml",
     "yaml",
     "panoptic",
@@ -34,7 +35,7 @@ FORMATS = (
 )
 HDF5 = ("sleap", "deeplabcut")
 """Read by h5py, which is an extra."""
-GROUPS = (FORMATS[:8], FORMATS[8:12], FORMATS[12:])
+GROUPS = (FORMATS[:8], FORMATS[8:13], FORMATS[13:])
 TABLES = ("caliscope", "toml", "yaml", "yolo")
 """Cut between two lines they are whole, and shorter."""
 

@@ -38,7 +38,7 @@ def random_problem(rng: np.random.Generator) -> tuple[Correspondences, PlacedRig
         broken.view(-1)[int(rng.integers(broken.numel()))] = float(rng.choice(SPOILT))
     valid &= valid.sum(0) >= 2
     frame = torch.zeros(joints, dtype=torch.int64)
-    return Correspondences(xy, noise, valid, frame, torch.arange(joints)), PlacedRig(
+    return Correspondences(xy, noise, valid, frame, torch.arange(joints), frame), PlacedRig(
         R, t, torch.ones(views, dtype=torch.bool), points, valid
     )
 

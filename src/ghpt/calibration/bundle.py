@@ -1,22 +1,35 @@
-"""Bundle adjustment of extrinsics and points with constant intrinsics: pycolmap's (Ceres), checked
-afterwards.
+"""Bundle adjustment of extrinsics and points with constant intrinsics: Levenberg-Marquardt steps
+with the points eliminated.
 """
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
-from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.calibration.normal_matrix import Linearised, linearise
+from ghpt.calibration.normal_matrix import (
+    Linearised,
+    NormalEquations,
+    Residuals,
+    linearise,
+    residuals,
+)
 from ghpt.calibration.observations import Correspondences
 from ghpt.calibration.resection import PlacedRig
-from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
+from ghpt.geometry.rotations import vector_to_matrix
+
+_DAMPING = 1e-4
+"""At the start: share by which the normal matrix's diagonal is raised."""
+_DAMPING_CHANGE = 10.0
+_LARGEST_DAMPING = 1e8
+_SMALLEST_DAMPING = 1e-9
+_SMALLEST_STEP = 0.3
+"""Of the tolerance: a step that gains less of the cost is the last."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +39,7 @@ class Adjusted:
     rig: PlacedRig
     start_cost: float
     final: Linearised
-    """At the rig's state, by this project's own derivatives."""
+    """At the rig's state."""
     iterations: int
     seconds: float
     converged: bool
@@ -55,10 +68,14 @@ class BundleAdjustment:
         rig that could not be improved comes back as it was, with ``converged`` False where it is
         not at a minimum.
         """
+        started = time.monotonic()
         used = rig.inlier
         rig = replace(rig, points=torch.where(used.any(0)[:, None], rig.points, 0.0))
         start = self.state(observed, rig)
-        solved, report = self._solve(observed, rig, used) if start.finite else (rig, None)
+        solved = rig
+        steps = 0
+        if start.finite:
+            solved, steps = self._solve(observed, rig, used, started + self.seconds)
         final = self.state(observed, solved)
         if not (final.finite and final.cost <= start.cost * (1 + 1e-12)):
             solved = rig
@@ -68,12 +85,7 @@ class BundleAdjustment:
             and final.in_front
             and final.gain <= self.tolerance * max(final.cost, 1e-12 * int(used.sum()))
         )
-        steps = 0
-        seconds = 0.0
-        if report is not None:
-            tried = report.num_successful_steps + report.num_unsuccessful_steps
-            steps = max(tried - 1, 0)  # Ceres counts the start as a successful step
-            seconds = report.total_time_in_seconds
+        seconds = time.monotonic() - started
         return Adjusted(solved, start.cost, final, steps, seconds, bool(converged))
 
     def state(self, observed: Correspondences, rig: PlacedRig) -> Linearised:
@@ -81,114 +93,53 @@ class BundleAdjustment:
         return linearise(observed, rig, rig.inlier, self.loss_scale)
 
     def _solve(
-        self, observed: Correspondences, rig: PlacedRig, used: Bool[Tensor, "V N"]
-    ) -> tuple[PlacedRig, Any]:
-        """Return the adjusted rig and Ceres' summary, which pycolmap does not type; None where
-        nothing can be adjusted.
-        """
-        views = torch.nonzero(rig.placed & used.any(1))[:, 0].tolist()
-        chosen = np.flatnonzero(used.any(0).numpy())
-        if len(views) < 2 or not len(chosen):
-            return rig, None
-        model = pycolmap.Reconstruction()
-        config = pycolmap.BundleAdjustmentConfig()
-        mask = used[:, chosen].numpy()
-        slot = np.zeros(len(chosen), dtype=np.int64)
-        joint = observed.joint.numpy()[chosen]
-        for j in np.unique(joint):
-            slot[joint == j] = np.arange((joint == j).sum())
-        for v in views:
-            _add_view(model, config, observed, rig, v, chosen, joint)
-        ids = []
-        for n, point in enumerate(rig.points.numpy()[chosen]):
-            track = [
-                pycolmap.TrackElement(_image(v, joint[n]), slot[n])
-                for v in np.flatnonzero(mask[:, n])
-            ]
-            ids.append(model.add_point3D(point, pycolmap.Track(track)))
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        report: Any = pycolmap.create_default_bundle_adjuster(
-            self._options(), config, model
-        ).solve()
+        self,
+        observed: Correspondences,
+        rig: PlacedRig,
+        used: Bool[Tensor, "V N"],
+        until: float,
+    ) -> tuple[PlacedRig, int]:
+        """Return the adjusted rig, and how many steps were tried."""
+        chosen = (used & rig.placed[:, None]).any(0)
+        views = torch.nonzero(rig.placed & used.any(1))[:, 0]
+        observed = observed.select(chosen).of_views(views)
+        now = rig.select(chosen).of_views(views)
+        state = self._residuals(observed, now)
+        equations = NormalEquations.of(observed, now, state)
+        damping = _DAMPING
+        steps = 0
+        while steps < self.iterations and time.monotonic() < until:
+            steps += 1
+            reduced = equations.reduce(damping)
+            tried = _moved(now, *reduced.step())
+            then = self._residuals(observed, tried)
+            if not then.cost < state.cost:
+                damping *= _DAMPING_CHANGE
+                if damping > _LARGEST_DAMPING:
+                    break
+                continue
+            gained = state.cost - then.cost
+            now = tried
+            state = then
+            damping = max(damping / _DAMPING_CHANGE, _SMALLEST_DAMPING)
+            if gained <= _SMALLEST_STEP * self.tolerance * state.cost:
+                break
+            equations = NormalEquations.of(observed, now, state)
         R = rig.R.clone()
         t = rig.t.clone()
         points = rig.points.clone()
-        for v in views:
-            pose: Any = model.frame(v + 1).rig_from_world
-            R[v] = torch.from_numpy(pose.rotation.matrix().copy())
-            t[v] = torch.from_numpy(np.array(pose.translation))
-        points[chosen] = torch.from_numpy(np.stack([model.point3D(i).xyz for i in ids]))
-        return replace(rig, R=R, t=t, points=points), report.ceres_summary
+        R[views] = now.R
+        t[views] = now.t
+        points[chosen] = now.points
+        return replace(rig, R=R, t=t, points=points), steps
 
-    def _options(self) -> pycolmap.BundleAdjustmentOptions:
-        options = pycolmap.BundleAdjustmentOptions()
-        options.refine_focal_length = options.refine_principal_point = (
-            options.refine_extra_params
-        ) = False
-        options.refine_sensor_from_rig = False
-        options.print_summary = False
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.loss_function_scale = self.loss_scale
-        solver = options.ceres.solver_options
-        solver.max_num_iterations = self.iterations
-        solver.max_solver_time_in_seconds = self.seconds
-        solver.num_threads = 1  # sums in one order: the same rig on any machine
-        solver.function_tolerance = 1e-10
-        solver.gradient_tolerance = 1e-12
-        solver.parameter_tolerance = 1e-10
-        options.ceres.solver_options = solver
-        return options
+    def _residuals(self, observed: Correspondences, rig: PlacedRig) -> Residuals:
+        return residuals(observed, rig, rig.inlier, self.loss_scale)
 
 
-def _image(view: int | np.integer, joint: int | np.integer) -> int:
-    return int(view) * JOINTS + int(joint) + 1
-
-
-JOINTS = 1000
-"""More joints than any body has."""
-
-
-def _add_view(
-    model: pycolmap.Reconstruction,
-    config: pycolmap.BundleAdjustmentConfig,
-    observed: Correspondences,
-    rig: PlacedRig,
-    view: int,
-    chosen: np.ndarray,
-    joint: np.ndarray,
-) -> None:
-    """A view as a pycolmap rig with one pose and a camera for each joint, whose pixel is that
-    joint's noise: so Ceres weighs joints, which it has no other way to do.
-    """
-    body = pycolmap.Rig(rig_id=view + 1)
-    frame = pycolmap.Frame(frame_id=view + 1, rig_id=view + 1)
-    images: list[pycolmap.Image] = []
-    for j in np.unique(joint).tolist():
-        own = chosen[joint == j]
-        focal = 1 / float(observed.noise[view, own[0]])
-        number = _image(view, j)
-        camera = pycolmap.Camera(
-            camera_id=number, model="SIMPLE_PINHOLE", width=1, height=1, params=[focal, 0.0, 0.0]
-        )
-        model.add_camera(camera)
-        body.add_sensor(camera.sensor_id, pycolmap.Rigid3d()) if images else body.add_ref_sensor(
-            camera.sensor_id
-        )
-        # what is not used may be anything
-        xy = (
-            torch.where(rig.inlier[view, own][:, None], observed.xy[view, own], 0.0).numpy() * focal
-        )
-        image = pycolmap.Image(name=str(number), keypoints=xy, camera_id=number, image_id=number)
-        image.frame_id = view + 1
-        frame.add_data_id(image.data_id)
-        images.append(image)
-        config.add_image(number)
-        config.set_constant_cam_intrinsics(number)
-    frame.rig_from_world = pycolmap.Rigid3d(
-        pycolmap.Rotation3d(rig.R[view].numpy()), rig.t[view].numpy()
-    )
-    model.add_rig(body)
-    model.add_frame(frame)
-    for image in images:
-        model.add_image(image)
-    model.register_frame(view + 1)
+def _moved(rig: PlacedRig, views: Float[Tensor, "V 6"], points: Float[Tensor, "N 3"]) -> PlacedRig:
+    """Return the rig after a step of the views' and the points' parameters."""
+    R = rig.R @ vector_to_matrix(views[:, :3]).mT
+    centre = rig.centre + views[:, 3:]
+    t = -(R @ centre[..., None])[..., 0]
+    return replace(rig, R=R, t=t, points=rig.points + points)

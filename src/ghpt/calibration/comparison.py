@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -144,21 +144,33 @@ class Explanation:
     segments: BoneVariation
 
 
-def explain(recordings: Mapping[str, Recording], estimator: Estimator) -> dict[str, Explanation]:
-    """Return how well each calibration of the same key points explains them, by name.
+def explain(
+    recordings: Mapping[str, Sequence[Recording]], estimator: Estimator
+) -> dict[str, Explanation]:
+    """Return how well each calibration explains key points, by name.
 
-    The errors in held-out views (pixels) are over the joints that all of them estimate.
+    The calibrations have the same parts of a recording, each perhaps with cameras of its own. The
+    errors in held-out views (pixels) are over the joints that all of them estimate.
     """
-    held_out = {name: held_out_errors(one, estimator) for name, one in recordings.items()}
-    if not held_out:
+    if not recordings:
         return {}
+    held_out = {name: _errors_of_parts(parts, estimator) for name, parts in recordings.items()}
     measured = torch.stack([valid for _, valid in held_out.values()]).all(0)
     result = {}
-    for name, recording in recordings.items():
-        errors = view_errors(held_out[name][0], measured, recording.camera_names)
-        points, estimated = triangulate_recording(recording, estimator)
+    for name, parts in recordings.items():
+        errors = view_errors(held_out[name][0], measured, parts[0].camera_names)
+        found = [triangulate_recording(part, estimator) for part in parts]
+        points, estimated = (torch.cat(each) for each in zip(*found, strict=True))
         result[name] = Explanation(errors, bone_variations(points, estimated))
     return result
+
+
+def _errors_of_parts(
+    parts: Sequence[Recording], estimator: Estimator
+) -> tuple[Float[Tensor, "T V J"], Bool[Tensor, "T V J"]]:
+    found = [held_out_errors(part, estimator) for part in parts]
+    error, measured = (torch.cat(each) for each in zip(*found, strict=True))
+    return error, measured
 
 
 def view_errors(

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ghpt.calibration.bundle import Adjusted
 from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.independence import Evidence
 from ghpt.calibration.mistakes import (
     DISAGREEMENT,
     FEW_FRAMES,
@@ -18,6 +19,7 @@ from ghpt.calibration.mistakes import (
     ILL_CONDITIONED,
     LARGE_RESIDUALS,
     LITTLE_MOTION,
+    NO_MOTION,
     NOT_CONVERGED,
     NOTHING_LINKED,
     OUTSIDE_IMAGE,
@@ -45,27 +47,35 @@ _SUSPICIOUS = ("resolution", "unlinked", "disagreement")
 
 
 @dataclass(frozen=True)
+class Joints:
+    """The 17 joints of the rows that a rig was calibrated from, in its world."""
+
+    points: Float[Tensor, "R 17 3"]
+    estimated: Bool[Tensor, "R 17"]
+
+
+@dataclass(frozen=True)
 class Case:
     """All that is known of a rig when it is judged."""
 
     names: tuple[str, ...]
     K: Float[Tensor, "V 3 3"]
-    key_points: Float[Tensor, "T V J 2"]
-    valid: Bool[Tensor, "T V J"]
+    key_points: Float[Tensor, "T V 17 2"]
+    valid: Bool[Tensor, "T V 17"]
     sizes: Int[Tensor, "V 2"] | None
     frames: Int[Tensor, " F"]
+    """The rows that are used."""
     observed: Correspondences
+    """The detector's own key points of these rows."""
+    joints: Joints
     table: PairTable
     adjusted: Adjusted | None
+    evidence: Evidence | None
+    """None without a rig."""
     resection: Resection
     noise: float
     """First guess of the key points' noise, in sizes of the person."""
     seed: int
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """The numbers of frames used and of joints."""
-        return len(self.frames), self.key_points.shape[2]
 
     @property
     def rig(self) -> PlacedRig | None:
@@ -100,14 +110,15 @@ class Diagnostics:
     in sizes of the rig.
 
     ``few_frames``: fewer are a finding. ``motion``: least motion of a joint in the image, in sizes
-    of the person; an error below half of it. ``flat``: least thickness of the cloud of all points,
-    in its length. ``inliers``: least share of a view's key points that agree. ``noise``: largest
-    noise of the key points that the residuals show, in sizes of the person; ``contrast``: and in
-    the median of the views. ``distance``: least distance of two cameras, in sizes of the rig.
-    ``proportions``: largest ratio of the bones' lengths, in an average adult's, to each other.
-    ``outside``: largest share of key points outside the image. ``unused``: share of the width and
-    of the height of the image beyond which some key points must lie. ``repair``: when a mistake
-    explains a finding.
+    of the person. ``rotation_wanted``: a larger standard deviation of a rotation is a finding that
+    says how much recording would do, and an error from ``rotation_useless`` on. ``flat``: least
+    thickness of the cloud of all points, in its length. ``inliers``: least share of a view's key
+    points that agree. ``noise``: largest noise of the key points that the residuals show, in sizes
+    of the person; ``contrast``: and in the median of the views. ``distance``: least distance of two
+    cameras, in sizes of the rig. ``proportions``: largest ratio of the bones' lengths, in an
+    average adult's, to each other. ``outside``: largest share of key points outside the image.
+    ``unused``: share of the width and of the height of the image beyond which some key points must
+    lie. ``repair``: when a mistake explains a finding.
     """
 
     few_frames: int
@@ -117,6 +128,8 @@ class Diagnostics:
     noise: float
     contrast: float
     distance: float
+    rotation_wanted: float
+    rotation_useless: float
     rotation_std: float
     centre_std: float
     proportions: float
@@ -140,7 +153,8 @@ class Diagnostics:
         if case.rig is not None and uncertainty is not None and determined:
             findings += self._agreement(case, case.rig)
             findings += self._geometry(case, case.rig)
-            findings += self._proportions(case, case.rig)
+            findings += self._proportions(case)
+            findings += self._evidence(case)
             findings += self._determined(case, case.rig, uncertainty)
         return (*findings, *self._repairs(case, findings))
 
@@ -177,8 +191,7 @@ class Diagnostics:
         count = len(case.frames)
         motion = _motion(case.key_points[case.frames], case.valid[case.frames])
         if count > 1 and motion < self.motion:
-            severity = Severity.ERROR if motion < self.motion / 2 else Severity.WARNING
-            yield LITTLE_MOTION.finding((), motion, self.motion, severity, count=count)
+            yield NO_MOTION.finding((), motion, self.motion, count=count)
 
     def _resolution(self, case: Case) -> Iterator[Finding]:
         """Yield the views whose key points lie outside the image, or leave much of it unused."""
@@ -253,15 +266,29 @@ class Diagnostics:
             shape = "a line" if values[1] < self.flat * values[0] else "a plane"
             yield FLAT.finding((), float(values[2] / values[0]), self.flat, shape=shape)
 
-    def _proportions(self, case: Case, rig: PlacedRig) -> Iterator[Finding]:
+    def _proportions(self, case: Case) -> Iterator[Finding]:
         lengths = torch.tensor(average_lengths(), dtype=torch.float64)
-        points = rig.points.unflatten(0, case.shape)
-        known = rig.inlier.any(0).unflatten(0, case.shape)
-        scales = bone_scales(points, known, lengths)
+        scales = bone_scales(case.joints.points, case.joints.estimated, lengths)
         scales = scales[torch.isfinite(scales)]
         if len(scales) > 1 and scales.max() > self.proportions * scales.min():
             ratio = float(scales.max() / scales.min())
             yield PROPORTIONS.finding((), ratio, self.proportions)
+
+    def _evidence(self, case: Case) -> Iterator[Finding]:
+        """Yield that the recording is too short, or too much alike, for a rig to rely on."""
+        evidence = case.evidence
+        if evidence is not None and evidence.rotation_sd_deg > self.rotation_wanted:
+            useless = evidence.rotation_sd_deg > self.rotation_useless
+            yield LITTLE_MOTION.finding(
+                (),
+                evidence.rotation_sd_deg,
+                self.rotation_wanted,
+                Severity.ERROR if useless else Severity.WARNING,
+                used=evidence.used,
+                independent=evidence.independent,
+                turned=evidence.turned_deg,
+                needed=evidence.frames_for(self.rotation_wanted),
+            )
 
     def _determined(
         self, case: Case, rig: PlacedRig, uncertainty: Uncertainty

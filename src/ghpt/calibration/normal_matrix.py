@@ -1,5 +1,7 @@
-"""Cost, gradient and normal matrix of a rig under the robust loss, with the points eliminated
-(Schur complement).
+"""Normal equations of a rig under the robust loss, with the points eliminated (Schur complement).
+
+Parameters of a view are a rotation vector w (radians, ``R exp([w]x)^T``: a turn of the camera about
+the world's axes) and its centre c (world); of a point, its coordinates.
 """
 
 from __future__ import annotations
@@ -12,28 +14,165 @@ from torch import Tensor
 
 from ghpt.calibration.observations import Correspondences
 from ghpt.calibration.resection import PlacedRig
-from ghpt.geometry.epipolar import cross_matrix
+from ghpt.geometry.normal_equations import minors
 
 BEHIND = 1e4
 """Units of noise that an observation behind its camera counts as."""
+_LARGEST = 1e100
+"""Numbers beyond it are none: their squares would not be finite."""
+_SINGULAR = 1e-18
+"""Determinant of a point's matrix of trace 1 below which its rays do not fix it."""
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Of the used observations of N points in V views, in units of noise."""
+
+    in_camera: Float[Tensor, "V N 3"]
+    """The points in the cameras' frames; depth 1 where not in front."""
+    error: Float[Tensor, "V N 2"]
+    """0 where not used or not in front."""
+    weight: Float[Tensor, "V N"]
+    """Of the Cauchy loss; 0 where not used or not in front."""
+    cost: float
+    """Sum of the Cauchy loss c^2 / 2 log(1 + r^2 / c^2) over the used observations."""
+    in_front: bool
+    """Whether all used observations are."""
+
+
+def residuals(
+    observed: Correspondences, rig: PlacedRig, used: Bool[Tensor, "V N"], scale: float
+) -> Residuals:
+    """Return the errors of a rig; ``scale``: of the Cauchy loss, units of noise."""
+    in_camera = rig.points @ rig.R.mT + rig.t[:, None]
+    depth = in_camera[..., 2]
+    front = used & (depth > 0)
+    depth = torch.where(front, depth, 1.0)
+    in_camera = torch.cat((in_camera[..., :2], depth[..., None]), dim=-1)
+    error = (in_camera[..., :2] / depth[..., None] - observed.xy) / observed.noise[..., None]
+    error = torch.where(front[..., None], error, 0.0)
+    square = error.square().sum(-1)
+    behind = float((used & ~front).sum())
+    ratio = square / scale**2
+    loss = float(torch.log1p(ratio).sum()) + behind * float(
+        torch.log1p(torch.tensor((BEHIND / scale) ** 2, dtype=torch.float64))
+    )
+    weight = torch.where(front, 1 / (1 + ratio), 0.0)
+    return Residuals(in_camera, error, weight, scale**2 / 2 * loss, behind == 0)
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Normal matrix and gradient of V views and N points."""
+
+    views: Float[Tensor, "V 6 6"]
+    cross: Float[Tensor, "N P 3"]
+    """Of the P = 6 V parameters of the views with each point's."""
+    points: Float[Tensor, "N 3 3"]
+    views_gradient: Float[Tensor, "N P"]
+    """Of each point's cost."""
+    points_gradient: Float[Tensor, "N 3"]
+
+    @classmethod
+    def of(cls, observed: Correspondences, rig: PlacedRig, now: Residuals) -> NormalEquations:
+        """Return the equations of a rig with these residuals."""
+        root = now.weight.sqrt()
+        scale = root / (observed.noise * now.in_camera[..., 2])
+        slope = now.in_camera[..., :2] / now.in_camera[..., 2:]
+        R = rig.R[:, None]
+        # the derivatives by the point: f / z (r_1 - x / z r_3), and the same with r_2 and y
+        by_point = R[..., :2, :] - slope[..., None] * R[..., 2:, :]
+        by_point = scale[..., None, None] * by_point
+        arm = (rig.points - rig.centre[:, None])[..., None, :].expand_as(by_point)
+        by_view = torch.cat((torch.linalg.cross(by_point, arm), -by_point), dim=-1)
+        error = root[..., None] * now.error
+        rows = by_view.flatten(1, 2)
+        return cls(
+            views=rows.mT @ rows,
+            cross=_outer_sum(by_view, by_point).transpose(0, 1).flatten(1, 2),
+            points=_outer_sum(by_point, by_point).sum(0),
+            views_gradient=_weighted_sum(by_view, error).transpose(0, 1).flatten(1),
+            points_gradient=_weighted_sum(by_point, error).sum(0),
+        )
+
+    def reduce(self, damping: float = 0.0) -> ReducedEquations:
+        """Return the equations of the views alone.
+
+        ``damping``: share by which the diagonals of views and points are raised.
+        """
+        inverse, solvable = _inverse(self.points, damping)
+        eliminated = self.cross @ inverse
+        gradient = (eliminated @ self.points_gradient[..., None])[..., 0]
+        return ReducedEquations(
+            equations=self,
+            inverse=inverse,
+            eliminated=eliminated,
+            gradient=self.views_gradient - gradient,
+            solvable=bool(solvable.all()),
+            damping=damping,
+        )
+
+
+@dataclass(frozen=True)
+class ReducedEquations:
+    """Normal equations with the points eliminated."""
+
+    equations: NormalEquations
+    inverse: Float[Tensor, "N 3 3"]
+    """Of the points' matrices; 0 where a point's rays do not fix it."""
+    eliminated: Float[Tensor, "N P 3"]
+    gradient: Float[Tensor, "N P"]
+    """Of each point's cost by the views."""
+    solvable: bool
+    """Whether all points' rays fix them."""
+    damping: float
+
+    def matrix(self) -> Float[Tensor, "P P"]:
+        """Return the matrix of the P = 6 V parameters, undamped."""
+        left = self.eliminated.transpose(1, 2).flatten(0, 1)
+        right = self.equations.cross.transpose(1, 2).flatten(0, 1)
+        matrix = torch.block_diag(*self.equations.views) - left.T @ right
+        return (matrix + matrix.T) / 2
+
+    def step(self) -> tuple[Float[Tensor, "V 6"], Float[Tensor, "N 3"]]:
+        """Return the (damped) Gauss-Newton step of views and points."""
+        matrix = self.matrix()
+        diagonal = self.equations.views.diagonal(dim1=-2, dim2=-1).flatten()
+        gradient = self.gradient.sum(0)
+        scale = torch.where(diagonal > 0, diagonal.clamp_min(1e-300).rsqrt(), 0.0)
+        # scaled to a diagonal of about 1, so that radians and lengths compare
+        scaled = matrix * scale * scale[:, None]
+        scaled.diagonal().add_(max(self.damping, 1e-12))
+        factor, failed = torch.linalg.cholesky_ex(scaled)
+        if int(failed):
+            nothing = torch.full_like(self.equations.views[:, 0], torch.nan)
+            return nothing, self.equations.points_gradient
+        solved = torch.cholesky_solve((scale * gradient)[:, None], factor)[:, 0]
+        views = -scale * solved
+        right = self.equations.points_gradient + views @ self.equations.cross
+        return views.unflatten(0, (-1, 6)), -(self.inverse @ right[..., None])[..., 0]
+
+    def gain(self) -> float:
+        """Return what the step would gain: half the squared length of the gradient in the inverse
+        normal matrix. It is 0 at a minimum and the same in any gauge and unit.
+        """
+        by_point = (self.inverse @ self.equations.points_gradient[..., None])[..., 0]
+        of_points = float((self.equations.points_gradient * by_point).sum() / 2)
+        return of_points + _gain(self.matrix(), self.gradient.sum(0))
 
 
 @dataclass(frozen=True)
 class Linearised:
-    """A rig's state. Parameters of a view: a rotation vector w (radians, ``R exp([w]x)^T``: a turn
-    of the camera about the world's axes) and its centre c (world).
-    """
+    """A rig's state, and the equations of its views."""
 
     scale: float
     """Of the Cauchy loss, units of noise."""
     cost: float
-    """Sum of the Cauchy loss c^2 / 2 log(1 + r^2 / c^2) over the used observations, r in units."""
+    """See `Residuals`."""
     finite: bool
     in_front: bool
     gain: float
-    """What a full Gauss-Newton step would gain: half the squared length of the gradient in the
-    inverse normal matrix. It is 0 at a minimum and the same in any gauge and unit.
-    """
+    """See `ReducedEquations`."""
     matrix: Float[Tensor, "P P"]
     """Normal matrix of the P = 6 V parameters of the views, points eliminated; singular along the
     gauge's 7.
@@ -45,95 +184,93 @@ class Linearised:
 def linearise(
     observed: Correspondences, rig: PlacedRig, used: Bool[Tensor, "V N"], scale: float
 ) -> Linearised:
-    """``scale``: of the Cauchy loss, units of noise. Not finite numbers give ``finite`` False and
-    zeros.
+    """Return a rig's state. Not finite numbers give ``finite`` False and zeros.
+
+    ``scale``: of the Cauchy loss, units of noise.
     """
     used = used & rig.placed[:, None]
-    views = len(rig.R)
-    frames = int(observed.frame[-1]) + 1 if len(observed.frame) else 0
-    nothing = (
-        torch.zeros(6 * views, 6 * views, dtype=torch.float64),
-        torch.zeros(frames, 6 * views, dtype=torch.float64),
-    )
     chosen = used.any(0)
-    inputs = (
+    parameters = 6 * len(rig.R)
+    scores = torch.zeros(observed.frames, parameters, dtype=torch.float64)
+    infinite = float("inf")
+    nothing = Linearised(
+        scale=scale,
+        cost=infinite,
+        finite=False,
+        in_front=False,
+        gain=infinite,
+        matrix=torch.zeros(parameters, parameters, dtype=torch.float64),
+        scores=scores,
+    )
+    if not chosen.any() or not all_finite(observed, rig, used):
+        return nothing
+    observed = observed.select(chosen)
+    rig = rig.select(chosen)
+    now = residuals(observed, rig, used[:, chosen], scale)
+    reduced = NormalEquations.of(observed, rig, now).reduce()
+    scores = scores.index_add(0, observed.frame, reduced.gradient)
+    matrix = reduced.matrix()
+    if not (torch.isfinite(matrix).all() and torch.isfinite(scores).all()):
+        return nothing
+    gain = reduced.gain()
+    return Linearised(
+        scale=scale,
+        cost=now.cost,
+        finite=gain < infinite,
+        in_front=now.in_front and reduced.solvable,
+        gain=gain,
+        matrix=matrix,
+        scores=scores,
+    )
+
+
+def all_finite(observed: Correspondences, rig: PlacedRig, used: Bool[Tensor, "V N"]) -> bool:
+    """Return whether the numbers of the placed views and used points can be calculated with."""
+    numbers = (
         rig.R[rig.placed],
         rig.t[rig.placed],
-        rig.points[chosen],
-        observed.xy[:, chosen][used[:, chosen]],
+        rig.points[used.any(0)],
+        observed.xy[used],
     )
-    if not (
-        chosen.any() and all(torch.isfinite(x).all() and x.abs().max() < 1e100 for x in inputs)
-    ):
-        return Linearised(scale, float("inf"), False, False, float("inf"), *nothing)
-    used = used[:, chosen]
-    frame = observed.frame[chosen]
-    centre = rig.centre
-    arm = rig.points[chosen] - centre[:, None]
-    x, y, z = (arm @ rig.R.mT).unbind(-1)
-    front = used & (z > 0)
-    depth = torch.where(front, z, 1.0)
-    f = 1 / observed.noise[:, chosen]
-    residual = (torch.stack((x, y), dim=-1) / depth[..., None] - observed.xy[:, chosen]) * f[
-        ..., None
-    ]
-    residual = torch.where(front[..., None], residual, 0.0)
-    square = torch.where(front, residual.square().sum(-1), torch.where(used, BEHIND**2, 0.0))
-    cost = float((scale**2 / 2 * torch.log1p(square / scale**2)).sum())
-    weight = torch.where(front, 1 / (1 + square / scale**2), 0.0)
-
-    zero = torch.zeros_like(x)
-    by_camera = torch.stack(
-        (f / depth, zero, -f * x / depth**2, zero, f / depth, -f * y / depth**2), dim=-1
-    )
-    by_point = by_camera.unflatten(-1, (2, 3)) @ rig.R[:, None]
-    by_view = torch.cat((by_point @ cross_matrix(arm), -by_point), dim=-1)
-    Jp = by_point * weight[..., None, None]
-    Jv = by_view * weight[..., None, None]
-    r = residual
-    Hpp = torch.einsum("vnri,vnrj->nij", Jp, by_point)
-    gp = torch.einsum("vnri,vnr->ni", Jp, r)
-    Hvp = torch.einsum("vnri,vnrj->nvij", Jv, by_point)
-    gv = torch.einsum("vnri,vnr->nvi", Jv, r)
-    Hvv = torch.einsum("vnri,vnrj->vij", Jv, by_view)
-    inverse, solvable = _inverse(Hpp)
-    right = torch.cat((Hvp.flatten(1, 2).mT, gp[..., None]), dim=-1)
-    solved = inverse @ right
-    matrix = torch.block_diag(*Hvv) - torch.einsum("nki,nkj->ij", right[..., :-1], solved[..., :-1])
-    reduced = gv.flatten(1) - (right[..., :-1].mT @ solved[..., -1:])[..., 0]
-    scores = nothing[1].index_add(0, frame, reduced)
-    gain = float((gp * solved[..., -1]).sum() / 2) + _gain((matrix + matrix.T) / 2, scores.sum(0))
-    finite = bool(torch.isfinite(matrix).all() and torch.isfinite(scores).all()) and gain < float(
-        "inf"
-    )
-    return Linearised(
-        scale,
-        cost,
-        finite,
-        bool((front == used).all() and solvable.all()),
-        gain,
-        (matrix + matrix.T) / 2,
-        scores,
-    )
+    return all(bool((x.abs() < _LARGEST).all()) for x in numbers)
 
 
-def _inverse(H: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, "N 3 3"], Bool[Tensor, " N"]]:
-    """Inverses of points' normal matrices; 0 where a point's rays do not fix it."""
-    trace = H.diagonal(dim1=-2, dim2=-1).sum(-1)
-    safe = torch.where(trace > 0, trace, 1.0)[:, None, None]
-    scaled = H / safe
-    solvable = (trace > 0) & (torch.linalg.det(scaled) > 1e-18)
-    eye = torch.eye(3, dtype=H.dtype)
-    inverse, failed = torch.linalg.inv_ex(torch.where(solvable[:, None, None], scaled, eye))
-    solvable = solvable & (failed == 0)
-    return torch.where(solvable[:, None, None], inverse / safe, 0.0), solvable
+def _outer_sum(a: Float[Tensor, "V N 2 A"], b: Float[Tensor, "V N 2 B"]) -> Tensor:
+    """Return the sum over both rows of their outer products, [V N A B]."""
+    first = a[:, :, 0, :, None] * b[:, :, 0, None]
+    return torch.addcmul(first, a[:, :, 1, :, None], b[:, :, 1, None])
+
+
+def _weighted_sum(rows: Float[Tensor, "V N 2 A"], error: Float[Tensor, "V N 2"]) -> Tensor:
+    """Return the sum of both rows, each times its error, [V N A]."""
+    first = rows[:, :, 0] * error[..., :1]
+    return torch.addcmul(first, rows[:, :, 1], error[..., 1:])
+
+
+def _inverse(
+    matrix: Float[Tensor, "N 3 3"], damping: float
+) -> tuple[Float[Tensor, "N 3 3"], Bool[Tensor, " N"]]:
+    """Return inverses, with the diagonal raised; 0 where a point's rays do not fix it."""
+    trace = matrix.diagonal(dim1=-2, dim2=-1).sum(-1)
+    safe = torch.where(trace > 0, trace, 1.0)
+    scaled = matrix / safe[:, None, None]
+    diagonal = scaled.diagonal(dim1=-2, dim2=-1)
+    scaled = scaled + torch.diag_embed(damping * diagonal)
+    xx, xy, xz, _, yy, yz, _, _, zz = scaled.flatten(1).unbind(-1)
+    cofactors = minors((xx, xy, xz, yy, yz, zz))
+    cxx, cxy, cxz, cyy, cyz, czz = cofactors
+    determinant = xx * cxx + xy * cxy + xz * cxz
+    solvable = (trace > 0) & (determinant > _SINGULAR)
+    factor = torch.where(solvable, 1 / (torch.where(solvable, determinant, 1.0) * safe), 0.0)
+    rows = torch.stack((cxx, cxy, cxz, cxy, cyy, cyz, cxz, cyz, czz), dim=-1)
+    return factor[:, None, None] * rows.unflatten(-1, (3, 3)), solvable
 
 
 def preconditioned(
     matrix: Float[Tensor, "P P"],
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, "P P"]]:
-    """1 / sqrt of the diagonal (0 where it is 0), and eigenvalues and -vectors of the matrix scaled
-    to diagonal 1: so radians and lengths compare.
+    """Return 1 / sqrt of the diagonal (0 where it is 0), and eigenvalues and -vectors of the matrix
+    scaled to diagonal 1: so radians and lengths compare.
     """
     diagonal = matrix.diagonal()
     scale = torch.where(diagonal > 0, diagonal.clamp_min(1e-300).rsqrt(), 0.0)

@@ -12,11 +12,14 @@ from torch import Tensor
 from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.geometry.epipolar import normalise
 from ghpt.models.estimators.classical import person_scale
+from ghpt.skeleton import Skeleton
 
 
 @dataclass(frozen=True)
 class Correspondences:
-    """Key points of N = T x J points (joints of a frame side by side) in V views."""
+    """Key points of N = R x J points in V views: the joints of R rows, each a person in a frame,
+    side by side.
+    """
 
     xy: Float[Tensor, "V N 2"]
     """Normalised image coordinates; 0 where not seen."""
@@ -28,6 +31,13 @@ class Correspondences:
     frame: Int[Tensor, " N"]
     """Which of the T frames a point is of."""
     joint: Int[Tensor, " N"]
+    row: Int[Tensor, " N"]
+    """Which of the R rows."""
+
+    @property
+    def frames(self) -> int:
+        """The number T of frames."""
+        return int(self.frame.max()) + 1 if len(self.frame) else 0
 
     def focal(self, view: int) -> float:
         """The focal length of a view whose pixel is its typical noise: what foreign solvers with
@@ -47,6 +57,21 @@ class Correspondences:
             reprojection_error(cameras, self.xy.expand(*points.shape[:-2], -1, -1, -1), points)
             / self.noise
         )
+
+    def select(self, points: Bool[Tensor, " N"]) -> Correspondences:
+        """Return those of some points."""
+        return Correspondences(
+            self.xy[:, points],
+            self.noise[:, points],
+            self.valid[:, points],
+            self.frame[points],
+            self.joint[points],
+            self.row[points],
+        )
+
+    def of_views(self, views: Int[Tensor, " W"]) -> Correspondences:
+        """Return those of some views."""
+        return replace(self, xy=self.xy[views], noise=self.noise[views], valid=self.valid[views])
 
     def with_view(self, view: int, other: Correspondences) -> Correspondences:
         """Return the same with one view's key points from another set of the same points."""
@@ -77,6 +102,50 @@ def typical_size(
     size = person_scale(key_points, valid)
     missing = torch.full_like(size[:0].sum(0), torch.nan)
     return torch.where(size > 0, size, torch.nan).nanmedian(0).values if len(size) else missing
+
+
+def joints_of(
+    skeleton: Skeleton, key_points: Float[Tensor, "T V K 2"], valid: Bool[Tensor, "T V K"]
+) -> tuple[Float[Tensor, "T V 17 2"], Bool[Tensor, "T V 17"]]:
+    """Return the 17 joints as means of a skeleton's key points, valid where all of these are."""
+    weights = torch.from_numpy(skeleton.joint_weights)
+    pixels = torch.where(valid[..., None], key_points.double(), 0.0)
+    parts = (weights > 0).double()
+    missing = (~valid).double() @ parts.T
+    known = (missing == 0) & (parts.sum(1) > 0)
+    return torch.where(known[..., None], weights @ pixels, 0.0), known
+
+
+def spread_key_points(
+    key_points: Float[Tensor, "T V K 2"], valid: Bool[Tensor, "T V K"], spacing: float
+) -> Int[Tensor, " J"]:
+    """Return key points, rising, of which no two are nearer to each other than ``spacing``.
+
+    Distances are medians over frames and views, in sizes of the person. Neighbouring key points
+    share a detector's errors: a face or a hand of many would count for more than it shows. The
+    outermost are taken first, for limbs tell most of a rig.
+    """
+    count = valid.shape[2]
+    size = person_scale(key_points.double(), valid)
+    seen = valid & (size > 0)[..., None]
+    xy = torch.where(seen[..., None], key_points.double(), torch.nan)
+    xy = (xy / size.clamp(min=1e-9)[..., None, None]).flatten(0, 1)
+    step = max(1, len(xy) // _ROWS_OF_DISTANCES)
+    xy = xy[::step]
+    apart = (xy[:, :, None] - xy[:, None]).norm(dim=-1).nanmedian(0).values if len(xy) else None
+    if apart is None:
+        return torch.arange(count)
+    apart = apart.nan_to_num(torch.inf)
+    outward = (xy - xy.nanmean(1, keepdim=True)).norm(dim=-1).nanmedian(0).values
+    chosen: list[int] = []
+    for place in outward.nan_to_num(-1.0).sort(descending=True, stable=True).indices.tolist():
+        if all(float(apart[place, other]) >= spacing for other in chosen):
+            chosen.append(place)
+    return torch.tensor(sorted(chosen), dtype=torch.int64)
+
+
+_ROWS_OF_DISTANCES = 400
+"""Views of frames that tell how far key points are from each other."""
 
 
 def choose_frames(
@@ -125,9 +194,12 @@ def observe(
     key_points: Float[Tensor, "T V J 2"],
     valid: Bool[Tensor, "T V J"],
     noise: float,
+    frame: Int[Tensor, " T"] | None = None,
+    person: Int[Tensor, " T"] | None = None,
 ) -> Correspondences:
-    """The chosen frames' key points, with ``noise`` x the median size of the person in the view as
-    their noise.
+    """The chosen rows' key points, with ``noise`` x the median size of the person in the view as
+    their noise. ``frame``: the number of each row's frame; None for a row a frame.
+    ``person``: of each row; None for one person. Everybody's joints have numbers of their own.
     """
     key_points = torch.where(valid[..., None], key_points.double(), 0.0)
     size = typical_size(key_points, valid)
@@ -137,14 +209,22 @@ def observe(
     xy = normalise(sane, key_points.transpose(0, 1).flatten(1, 2))
     mask = (valid & known[:, None]).transpose(0, 1).flatten(1, 2) & (xy.abs() < LARGEST).all(-1)
     unit = torch.where(known, noise * size, 1.0) / focal
-    frames = key_points.shape[0]
+    rows = key_points.shape[0]
     joints = key_points.shape[2]
+    row = torch.arange(rows).repeat_interleave(joints)
+    of_row = torch.arange(rows)
+    if frame is not None:
+        of_row = torch.unique(frame, return_inverse=True)[1]
+    joint = torch.arange(joints).repeat(rows)
+    if person is not None:
+        joint = joint + joints * person[row]
     return Correspondences(
         torch.where(mask[..., None], xy, 0.0),
         unit[:, None].expand_as(mask).clone(),
         mask,
-        torch.arange(frames).repeat_interleave(joints),
-        torch.arange(joints).repeat(frames),
+        of_row[row],
+        joint,
+        row,
     )
 
 

@@ -59,41 +59,57 @@ def ransac_options(threshold: float, iterations: int, seed: int, kind: str) -> d
 
 @dataclass(frozen=True)
 class PairEstimation:
-    """Every pair with at least ``least`` common correspondences, by poselib's LO-RANSAC and
-    refinement.
+    """The pairs with at least ``least`` common correspondences, by poselib's LO-RANSAC and
+    refinement: of each view those with the ``partners`` views that see most of what it sees.
 
     ``threshold``: largest Sampson error of an inlier, in units of noise. A pair is linked if it has
     ``least`` inliers and they are ``share`` of the common correspondences. ``iterations``: the cap
-    of RANSAC.
+    of RANSAC. ``points``: of a pair at most so many correspondences, evenly spread.
     """
 
     threshold: float
     iterations: int
     least: int
     share: float
+    partners: int
+    points: int
 
     def __post_init__(self) -> None:
-        check_positive(
-            threshold=self.threshold, iterations=self.iterations, least=self.least, share=self.share
-        )
+        check_positive(**vars(self))
 
     def __call__(self, observed: Correspondences, seed: int) -> PairTable:
-        count = len(observed.valid)
-        found = (
-            self._pair(observed, a, b, seed) for a in range(count) for b in range(a + 1, count)
-        )
+        found = (self.pair(observed, a, b, seed) for a, b in self._partners(observed.valid))
         rows = [row for row in found if row is not None]
         return (
             PairTable(*map(torch.stack, zip(*rows, strict=True))) if rows else PairTable(*_NOTHING)
         )
 
-    def _pair(
+    def _partners(self, valid: Bool[Tensor, "V N"]) -> list[tuple[int, int]]:
+        """Return the pairs (a, b), a < b, that are estimated, in order."""
+        seen = valid.double()
+        common = seen @ seen.T
+        common.fill_diagonal_(-1.0)
+        views = len(valid)
+        # among equals the next in the order of the views: so all are linked
+        step = torch.arange(views) - torch.arange(views)[:, None]
+        common = common - step.remainder(views) / (2 * views)
+        best = common.topk(min(self.partners, views - 1), dim=-1).indices
+        chosen = torch.zeros(views, views, dtype=torch.bool).scatter_(1, best, True)
+        return torch.nonzero((chosen | chosen.T).triu(1)).tolist()
+
+    def pair(
         self, observed: Correspondences, a: int, b: int, seed: int
     ) -> tuple[Tensor, ...] | None:
+        """Return two views' row of a `PairTable`; None where they have too little in common."""
         both = observed.valid[a] & observed.valid[b]
         common = int(both.sum())
         if common < self.least:
             return None
+        if common > self.points:
+            at = torch.nonzero(both)[:, 0]
+            spread = torch.linspace(0, common - 1, self.points).round().long()
+            both = torch.zeros_like(both).scatter_(0, at[spread], True)
+            common = self.points
         focal = [observed.focal(v) for v in (a, b)]
         na = observed.xy[a, both]
         nb = observed.xy[b, both]

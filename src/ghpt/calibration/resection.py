@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import poselib
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.calibration.observations import Correspondences
@@ -37,6 +37,20 @@ class PlacedRig:
     def centre(self) -> Float[Tensor, "V 3"]:
         """The centres of the cameras in the world."""
         return camera_centre(self.R, self.t)
+
+    def of_views(self, views: Int[Tensor, " W"]) -> PlacedRig:
+        """Return some of the views."""
+        return replace(
+            self,
+            R=self.R[views],
+            t=self.t[views],
+            placed=self.placed[views],
+            inlier=self.inlier[views],
+        )
+
+    def select(self, points: Bool[Tensor, " N"]) -> PlacedRig:
+        """Return the rig with some of the points."""
+        return replace(self, points=self.points[points], inlier=self.inlier[:, points])
 
 
 @dataclass(frozen=True)
@@ -77,32 +91,31 @@ class Resection:
     def grow(
         self, observed: Correspondences, table: PairTable, rig: PlacedRig, seed: int
     ) -> PlacedRig:
-        """Place every view that a chain of linked pairs reaches, the one best bound to the placed
-        ones first; a view that fails is tried again when the rig has grown.
+        """Place every view that a chain of linked pairs reaches: all that the people of the placed
+        views place, then those that the people of more views do.
         """
-        failed: set[int] = set()
-        while (view := self._next(table, rig.placed, failed)) is not None:
-            found = self.place(observed, rig, view, seed)
-            if found is None:
-                failed.add(view)
-                continue
-            R = rig.R.clone()
-            t = rig.t.clone()
-            placed = rig.placed.clone()
-            R[view], t[view] = found
-            placed[view] = True
-            rig = self.triangulate(observed, replace(rig, R=R, t=t, placed=placed), seed)
-            failed.clear()
-        return rig
+        while True:
+            placed = rig.placed
+            rig = self._place_all(observed, table, rig, seed)
+            if torch.equal(rig.placed, placed):
+                return rig
+            rig = self.triangulate(observed, rig, seed)
 
-    def _next(self, table: PairTable, placed: Bool[Tensor, " V"], failed: set[int]) -> int | None:
-        inside = placed[table.views]
+    def _place_all(
+        self, observed: Correspondences, table: PairTable, rig: PlacedRig, seed: int
+    ) -> PlacedRig:
+        R = rig.R.clone()
+        t = rig.t.clone()
+        placed = rig.placed.clone()
+        inside = rig.placed[table.views]
         border = table.linked & (inside[:, 0] != inside[:, 1])
         outside = torch.where(inside[:, 0], table.views[:, 1], table.views[:, 0])
-        for edge in torch.sort(table.expected, stable=True).indices.tolist():
-            if border[edge] and int(outside[edge]) not in failed:
-                return int(outside[edge])
-        return None
+        for view in outside[border].unique().tolist():
+            found = self.place(observed, rig, view, seed)
+            if found is not None:
+                R[view], t[view] = found
+                placed[view] = True
+        return replace(rig, R=R, t=t, placed=placed)
 
     def supported(self, rig: PlacedRig) -> PlacedRig:
         """Return the rig without the views that fewer than ``least`` inliers hold, or a pair."""

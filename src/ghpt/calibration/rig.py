@@ -12,22 +12,29 @@ from jaxtyping import Bool, Float, Float64, Int
 from torch import Tensor
 
 from ghpt.calibration.bundle import Adjusted, BundleAdjustment
-from ghpt.calibration.diagnostics import Case, Diagnostics
+from ghpt.calibration.diagnostics import Case, Diagnostics, Joints
 from ghpt.calibration.findings import Finding, Severity
+from ghpt.calibration.independence import Evidence, turning
 from ghpt.calibration.mistakes import size_finding
 from ghpt.calibration.observations import (
     Correspondences,
     choose_frames,
+    joints_of,
     observe,
     reweighted,
+    spread_key_points,
     usable,
 )
 from ghpt.calibration.pairs import PairEstimation, PairTable
 from ghpt.calibration.resection import PlacedRig, Resection
-from ghpt.calibration.uncertainty import uncertainty
+from ghpt.calibration.uncertainty import Uncertainty, uncertainty
 from ghpt.errors import GhptDataError, check_positive
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.scale import stature
+from ghpt.skeleton import HUMAN36M, Skeleton
+
+_ROUGH = 1e-3
+"""Tolerance of the adjustments whose weights and points are not the last."""
 
 
 @dataclass(frozen=True)
@@ -57,16 +64,18 @@ class RigEstimate:
     pairs: PairTable
     frames: Int[Tensor, " T"]
     """Which frames of the recording were used."""
-    points: Float64[Tensor, "T J 3"]
-    estimated: Bool[Tensor, "T J"]
+    points: Float64[Tensor, "T 17 3"]
+    estimated: Bool[Tensor, "T 17"]
     converged: bool
     iterations: int
+    evidence: Evidence | None
+    """What the recording is worth; None without a rig."""
     findings: tuple[Finding, ...]
 
     @property
     def rotation_std_deg(self) -> Float64[Tensor, " V"]:
         """Root mean square over the axes of the standard deviation of a camera's rotation."""
-        return torch.rad2deg((self.covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(-1)).sqrt())
+        return _rotation_std_deg(self.covariance)
 
     @property
     def centre_std(self) -> Float64[Tensor, " V"]:
@@ -106,14 +115,18 @@ class RigEstimate:
 class RigCalibration:
     """Key points and known intrinsics to the extrinsics of all cameras.
 
-    ``frames``: most frames used. ``noise``: first guess of the key points' noise, in sizes of the
-    person in the image. ``seeds``: best-conditioned pairs that the rig is begun from in turn, until
-    one places every linked view with a share of ``good`` inliers; the best is kept. ``rounds``:
-    bundle adjustments, each with the noise of views and joints that the one before has shown and
-    points triangulated anew. ``blocks``: see ``uncertainty``.
+    ``frames``: most frames of a person used, and fewer where they have more key points than
+    ``observations`` in all views together. ``spacing``: of key points that are nearer to each
+    other, in sizes of the person, one is used. ``noise``: first guess of the key points' noise, in
+    sizes of the person in the image. ``seeds``: best-conditioned pairs that the rig is begun from
+    in turn, until one places every linked view with a share of ``good`` inliers; the best is kept.
+    ``rounds``: bundle adjustments, each with the noise of views and joints that the one before has
+    shown and points triangulated anew. ``blocks``: see ``uncertainty``.
     """
 
     frames: int
+    observations: int
+    spacing: float
     noise: float
     pairs: PairEstimation
     resection: Resection
@@ -127,6 +140,8 @@ class RigCalibration:
     def __post_init__(self) -> None:
         check_positive(
             frames=self.frames,
+            observations=self.observations,
+            spacing=self.spacing,
             noise=self.noise,
             seeds=self.seeds,
             good=self.good,
@@ -144,35 +159,90 @@ class RigCalibration:
         valid: Bool[Tensor, "T V J"],
         sizes: Int[Tensor, "V 2"] | None,
         seed: int,
+        frame: Int[Tensor, " T"] | None = None,
+        person: Int[Tensor, " T"] | None = None,
+        skeleton: Skeleton = HUMAN36M,
     ) -> RigEstimate:
-        """Calibrate; ``key_points`` are undistorted pixels. Never raises on values: what is wrong
-        is among the findings. Raises GhptDataError for fewer than two cameras, a name that occurs
-        twice, or arrays that do not belong together.
+        """Calibrate; ``key_points`` are undistorted pixels of the ``skeleton``. Never raises on
+        values: what is wrong is among the findings. Raises GhptDataError for fewer than two
+        cameras, a name that occurs twice, or arrays that do not belong together.
+
+        ``frame`` and ``person``: the numbers of each row's, where there are several people; frames
+        rise.
         """
         _check(names, K, key_points)
+        if frame is None:
+            frame = torch.arange(len(key_points))
+        if person is None:
+            person = torch.zeros_like(frame)
         mask = usable(K, key_points, valid)
-        frames = choose_frames(key_points, confidence, mask, self.frames)
-        observed = observe(K, key_points[frames], mask[frames], self.noise)
+        apart = spread_key_points(key_points, mask, self.spacing)
+        most = max(self.observations // max(mask.shape[1] * len(apart), 1), 1)
+        joints, joints_valid = joints_of(skeleton, key_points, mask)
+        used = key_points[:, :, apart]
+        mask = mask[:, :, apart]
+        if len(person):
+            most = min(most, self.frames * (int(person.max()) + 1))
+        frames = choose_frames(used, confidence[:, :, apart], mask, most)
+        numbers = (frame[frames], person[frames])
+        observed = observe(K, used[frames], mask[frames], self.noise, *numbers)
         table = self.pairs(observed, seed)
         rig = self.begin(observed, table, seed)
         adjusted = None
         if rig is not None:
             observed, adjusted = self.refine(observed, table, rig, seed)
+        shown = self.joints(K, joints[frames], joints_valid[frames], adjusted, seed)
+        spread = None
+        evidence = None
+        if adjusted is not None:
+            facing = turning(shown.points, shown.estimated)
+            final = adjusted.final
+            spread = uncertainty(observed, adjusted.rig, final, self.blocks, facing.sector)
+            evidence = Evidence(
+                frames=len(frame.unique()),
+                used=observed.frames,
+                independent=spread.persistence.independent,
+                turned_deg=facing.degrees,
+                rotation_sd_deg=3**0.5 * float(_rotation_std_deg(spread.covariance).max()),
+                repeatability=spread.repeatability,
+            )
         case = Case(
-            tuple(names),
-            K,
-            key_points,
-            mask,
-            sizes,
-            frames,
-            observed,
-            table,
-            adjusted,
-            self.resection,
-            self.noise,
-            seed,
+            names=tuple(names),
+            K=K,
+            key_points=joints,
+            valid=joints_valid,
+            sizes=sizes,
+            frames=frames,
+            observed=observed,
+            joints=shown,
+            table=table,
+            adjusted=adjusted,
+            evidence=evidence,
+            resection=self.resection,
+            noise=self.noise,
+            seed=seed,
         )
-        return self._estimate(case)
+        return self._estimate(case, spread)
+
+    def joints(
+        self,
+        K: Float64[Tensor, "V 3 3"],
+        joints: Float[Tensor, "R V 17 2"],
+        valid: Bool[Tensor, "R V 17"],
+        adjusted: Adjusted | None,
+        seed: int,
+    ) -> Joints:
+        """Return the 17 joints that the adjusted rig shows; none without one."""
+        rows = len(joints)
+        if adjusted is None:
+            nothing = torch.zeros(rows, 17, dtype=torch.bool)
+            return Joints(torch.zeros(rows, 17, 3, dtype=torch.float64), nothing)
+        observed = observe(K, joints, valid, self.noise)
+        rig = replace(adjusted.rig, points=adjusted.rig.points[:0], inlier=observed.valid)
+        rig = self.resection.triangulate(observed, rig, seed)
+        estimated = rig.inlier.any(0).unflatten(0, (rows, 17))
+        points = rig.points.unflatten(0, (rows, 17))
+        return Joints(torch.where(estimated[..., None], points, 0.0), estimated)
 
     def begin(self, observed: Correspondences, table: PairTable, seed: int) -> PlacedRig | None:
         """The first rig, from the seed with the most views and the largest share of inliers; None
@@ -201,37 +271,31 @@ class RigCalibration:
         """Bundle adjustments in turn with new weights and new points; the last result is not
         touched any more.
         """
-        adjusted = self.bundle(observed, rig)
-        for _ in range(self.rounds - 1):
+        rough = replace(self.bundle, tolerance=max(self.bundle.tolerance, _ROUGH))
+        adjusted = (self.bundle if self.rounds == 1 else rough)(observed, rig)
+        for left in range(self.rounds - 1, 0, -1):
             error = observed.error(adjusted.rig.R, adjusted.rig.t, adjusted.rig.points)
             observed = reweighted(observed, error, adjusted.rig.inlier)
             rig = self.resection.triangulate(observed, unitised(adjusted.rig), seed)
             rig = self.resection.grow(observed, table, self.resection.supported(rig), seed)
-            adjusted = self.bundle(observed, rig)
+            adjusted = (self.bundle if left == 1 else rough)(observed, rig)
         adjusted = replace(adjusted, rig=unitised(adjusted.rig))
         final = self.bundle.state(observed, adjusted.rig)
         return observed, replace(adjusted, final=final)
 
-    def _estimate(self, case: Case) -> RigEstimate:
+    def _estimate(self, case: Case, spread: Uncertainty | None) -> RigEstimate:
         views = len(case.names)
-        (frames, joints) = case.shape
         eye = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
         rig = case.rig or PlacedRig(
             eye,
             torch.zeros(views, 3, dtype=torch.float64),
             torch.zeros(views, dtype=torch.bool),
-            torch.zeros(frames * joints, 3, dtype=torch.float64),
+            torch.zeros(len(case.observed.frame), 3, dtype=torch.float64),
             torch.zeros_like(case.observed.valid),
         )
         placed = rig.placed
         nothing = torch.zeros(views, dtype=torch.float64)
         reprojection, inliers = case.agreement(rig) if placed.any() else (nothing, nothing)
-        spread = (
-            None
-            if case.adjusted is None
-            else uncertainty(case.observed, rig, case.adjusted.final, self.blocks)
-        )
-        estimated = rig.inlier.any(0)
         return RigEstimate(
             names=case.names,
             cameras=Cameras(
@@ -247,12 +311,17 @@ class RigCalibration:
             inliers=inliers,
             pairs=case.table,
             frames=case.frames,
-            points=torch.where(estimated[:, None], rig.points, 0.0).unflatten(0, (frames, joints)),
-            estimated=estimated.unflatten(0, (frames, joints)),
+            points=case.joints.points,
+            estimated=case.joints.estimated,
             converged=case.adjusted is not None and case.adjusted.converged,
             iterations=0 if case.adjusted is None else case.adjusted.iterations,
+            evidence=case.evidence,
             findings=self.diagnostics(case, spread),
         )
+
+
+def _rotation_std_deg(covariance: Float64[Tensor, "V 6 6"]) -> Float64[Tensor, " V"]:
+    return torch.rad2deg(covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(-1).sqrt())
 
 
 def unitised(rig: PlacedRig) -> PlacedRig:

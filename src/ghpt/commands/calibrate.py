@@ -34,6 +34,7 @@ from ghpt.calibration.millimetres import (
 from ghpt.calibration.mistakes import SEVERAL_PEOPLE
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.uncalibrated import UncalibratedShifts
+from ghpt.calibration.whose import one_person
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
@@ -41,17 +42,23 @@ from ghpt.commands.inputs import (
     InputSettings,
     own_cameras,
     own_people,
-    own_sequence,
+    own_title,
     recording_sequence,
     resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.time import calibrate_sequence, clock_of, log_time, time_of_rig
+from ghpt.commands.time import calibrate_people, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
+from ghpt.data.formats.names import Name
 from ghpt.data.people.detections import Detections
-from ghpt.data.people.persons import with_lenses
+from ghpt.data.people.persons import (
+    detector_sequence,
+    detector_sequences,
+    tracks_of_views,
+    with_lenses,
+)
 from ghpt.data.people.retimed import retime
-from ghpt.data.people.sequence import Sequence
+from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.errors import GhptDataError, check
 from ghpt.files import remove, sweep_temporaries
 from ghpt.geometry.cameras import Cameras, CameraSet
@@ -110,10 +117,31 @@ class CalibrateSettings(InputSettings):
 
 
 @dataclass(frozen=True)
+class Crowd:
+    """Detections of several people, who are told apart once a rig is known."""
+
+    people: Detections
+    match: dict[Name, Name] | None
+    views: list[Name] | None
+
+    def follow(self, cameras: CameraSet, calibration: RigCalibration, seed: int) -> Sequence:
+        """Return one person, the same in all views, whose cameras need no extrinsics."""
+        tracks = tracks_of_views(self.people, cameras, self.match, self.views)
+        return one_person(tracks, calibration.pairs, calibration.noise, seed)
+
+    def persons(self, cameras: CameraSet) -> list[Sequence]:
+        """Return everybody whom calibrated cameras tell apart, the most visible first."""
+        return detector_sequences(self.people, cameras, self.match, self.views)
+
+
+@dataclass(frozen=True)
 class Case:
     """What is calibrated, and what it can be compared with."""
 
     sequence: Sequence
+    """The 17 joints."""
+    evidence: Sequence
+    """All key points of the detector, which the rig is calibrated from."""
     reference: str
     """What the extrinsics of the sequence's cameras, where there are any, are, in words.
 
@@ -122,6 +150,8 @@ class Case:
     is_own: bool
     """Whether they are the user's, which may be wrong."""
     notes: tuple[Finding, ...] = ()
+    crowd: Crowd | None = None
+    """Everybody's detections, where the views show several people."""
     intrinsics: str | None = None
     """What was estimated of the intrinsics, in words; None where they were given."""
 
@@ -155,6 +185,8 @@ class RigSolution:
 
     estimate: RigEstimate
     """In a world of its own."""
+    people: tuple[Sequence, ...]
+    """Those whom it was calibrated from."""
     scale: RigScale
     placed: list[int]
     """The calibrated views; none if they are fewer than two."""
@@ -195,7 +227,8 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     name = settings.estimator
     estimator: Estimator = build(settings.baselines[name], f"baselines.{name}")
     camera_check: CameraCheck = build(settings.camera_check, "camera_check")
-    case = in_one_time(settings, open_case(settings, estimator), calibration, camera_check)
+    case = of_one_person(open_case(settings, estimator), calibration, settings.seed)
+    case = in_one_time(settings, case, calibration, camera_check)
     case = with_intrinsics(settings, case, calibration)
     cameras = case.sequence.cameras
     source = read_scale(settings.scale, cameras.names)
@@ -211,12 +244,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     change = solution.change
     rig = solution.rig
     reference = case.reference_cameras
-    rigs = {_ESTIMATED: rig} if reference is None else {_ESTIMATED: rig, case.reference: reference}
-    recordings = {
-        name: _spread(case.recording(placed, own), settings.evaluated_frames)
-        for name, own in rigs.items()
-        if placed
-    }
+    halves = _halves(case, solution, calibration, settings)
     result = CalibrationResult(
         data=case.sequence.title,
         source=case.sequence.source,
@@ -231,8 +259,9 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         converged=estimate.converged,
         usable=tuple(cameras.names[view] for view in usable),
         cameras=calibrated_cameras(estimate, change, cameras),
+        evidence=estimate.evidence,
         difference=_difference(estimate, rig, reference, placed),
-        explains=explain(recordings, estimator),
+        explains=explain(halves, estimator),
         findings=_findings(case, solution, camera_check),
         provenance=provenance(settings.seed),
     )
@@ -263,7 +292,7 @@ def solve_rig(
     seed: int,
 ) -> RigSolution:
     """Return the rig that a recording shows, with the length that ``source`` gives it."""
-    estimate = calibrate_sequence(calibration, case.sequence, seed)
+    people, estimate = _from_everybody(case, calibration, seed)
     placed = _placed_views(estimate)
 
     def measure(rig: Cameras) -> tuple[Tensor, Tensor]:
@@ -274,7 +303,62 @@ def solve_rig(
     estimate, scale = in_millimetres(estimate, source, measure)
     usable = _indices(usable_cameras(estimate))
     world, change = _choose_world(estimate, placed, case)
-    return RigSolution(estimate, scale, placed, usable, world, change)
+    return RigSolution(estimate, people, scale, placed, usable, world, change)
+
+
+def _from_everybody(
+    case: Case, calibration: RigCalibration, seed: int
+) -> tuple[tuple[Sequence, ...], RigEstimate]:
+    """Return the rig from the person who was followed, or from everybody whom that rig tells apart;
+    and who it was.
+    """
+    followed = (case.evidence,)
+    estimate = calibrate_people(calibration, followed, seed)
+    cameras = case.evidence.cameras
+    in_one_time = cameras.clock is None or cameras.clock.is_synchronised
+    whole = estimate.converged and bool(estimate.calibrated.all())
+    if case.crowd is None or not in_one_time or not whole:
+        return followed, estimate
+    people = tuple(case.crowd.persons(cameras.with_cameras(estimate.cameras)))
+    if len(people) < 2:
+        return followed, estimate
+    of_all = calibrate_people(calibration, people, seed)
+    if not bool(of_all.calibrated.all()):
+        return followed, estimate
+    return people, of_all
+
+
+def _halves(
+    case: Case, solution: RigSolution, calibration: RigCalibration, settings: CalibrateSettings
+) -> dict[str, list[Recording]]:
+    """Return both halves of the recording, as each calibration sees them, by its name.
+
+    The rig of a half is calibrated from the *other* one: of the key points that it was fitted to
+    any rig explains too much. Nothing is returned unless both halves place the same cameras.
+    """
+    count = len(case.sequence)
+    placed = solution.placed
+    rows = [np.arange(count // 2), np.arange(count // 2, count)]
+    seen = [_spread_rows(half, settings.evaluated_frames // 2) for half in rows]
+    if not placed or not all(len(half) for half in seen):
+        return {}
+    rigs = []
+    for other in reversed(rows):
+        estimate = calibrate_people(calibration, solution.people, settings.seed, other)
+        if not bool(estimate.calibrated[placed].all()):
+            return {}
+        own = estimate.cameras.index(placed)
+        similarity = align(own, solution.rig.index(placed))
+        rigs.append(similarity.cameras(estimate.cameras))
+    found = {_ESTIMATED: rigs}
+    if case.reference_cameras is not None:
+        found[case.reference] = [case.reference_cameras] * 2
+    return {
+        name: [
+            case.recording(placed, rig).frames(half) for rig, half in zip(own, seen, strict=True)
+        ]
+        for name, own in found.items()
+    }
 
 
 def _raise_errors(result: CalibrationResult, report: str) -> None:
@@ -303,13 +387,30 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     Extrinsics are in mm where the person tells their unit.
     """
     if not settings.keypoints:
-        return Case(recording_sequence(settings), "the truth", is_own=False)
+        recording = recording_sequence(settings)
+        return Case(recording, recording, "the truth", is_own=False)
     people = own_people(settings)
     cameras = _given_cameras(settings, people)
-    sequence = own_sequence(settings, people, cameras, person=None)
-    sequence = resolve_unit(sequence, estimator, ask=False)
+    people.skeleton.require_joints(people.path)
+    wanted = (settings.match, settings.views, None, own_title(settings))
+    evidence = detector_sequence(people, cameras, *wanted)
+    evidence = replace(evidence, source=str(Path(str(settings.keypoints)).resolve()))
+    sequence = resolve_unit(evidence.as_joints(), estimator, ask=False)
     notes = people_findings(people)
-    return Case(sequence, "the file's own calibration", is_own=True, notes=notes)
+    own = "the file's own calibration"
+    crowd = Crowd(people, settings.match, settings.views) if notes else None
+    return Case(sequence, evidence, own, is_own=True, notes=notes, crowd=crowd)
+
+
+def of_one_person(case: Case, calibration: RigCalibration, seed: int) -> Case:
+    """Return the case with a person whom all views follow, where there are several."""
+    if case.crowd is None:
+        return case
+    given = case.evidence
+    found = case.crowd.follow(given.cameras, calibration, seed)
+    evidence = replace(given, points=found.points)
+    joints = evidence.as_joints()
+    return replace(case, evidence=evidence, sequence=replace(case.sequence, points=joints.points))
 
 
 def _given_cameras(settings: CalibrateSettings, people: Detections) -> CameraSet:
@@ -337,9 +438,14 @@ def with_intrinsics(settings: CalibrateSettings, case: Case, calibration: RigCal
         settings.seed,
     )
     cameras = replace(sequence.cameras, K=found.K, distortion=found.distortion)
-    sequence = with_lenses(sequence, cameras)
     notes = (*case.notes, *found.findings)
-    return replace(case, sequence=sequence, notes=notes, intrinsics=found.text)
+    return replace(
+        case,
+        sequence=with_lenses(sequence, cameras),
+        evidence=with_lenses(case.evidence, cameras),
+        notes=notes,
+        intrinsics=found.text,
+    )
 
 
 def in_one_time(
@@ -357,8 +463,13 @@ def in_one_time(
         clock = found.clock
     else:
         clock = clock_of(settings.time, sequence, camera_check.time)
-    timed = replace(retime(sequence, clock), cameras=replace(cameras, clock=clock))
-    return replace(case, sequence=timed, notes=notes)
+    timed = replace(cameras, clock=clock)
+    return replace(
+        case,
+        sequence=replace(retime(sequence, clock), cameras=timed),
+        evidence=replace(retime(case.evidence, clock), cameras=timed),
+        notes=notes,
+    )
 
 
 def people_findings(people: Detections) -> tuple[Finding, ...]:
@@ -396,9 +507,15 @@ def _indices(mask: Bool[Tensor, " V"]) -> list[int]:
 
 def _spread(recording: Recording, frames: int) -> Recording:
     """Return at most so many frames of a recording, evenly spread."""
-    count = min(frames, len(recording))
-    rows = np.linspace(0, len(recording) - 1, count).astype(int)
-    return recording.frames(np.unique(rows))
+    return recording.frames(_spread_rows(np.arange(len(recording)), frames))
+
+
+def _spread_rows(rows: Rows, count: int) -> Rows:
+    """Return at most so many of some rows, evenly spread."""
+    if not len(rows):
+        return rows
+    at = np.linspace(0, len(rows) - 1, min(max(count, 1), len(rows)))
+    return rows[np.unique(at.astype(int))]
 
 
 def _choose_world(estimate: RigEstimate, placed: list[int], case: Case) -> tuple[str, Similarity]:
@@ -427,7 +544,10 @@ def _difference(
 
 def _findings(case: Case, solution: RigSolution, camera_check: CameraCheck) -> tuple[Finding, ...]:
     """Return what is wrong with the recording, the rig, and the extrinsics in the user's file."""
-    own = (*case.notes, *solution.findings)
+    notes = case.notes
+    if len(solution.people) > 1:  # nobody had to be chosen
+        notes = tuple(found for found in notes if found.code != SEVERAL_PEOPLE.code)
+    own = (*notes, *solution.findings)
     said = {(found.code, frozenset(found.cameras)) for found in own}
     of_file = [
         found

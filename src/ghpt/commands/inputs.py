@@ -90,7 +90,7 @@ def own_people(inputs: InputSettings) -> Detections:
         )
     except GhptDataError as error:
         cameras = Path(inputs.cameras) if inputs.cameras else None
-        raise explain_key_points(error, path, cameras) from error
+        raise explain_key_points(error, path, cameras, inputs.format is not None) from error
 
 
 def own_sequence(

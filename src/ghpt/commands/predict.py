@@ -55,6 +55,7 @@ from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.joint_means import JointMeans, all_joints, human_joints
 from ghpt.models.estimators.predictors import Classical, Estimate, Learned, Predictor
+from ghpt.models.estimators.trajectory.predictor import TrajectoryPredictor
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, Reconstruction
@@ -564,7 +565,10 @@ def _evaluate(
     for name, other in compared.items():
         estimates.setdefault(name, other.fitted(sample))
     flips = estimator.flips and estimator.flips.for_skeleton(judged.skeleton)
-    return evaluate(judged, flips, estimates, settings.evaluated_frames)
+    test_halves = None
+    if isinstance(own, TrajectoryPredictor):
+        test_halves = own.trajectory.test_halves
+    return evaluate(judged, flips, estimates, settings.evaluated_frames, test_halves)
 
 
 def _about(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence as Items
 
 import numpy as np
 import torch
@@ -20,7 +21,7 @@ from ghpt.commands.inputs import InputSettings, own_detector_sequences, own_sequ
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.matching import match_views
 from ghpt.data.people.retimed import retime, shift_detections
-from ghpt.data.people.sequence import Sequence
+from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.errors import check
 from ghpt.geometry.cameras import CameraSet
 
@@ -118,15 +119,36 @@ def time_of_rig(
 
 
 def calibrate_sequence(calibration: RigCalibration, sequence: Sequence, seed: int) -> RigEstimate:
-    """Return the rig that a recording shows."""
-    points = sequence.undistorted()
-    cameras = sequence.cameras
+    """Return the rig that a recording of one person shows."""
+    return calibrate_people(calibration, (sequence,), seed)
+
+
+def calibrate_people(
+    calibration: RigCalibration, people: Items[Sequence], seed: int, rows: Rows | None = None
+) -> RigEstimate:
+    """Return the rig that everybody shows whose sequences these are, in some frames or in all."""
+    cameras = people[0].cameras
+    parts = [sequence.undistorted(rows) for sequence in people]
+    frames = people[0].frame if rows is None else people[0].frame[rows]
+    frame = np.tile(frames, len(people))
+    person = np.repeat(np.arange(len(people)), len(frames))
+    pixels = np.concatenate([part.pixels for part in parts])
+    confidence = np.concatenate([part.confidence for part in parts])
+    valid = np.concatenate([part.valid for part in parts])
+    order = np.lexsort((person, frame))
+    if len(people) > 1:
+        # what two views alone see of a bystander any rig explains: it would only dilute the rest
+        least = min(3, len(cameras))
+        order = order[valid[order].any(-1).sum(-1) >= least]
     return calibration(
         cameras.names,
         cameras.K,
-        torch.from_numpy(points.pixels).double(),
-        torch.from_numpy(points.confidence).double(),
-        torch.from_numpy(points.valid),
+        torch.from_numpy(pixels[order]).double(),
+        torch.from_numpy(confidence[order]).double(),
+        torch.from_numpy(valid[order]),
         cameras.size,
         seed,
+        torch.from_numpy(frame[order]),
+        torch.from_numpy(person[order]),
+        people[0].skeleton,
     )

@@ -274,6 +274,7 @@ def _parse_meta(path: Path, meta: Any) -> _Meta:
     for field, types in _META_TYPES.items():
         if not isinstance(content.get(field, ...), types):
             raise GhptDataError(path, f"meta.{field}", f"is {content.get(field)!r}", _HINT)
+    others: dict[str, Any] = {field: content[field] for field in _META_TYPES}
     return _Meta(
         format=_FORMAT,
         format_version=version,
@@ -281,7 +282,7 @@ def _parse_meta(path: Path, meta: Any) -> _Meta:
         origin=_parse_origin(path, content.get("origin", [0.0, 0.0, 0.0])),
         bones=_parse_bones(path, content.get("bones", HUMAN36M.bone_names)),
         states={},
-        **{field: content[field] for field in _META_TYPES},
+        **others,
     )
 
 

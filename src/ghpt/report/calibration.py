@@ -8,6 +8,7 @@ from typing import Any
 
 from ghpt.calibration.comparison import Explanation, Quantiles
 from ghpt.calibration.findings import Finding
+from ghpt.calibration.independence import Evidence
 from ghpt.calibration.millimetres import RigScale
 from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.report.document import (
@@ -23,8 +24,12 @@ from ghpt.report.document import (
 from ghpt.report.findings import finding_bullets, finding_paragraphs
 from ghpt.report.tables import NONE
 
+_WANTED_DEG = 0.5
+"""The standard deviation of a rotation that is asked for."""
 Matrix = list[list[float]]
-_CAPTION = "error: median reprojection; ±: standard deviation from the recording itself"
+_CAPTION = (
+    "error: median reprojection; ±: standard deviation, by leaving out parts of the recording"
+)
 
 
 @dataclass(frozen=True)
@@ -77,6 +82,8 @@ class CalibrationResult:
     usable: tuple[str, ...]
     """The cameras that are in the rig's files."""
     cameras: tuple[CalibratedCamera, ...]
+    evidence: Evidence | None
+    """What the recording is worth; None without a rig."""
     difference: Differences | None
     """None where there is no reference, and where the recording does not determine a rig."""
     explains: dict[str, Explanation]
@@ -156,6 +163,8 @@ def _camera_cells(camera: CalibratedCamera, difference: Differences | None) -> l
 def _rig_lines(result: CalibrationResult) -> list[Text]:
     """Return sentences on the rig as a whole."""
     lines: list[Text] = [f"Scale: {result.scale.text}."]
+    if result.evidence is not None:
+        lines.append(_evidence_line(result.evidence))
     if result.intrinsics is not None:
         lines.append(f"Intrinsics: {result.intrinsics}.")
     if result.difference is not None:
@@ -166,10 +175,25 @@ def _rig_lines(result: CalibrationResult) -> list[Text]:
         if errors.median is not None:
             variation = _percent(explanation.segments.median, 1)
             lines.append(
-                f"{name}: held-out view {errors.median:.1f} px median, {errors.p90:.1f} px 90 %; "
+                f"{name}: held-out view of the other half {errors.median:.1f} px median, "
+                f"{errors.p90:.1f} px 90 %; "
                 f"segments vary by {variation} %."
             )
     return lines
+
+
+def _evidence_line(evidence: Evidence) -> str:
+    """Return a sentence on what the recording is worth."""
+    needed = evidence.frames_for(_WANTED_DEG)
+    enough = "which is enough"
+    if needed > evidence.frames:
+        enough = f"and about {needed} like these would do"
+    return (
+        f"Evidence: {evidence.used} of {evidence.frames} frames, worth "
+        f"{evidence.independent:.0f} independent ones, in which people turn by "
+        f"{evidence.turned_deg:.0f}°; for rotations to ± {_WANTED_DEG}° {enough}. "
+        f"Another recording like this one would differ by {evidence.repeatability:.0%} of the ±."
+    )
 
 
 def _explanation_blocks(result: CalibrationResult) -> Iterator[Block]:
@@ -178,7 +202,10 @@ def _explanation_blocks(result: CalibrationResult) -> Iterator[Block]:
     yield Heading("Held-out views")
     yield Paragraph(
         "Each joint is triangulated from the other views and projected into the one left out, on "
-        f"the same joints for all; pixels. Triangulation: {result.triangulation}."
+        f"the same joints for all; pixels. Triangulation: {result.triangulation}. The estimated "
+        "rig is calibrated from one half of the recording and measured on the other, and the "
+        "reverse. Small numbers are no proof of a rig: what a detector always gets wrong, both "
+        "halves share."
     )
     yield Table(["view", *header], _held_out_rows(result))
     yield Heading("Segments")

@@ -5,7 +5,7 @@ again.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
@@ -58,9 +58,10 @@ class CameraCheck:
     ``frames``: most frames looked at. ``shift``: largest shift in time that is tried, frames.
     ``rounds``: most mistakes in one recording. ``astray``: a view with a larger error, which
     nothing mends, is off. ``clean``: where the error of every view is smaller, predict.py does not
-    ask. ``many``: of more views it asks only if a view's error exceeds ``suspicious``, because the
-    time grows with their square. ``consensus``: estimator that the person is measured with.
-    ``time``: of the views, which is looked at before anything else.
+    ask. ``contrast``: the repair of a view is kept if it leaves at most so many times the median
+    error of the others, or ``repaired``. ``many``: of more views it asks only if a view's error
+    exceeds ``suspicious``, because the time grows with their square. ``consensus``: estimator that
+    the person is measured with. ``time``: of the views, which is looked at before anything else.
     """
 
     frames: int
@@ -68,6 +69,8 @@ class CameraCheck:
     rounds: int
     astray: float
     clean: float
+    contrast: float
+    repaired: float
     many: int
     suspicious: float
     thresholds: Thresholds
@@ -80,6 +83,8 @@ class CameraCheck:
             rounds=self.rounds,
             astray=self.astray,
             clean=self.clean,
+            contrast=self.contrast,
+            repaired=self.repaired,
             many=self.many,
             suspicious=self.suspicious,
         )
@@ -107,6 +112,11 @@ class CameraCheck:
             candidate, after = best
             findings.append(_undone(search, candidate, after))
             search = search.after(candidate, after)
+        partly = self._partly_repaired(search, findings)
+        if partly:
+            given_back = _given_back(search.setup, setup, partly)
+            search = Search(cache, given_back, self.thresholds)
+            findings = [_unmended(found, partly, evidence.names) for found in findings]
         findings += self._left(search)
         height = self._stature(search)
         setup, height, unit_mm = _file_unit(search.setup, height)
@@ -120,6 +130,27 @@ class CameraCheck:
                 height *= wrong_size.value
         error_px = pixels_of(cache, setup, search.now.error)
         return CameraCheckResult(tuple(result), setup, error_px, given_px, height, unit_mm)
+
+    def _partly_repaired(self, search: Search, findings: list[Finding]) -> set[int]:
+        """Return the views that were repaired and are still worse than the others.
+
+        What was undone there is not what is wrong, or not all of it: a camera that runs at another
+        rate looks as if it had moved, and would be moved by metres.
+        """
+        names = list(search.cache.evidence.names)
+        repaired = {names.index(name) for found in findings for name in found.cameras}
+        error = search.now.error
+        partly = set()
+        for view in repaired:
+            others = torch.cat((error[:view], error[view + 1 :]))
+            limit = max(self.contrast * float(others.median()), self.repaired)
+            if float(error[view]) > limit:
+                partly.add(view)
+        for found in findings:  # two views that were exchanged are so together
+            views = {names.index(name) for name in found.cameras}
+            if views & partly:
+                partly |= views
+        return partly
 
     def _left(self, search: Search) -> list[Finding]:
         """Return the views that nothing that was tried brings to the others."""
@@ -178,6 +209,21 @@ def merge_steps(findings: list[Finding]) -> list[Finding]:
         told = old if found.code == MOVED.code and old.value > found.value else found
         result[earlier[0]] = replace(told, before_px=old.before_px, after_px=found.after_px)
     return result
+
+
+def _given_back(setup: Setup, given: Setup, views: set[int]) -> Setup:
+    """Return the setup with some views as the files have them."""
+    names = [field.name for field in fields(Setup) if field.name != "unit_mm"]
+    for view in views:
+        setup = setup.changed(view, **{name: getattr(given, name)[view] for name in names})
+    return setup
+
+
+def _unmended(found: Finding, views: set[int], names: tuple[str, ...]) -> Finding:
+    """Return the finding as of a mistake that was not undone, if it is about one of the views."""
+    if not any(names.index(name) in views for name in found.cameras):
+        return found
+    return replace(found, mended=False, after_px=found.before_px)
 
 
 def _undone(search: Search, candidate: Candidate, after: Agreement) -> Finding:

@@ -33,20 +33,30 @@ def summary_lines(result: PredictionResult) -> list[str]:
         lines.append(f"Left and right exchanged in {', '.join(flipped)}.")
     if coverage.stature_mm:
         lines.append(f"The person measures {coverage.stature_mm / 1000:.2f} m.")
+    shares = result.evaluation.ellipsoids
+    if shares:
+        held = ", ".join(f"{100 * share:.0f}" for share in shares)
+        lines.append(
+            "Two halves of the views, each on its own, differ as the covariances say: the "
+            f"ellipsoids of 50, 90 and 95 % hold {held} % of the differences."
+        )
     if result.smooth_hz:
         lines.append(f"Smoothed: zero-phase Butterworth, {result.smooth_hz:g} Hz.")
     return lines
 
 
 def _coverage_line(result: PredictionResult) -> str:
-    """Return which shares of the joints are observed, filled and missing."""
+    """Return which shares of the joints are observed, supported, filled and missing."""
     missing = dict(result.coverage.share)
     observed = missing.pop("observed")
     filled = missing.pop("filled")
+    supported = missing.pop("supported")
     line = (
         f"{result.coverage.frames} frames, {len(result.cameras)} views: "
         f"{100 * observed:.1f} % of the joints observed"
     )
+    if supported:
+        line += f", {100 * supported:.1f} % supported by one view"
     if filled:
         line += f", {100 * filled:.1f} % filled"
     shares = [

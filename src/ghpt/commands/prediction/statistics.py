@@ -5,7 +5,7 @@ Coverage, reprojection, errors in held-out views, and how constant the lengths o
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
@@ -19,6 +19,7 @@ from ghpt.geometry.cameras import reprojection_error
 from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.predictors import Estimate
+from ghpt.models.estimators.trajectory.disjoint import DisjointTest
 from ghpt.models.estimators.trajectory.windows import spread_runs
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, stature
 from ghpt.observations import Observations, PoseEstimate
@@ -77,6 +78,10 @@ class Evaluation:
 
     frames: int
     estimators: dict[str, EstimatorErrors]
+    ellipsoids: tuple[float, ...] | None = None
+    """Share of the differences between two halves of the views that are within the ellipsoids of
+    50, 90 and 95 % of their covariances; None where that cannot be told.
+    """
 
 
 def measure_coverage(
@@ -122,10 +127,12 @@ def evaluate(
     flips: LeftRightFlips | None,
     estimates: Mapping[str, Estimate],
     most: int,
+    test_halves: Callable[[Observations], DisjointTest] | None = None,
 ) -> Evaluation:
     """Return the errors of each estimator on about so many frames: runs, evenly spread.
 
-    ``flips``, which are of the sequence's skeleton, are undone for all estimators.
+    ``flips``, which are of the sequence's skeleton, are undone for all estimators. ``test_halves``:
+    how the covariances of the first one are tested.
     """
     rows = spread_runs(len(sequence), most, _RUN)
     batches = []
@@ -140,7 +147,11 @@ def evaluate(
         errors[name] = _estimator_errors(
             batches, estimate, held_out[name], common, names, sequence.skeleton
         )
-    return Evaluation(len(rows), errors)
+    ellipsoids = None
+    if test_halves is not None:
+        test = DisjointTest(torch.cat([test_halves(batch).square for batch in batches]))
+        ellipsoids = test.coverage() if test.is_decidable else None
+    return Evaluation(len(rows), errors, ellipsoids)
 
 
 @dataclass(frozen=True)

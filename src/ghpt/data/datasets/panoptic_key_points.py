@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points
+from ghpt.data.formats.skeletons import map_to_joints
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.matching import match_views
 from ghpt.data.people.persons import undistort_detections
@@ -41,7 +42,7 @@ def read_person(
         problem = f"holds none of the frames {frame[0]} to {frame[-1]} of the body3DScene files"
         raise GhptDataError(folder, "frame", problem, "Number the frames as Panoptic does.")
     at, cameras = match_views(people.path, people.views, read_cameras(calibration), None, names)
-    ideal = undistort_detections(people, cameras, at)
+    ideal = map_to_joints(undistort_detections(people, cameras, at), people.skeleton)
     distance = _distances(people, ideal, at, cameras.cameras, frame, truth, truth_valid)
     shape = (len(frame), len(names))
     chosen = np.full(shape, -1)

@@ -54,7 +54,8 @@ def camera_from_fields(path: Path, name: str, camera: Mapping[str, Any]) -> Came
         problem = f"is {convention!r}"
         hint = "Write it in OpenCV's convention: x right, y down, z forward."
         raise GhptDataError(path, f"camera {name}, convention", problem, hint)
-    R, t = found["R"], found["t"]
+    R = found["R"]
+    t = found["t"]
     if found["pose"] is not None:
         R, t = _split_pose(found["pose"])
     world_to_camera = fields.get("world2cam", True)

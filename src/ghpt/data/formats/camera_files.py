@@ -146,6 +146,9 @@ def _camera_set(path: Path, content: CameraContent) -> CameraSet:
     if not entries:
         raise GhptDataError(path, "", "holds 0 cameras", KNOWN_CAMERAS)
     check_view_count(path, len(entries))
+    if len(entries) == 1 and path.is_file() and content.format in ("OpenCap", "JSON"):
+        hint = f"Name the folder of all: cameras={path.parent}"
+        raise GhptDataError(path, "", "holds 1 camera", hint)
     names = tuple(entry.name for entry in entries)
     K = np.stack([_intrinsics(path, entry) for entry in entries])
     lenses = torch.stack([_lens(path, entry) for entry in entries])

@@ -8,6 +8,7 @@ from itertools import islice
 from pathlib import Path
 
 from ghpt.data.formats.camera_files import read_cameras
+from ghpt.data.formats.key_points import format_of
 from ghpt.errors import GhptDataError
 
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts")
@@ -23,10 +24,13 @@ _DETECT = (
 )
 
 
-def explain_key_points(error: GhptDataError, path: Path, cameras: Path | None) -> GhptDataError:
+def explain_key_points(
+    error: GhptDataError, path: Path, cameras: Path | None, named: bool = False
+) -> GhptDataError:
     """Return the error of reading key points, or one that says what ``path`` holds instead.
 
-    ``cameras`` is where the cameras are said to be.
+    ``cameras`` is where the cameras are said to be. Unless the format was ``named``, the error says
+    what it was taken for.
     """
     if not path.exists():
         return _missing(path)
@@ -41,7 +45,7 @@ def explain_key_points(error: GhptDataError, path: Path, cameras: Path | None) -
         exchanged = cameras is not None and _looks_like_key_points(cameras)
         hint = "Exchange keypoints= and cameras=." if exchanged else "Name it as cameras=."
         return GhptDataError(path, "", problem, hint)
-    return error
+    return error if named else _with_format(error, path)
 
 
 def explain_cameras(error: GhptDataError, path: Path, key_points: Path | None) -> GhptDataError:
@@ -62,6 +66,16 @@ def explain_cameras(error: GhptDataError, path: Path, key_points: Path | None) -
         hint = "Exchange keypoints= and cameras=." if exchanged else "Name it as keypoints=."
         return GhptDataError(path, "", "holds key points, not cameras", hint)
     return error
+
+
+def _with_format(error: GhptDataError, path: Path) -> GhptDataError:
+    """Return the error with the format that the key points were taken for, if for any."""
+    try:
+        form = format_of(path)
+    except GhptDataError:
+        return error
+    problem = f"{error.problem} (taken for {form}; format= names another)"
+    return GhptDataError(error.where, error.field, problem, error.hint)
 
 
 def _missing(path: Path) -> GhptDataError:

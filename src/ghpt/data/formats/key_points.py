@@ -10,12 +10,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from ghpt.data.formats.authors_npy import is_authors_file, read_authors
+from ghpt.data.formats.caliscope import is_caliscope, read_caliscope
+from ghpt.data.formats.freemocap import is_freemocap_file, read_freemocap
 from ghpt.data.formats.hdf5_files import ENDINGS as HDF5_ENDINGS
 from ghpt.data.formats.hdf5_files import read_hdf5
 from ghpt.data.formats.json_content import looks_like_people
 from ghpt.data.formats.json_people import read_json_people
 from ghpt.data.formats.layout import find_files
-from ghpt.data.formats.mediapipe import is_caliscope, read_caliscope
 from ghpt.data.formats.movement_files import (
     read_deeplabcut_csv,
     read_lightning_pose,
@@ -31,7 +32,14 @@ from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
-__all__ = ["FORMATS", "Detections", "KeyPoints", "read_key_points", "write_key_points"]
+__all__ = [
+    "FORMATS",
+    "Detections",
+    "KeyPoints",
+    "format_of",
+    "read_key_points",
+    "write_key_points",
+]
 
 _HINT = (
     "Known: JSON files of OpenPose, AlphaPose, MMPose, rtmlib, EasyMocap and COCO results; "
@@ -68,7 +76,7 @@ def read_key_points(
             path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
         )
     source = Source(path, skeleton, session, format)
-    form = format or _format_of(path)
+    form = format or format_of(path)
     if session is not None and form in _ONE_RECORDING:
         problem = "files of this format hold one recording"
         raise GhptDataError(path, "session", problem, "Leave session= out.")
@@ -96,7 +104,8 @@ FORMATS: dict[str, Callable[[Source], Detections]] = {
     "rtmlib": read_json_people,
     "easymocap": read_json_people,
     "yolo": read_yolo,
-    "caliscope": lambda source: read_caliscope(source.path),
+    "caliscope": read_caliscope,
+    "freemocap": read_freemocap,
     "npz": lambda source: read_own(source.path, source.skeleton),
     "authors": lambda source: read_authors(source.path, source.skeleton),
     "deeplabcut": lambda source: _of_own_or_hdf5(source, ".csv", read_deeplabcut_csv),
@@ -104,7 +113,7 @@ FORMATS: dict[str, Callable[[Source], Detections]] = {
     "sleap": lambda source: _of_own_or_hdf5(source, ".slp", read_sleap_labels),
     "lightningpose": read_lightning_pose,
 }
-_ONE_RECORDING = ("caliscope", "npz", "authors")
+_ONE_RECORDING = ("caliscope", "freemocap", "npz", "authors")
 
 
 def _of_own_or_hdf5(
@@ -114,8 +123,11 @@ def _of_own_or_hdf5(
     return read(source) if find_files(source.path, (ending,)) else read_hdf5(source)
 
 
-def _format_of(path: Path) -> str:
-    """Return the name of the format, by how the files of a folder, or a file, begin."""
+def format_of(path: Path) -> str:
+    """Return the name of the format, by how the files of a folder, or a file, begin.
+
+    It is ``json`` for those that are told apart by their structure. Raises GhptDataError for none.
+    """
     files = find_files(path, _ENDINGS)
     if path.is_dir() and any(is_authors_file(file) for file in files):
         return "authors"
@@ -137,6 +149,8 @@ def _format_of(path: Path) -> str:
 def _format_of_file(path: Path) -> str | None:
     with open_input(path) as handle:
         start = handle.read(4096)
+    if is_freemocap_file(path):
+        return "freemocap"
     for magic, form in _MAGIC.items():
         if start.startswith(magic):
             return form

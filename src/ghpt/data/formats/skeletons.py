@@ -79,6 +79,7 @@ _TYPICAL = _MIDDLE_BONES | {
 }
 _FULL_LENGTH = 0.8
 """The quantile over people of a bone's length in the images: most of them foreshorten it."""
+_LEAST_SPREAD = 1e-3
 _CLEARLY = 0.7
 """A skeleton is told from another when it misfits people at most so many times as the other."""
 
@@ -155,26 +156,63 @@ def recognise(
     Raises GhptDataError if none has K joints, or if two of them are as good.
     """
     count = key_points.shape[1]
-    choices = [name for name, joints in SKELETONS.items() if len(joints) == count]
+    choices = {name: joints for name, joints in SKELETONS.items() if len(joints) == count}
     if not choices:
-        known = ", ".join(f"{name} ({len(joints)})" for name, joints in SKELETONS.items())
-        problem = f"no known skeleton has {count} joints"
-        raise GhptDataError(where, "skeleton", problem, f"Known: {known}.")
-    best = choices[0]
-    for other in choices[1:]:
-        if _misfit(other, best, key_points, valid) < 1:
+        raise _unknown(where, f"no known skeleton has {count} joints")
+    return _best_fit(where, choices, key_points, valid)
+
+
+def recognise_beginning(
+    where: object, key_points: Float[np.ndarray, "N K 2"], valid: Bool[np.ndarray, "N K"]
+) -> str:
+    """Return the name of the skeleton of N people of whom the last key points may be missing.
+
+    It is one of K key points, unless one of more fits clearly better. Raises GhptDataError as
+    `recognise`.
+    """
+    count = key_points.shape[1]
+    by_beginning: dict[tuple[str, ...], str] = {}
+    for name, joints in sorted(SKELETONS.items(), key=lambda item: len(item[1])):
+        if len(joints) >= count:
+            by_beginning.setdefault(joints[:count], name)
+    choices = {name: joints for joints, name in by_beginning.items()}
+    same = {name: joints for name, joints in choices.items() if len(SKELETONS[name]) == count}
+    if not choices:
+        raise _unknown(where, f"no known skeleton has {count} joints or more")
+    best = _best_fit(where, same or choices, key_points, valid)
+    for name, joints in choices.items():
+        if _misfit(joints, choices[best], key_points, valid) < _CLEARLY:
+            best = name
+    return best
+
+
+def _unknown(where: object, problem: str) -> GhptDataError:
+    known = ", ".join(f"{name} ({len(joints)})" for name, joints in SKELETONS.items())
+    return GhptDataError(where, "skeleton", problem, f"Known: {known}.")
+
+
+def _best_fit(
+    where: object, choices: dict[str, tuple[str, ...]], key_points: np.ndarray, valid: np.ndarray
+) -> str:
+    """Return the name of the choice that fits people clearly best. Raises GhptDataError."""
+    best, *others = choices
+    for other in others:
+        if _misfit(choices[other], choices[best], key_points, valid) < 1:
             best = other
-    for other in choices:
-        if other != best and not _misfit(best, other, key_points, valid) < _CLEARLY:
-            problem = f"it may be {best} or {other}: both have {count} joints"
+    for other, joints in choices.items():
+        if other != best and not _misfit(choices[best], joints, key_points, valid) < _CLEARLY:
+            problem = f"it may be {best} or {other}: {len(joints)} joints fit both"
             raise GhptDataError(where, "skeleton", problem, f"Name it: skeleton={best}.")
     return best
 
 
-def _misfit(name: str, other: str, key_points: np.ndarray, valid: np.ndarray) -> float:
+def _misfit(
+    own: tuple[str, ...], its: tuple[str, ...], key_points: np.ndarray, valid: np.ndarray
+) -> float:
     """Return how many times as badly as another skeleton the first fits people; NaN if unknown."""
-    own, its = SKELETONS[name], SKELETONS[other]
     bones = [bone for bone in _TYPICAL if {*bone} <= {*own} and {*bone} <= {*its}]
+    if not bones:
+        return np.nan
     lengths = [_bone_lengths(joints, bones, key_points, valid) for joints in (own, its)]
     measured = np.isfinite(lengths).all(0)
     if measured.sum() < 2:
@@ -183,8 +221,9 @@ def _misfit(name: str, other: str, key_points: np.ndarray, valid: np.ndarray) ->
     misfits = []
     for length in lengths:
         found = length[measured]
-        misfits.append(found.mean() * (np.log(found) - typical).std())
-    return float(misfits[0] / misfits[1])
+        spread = (np.log(found) - typical).std()
+        misfits.append(float(found.mean() * max(spread, _LEAST_SPREAD)))
+    return misfits[0] / misfits[1]
 
 
 def _bone_lengths(

@@ -23,7 +23,10 @@ _BOX = 5
 """Columns before the key points: class, centre and size of the box."""
 _MOST_EXTRA = 2
 """Columns after them: the box's confidence (save_conf) and the track (track)."""
-_LINE = re.compile(r"\d+(?:\.0+)?(?: -?\d+(?:\.\d+)?(?:e-?\d+)?){14,}\s*$")
+_LINE = re.compile(r"\d+(?:\.0+)?(?: -?\d+(?:\.\d+)?(?:e-?\d+)?){14,}")
+_OF_VIDEO = re.compile(r".+_[1-9]\d*")
+"""Labels of a video are named by its frames from 1 on, without zeros before; labels of images are
+named as the images."""
 _HINT = "It must be a file that yolo pose wrote with save_txt=True."
 
 
@@ -35,8 +38,10 @@ def looks_like_yolo(text: str) -> bool:
 def read_yolo(source: Source) -> Detections:
     """Return everybody in the labels, with pixels as shares of the image's width and height.
 
-    A label of 17 joints is COCO's; a joint at 0, 0 is missing, and its confidence is 1 where the
-    files have none. Tracks are of one view alone and are not read. Raises GhptDataError.
+    The first frame of a video, whose label ends in ``_1``, is frame 0, as other tools count; labels
+    of images keep the images' numbers. A label of 17 joints is COCO's; a joint at 0, 0 is missing,
+    and its confidence is 1 where the files have none. Tracks are of one view alone and are not
+    read. Raises GhptDataError.
     """
     files = find_files(source.path, (".txt",))
     # a list of classes or a note may lie beside them
@@ -46,6 +51,8 @@ def read_yolo(source: Source) -> Detections:
         raise GhptDataError(source.path, "", problem, "Detect with save_txt=True.")
     wanted = None if source.skeleton is None else len(joints_of(source.path, source.skeleton))
     found = read_frame_files(source, labels, lambda file: _people(file, wanted))
+    if all(_OF_VIDEO.fullmatch(file.stem) for file in labels):
+        found = [replace(view, frame=view.frame - 1) for view in found]
     counts = {view.points.valid.shape[1] for view in found if len(view)}
     skeleton = source.skeleton
     if skeleton is None and counts == {len(SKELETONS["coco_17"])}:

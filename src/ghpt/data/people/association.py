@@ -90,7 +90,7 @@ def associate(
     4. The best person has the greatest sum, over frames and views, of size times mean confidence,
        over that of the best in the view.
     """
-    if not len(row):
+    if not len(row) or len(cameras.K) < 2:
         return []
     scale = box_diagonal(points.pixels, points.valid)
     prominence = _prominence(points, scale, view)

@@ -22,6 +22,8 @@ _SEPARATORS = {ord(character): None for character in " _.-"}
 _PARTS = re.compile(r"\d+|[^\W\d_]+")
 _MOST_PARTS = 4
 """Words or numbers that are taken off an end of a name."""
+_SAID = 5
+"""Cameras that a warning names; Panoptic has 520."""
 
 _Key = Callable[[str], str]
 
@@ -253,7 +255,9 @@ def _warn_of_unmatched(
     matched = {camera for _, camera in pairs}
     unseen = [name for index, name in enumerate(cameras.names) if index not in matched]
     if unseen:
-        _log.warning("%s: not used, as no view is of it: %s.", cameras.path, ", ".join(unseen))
+        more = f" and {len(unseen) - _SAID} more" if len(unseen) > _SAID else ""
+        text = "%s: not used, as no view is of it: %s%s."
+        _log.warning(text, cameras.path, ", ".join(unseen[:_SAID]), more)
     if cameras.R is None:
         return
     for view, camera in pairs:

@@ -17,7 +17,7 @@ from ghpt.data.people.association import associate
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.following import follow_views
 from ghpt.data.people.matching import match_views
-from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels
+from ghpt.data.people.pixel_checks import check_image_sizes, check_pixels, scale_to_images
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -66,6 +66,7 @@ def detector_sequence(
     points of images of another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
+    people = scale_to_images(people, ordered, at)
     ideal = undistort_detections(people, ordered, at)
     told_apart_by = _association_points(people, ideal)
     if person is None:
@@ -88,6 +89,7 @@ def detector_sequences(
     another size. Raises GhptDataError.
     """
     at, ordered = match_views(people.path, people.views, cameras, match, views)
+    people = scale_to_images(people, ordered, at)
     ideal = undistort_detections(people, ordered, at)
     found = tell_apart(people, ordered, at, _association_points(people, ideal))
     return [
@@ -118,6 +120,37 @@ def _sequence(
         points=KeyPointArrays(ideal.take(chosen[:, at]), raw.masked()),
         skeleton=people.skeleton,
     )
+
+
+def tracks_of_views(
+    people: Detections,
+    cameras: CameraSet,
+    match: Mapping[Name, Name] | None = None,
+    views: Items[Name] | None = None,
+    most: int = 4,
+) -> list[Sequence]:
+    """Return those whom each view follows by itself: of each the most prominent person, then the
+    most prominent of the rest, ``most`` times. Those of one rank need not be one person.
+
+    Raises GhptDataError where views and cameras do not match.
+    """
+    at, ordered = match_views(people.path, people.views, cameras, match, views)
+    ideal = undistort_detections(people, ordered, at)
+    left = np.arange(len(people))
+    tracks: list[Sequence] = []
+    while len(left) and len(tracks) < most:
+        rest = replace(
+            people,
+            row=people.row[left],
+            view=people.view[left],
+            identity=people.identity[left],
+            points=people.points[left],
+        )
+        followed = follow_views(rest)
+        chosen = np.where(followed >= 0, left[followed], -1)
+        tracks.append(_sequence(people, ordered, at, ideal, chosen, "", False))
+        left = np.setdiff1d(left, chosen)
+    return tracks
 
 
 def _association_points(people: Detections, ideal: KeyPoints) -> KeyPoints:

@@ -290,5 +290,5 @@ class _Rounds:
         return self.solver.noise * (median / _MEDIAN_LENGTH).clamp(min=_LEAST_NOISE)
 
 
-_LEAST_NOISE = 1e-3
-"""mm. Key points without any error would have an infinite weight."""
+_LEAST_NOISE = 1.0
+"""mm. No detector is better; key points without any error would leave time and bones no say."""

@@ -1,4 +1,4 @@
-"""caliscope's CSV of MediaPipe's landmarks: a row for each point, camera and synchronised frame."""
+"""caliscope's CSV of a tracker's points: a row for each point, camera and synchronised frame."""
 
 from __future__ import annotations
 
@@ -8,22 +8,30 @@ import io
 import re
 import warnings
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.formats.skeletons import SKELETONS, joints_of, recognise_beginning
+from ghpt.data.formats.source import Source
 from ghpt.data.formats.validate import open_input
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
-COLUMNS = ("sync_index", "port", "point_id", "img_loc_x", "img_loc_y")
+_CAMERAS = ("port", "cam_id")
+"""What the column of the camera's number is called, until 2025 and since."""
+_FRAME = "sync_index"
+_POINT = ("point_id", "img_loc_x", "img_loc_y")
 _LARGEST = 2 << 30
 _LONGEST_LINE = 1 << 12
 _MOST_PORTS = 1000
 _WRITE = "It must be an xy_*.csv that caliscope wrote."
+_BODY = len(SKELETONS["mediapipe_33"])
+_HANDS = 100
+"""From this number on MediaPipe's tracker counts the points of hands and face."""
 _PLACES = np.full(221, -1)
 """The place in ``mediapipe_75`` of a ``point_id``: of the body, the right and the left hand."""
 _PLACES[:33] = np.arange(33)
@@ -31,6 +39,7 @@ _PLACES[100:121] = np.arange(33, 54)
 _PLACES[200:221] = np.arange(54, 75)
 
 _LARGEST_NUMBER = 1e12
+_LARGEST_POINT = 1 << 20
 
 
 def is_caliscope(text: str) -> bool:
@@ -40,46 +49,87 @@ def is_caliscope(text: str) -> bool:
     """
     header = text.splitlines()[0] if text else ""
     names = {name.strip().strip('"') for name in re.split("[,;\t]", header)}
-    return set(COLUMNS) <= names
+    return {_FRAME, *_POINT} <= names and not names.isdisjoint(_CAMERAS)
 
 
-def read_caliscope(path: Path) -> Detections:
-    """Return the one person of the table: 33 landmarks in the views ``cam_<port>``.
+def read_caliscope(source: Source) -> Detections:
+    """Return the one person of the table, in the views ``cam_<number>``.
 
-    They are 75 with hands; points of the face are left out. The frame numbers are ``sync_index``.
-    There is no confidence in these files. Raises GhptDataError for a table that is damaged, or that
-    has a point twice.
+    The frame numbers are ``sync_index``; there is no confidence in these files. What a point's
+    number means depends on the tracker, which the file does not name: it is the skeleton of as many
+    points, or more, whose bones fit. MediaPipe's numbers leave a gap before hands and face; the
+    body has 33 points, with hands 75, and the face is left out. Raises GhptDataError for a table
+    that is damaged, or that has a point twice.
     """
+    path = source.path
     table = _table(path)
-    landmark = table[:, 2]
-    known = (landmark >= 0) & (landmark < len(_PLACES))
-    table = table[known & np.isfinite(table).all(1)]
-    place = _PLACES[table[:, 2].astype(np.int64)]
-    table = table[place >= 0]
-    joint = place[place >= 0]
-    body = len(SKELETONS["mediapipe_33"])
-    if not (joint < body).any():
-        problem = f"has no body landmark (0 to {body - 1})"
-        raise GhptDataError(path, "point_id", problem, _WRITE)
-    has_hands = bool((joint >= body).any())
-    names = SKELETONS["mediapipe_75" if has_hands else "mediapipe_33"]
+    table = table[np.isfinite(table).all(1) & (table[:, 2] >= 0)]
+    numbering = _number_joints(path, table[:, 2], source.skeleton)
+    count = numbering.count
+    table = table[numbering.joint >= 0]
+    joint = numbering.joint[numbering.joint >= 0]
     frame, port = table[:, :2].astype(np.int64).T
     frames, row = np.unique(frame, return_inverse=True)
     ports, view = np.unique(port, return_inverse=True)
     if len(ports) > _MOST_PORTS:
         raise GhptDataError(path, "port", f"names {len(ports)} cameras", _WRITE)
-    cell = (row * len(ports) + view) * len(names) + joint
+    cell = (row * len(ports) + view) * count + joint
     if len(np.unique(cell)) != len(cell):
         problem = "a point is there twice in a frame of a camera"
         raise GhptDataError(path, "point_id", problem, _WRITE)
-    shape = (len(frames), len(ports), len(names))
+    shape = (len(frames), len(ports), count)
     points = np.zeros((*shape, 2))
     valid = np.zeros(shape, np.bool_)
     points.reshape(-1, 2)[cell] = table[:, 3:5]
     valid.reshape(-1)[cell] = True
+    people = valid.reshape(-1, count)
+    name = numbering.skeleton
+    if name is None:
+        name = recognise_beginning(path, points.reshape(-1, count, 2), people)
+    joints = joints_of(path, name)
+    missing = len(joints) - count
+    points = np.pad(points, ((0, 0), (0, 0), (0, missing), (0, 0)))
+    valid = np.pad(valid, ((0, 0), (0, 0), (0, missing)))
     views = tuple(f"cam_{port}" for port in ports)
     key_points = KeyPoints(points, valid.astype(np.float64), valid)
-    return Detections.of_person(path, views, names, frames, key_points)
+    return Detections.of_person(path, views, joints, frames, key_points)
+
+
+@dataclass(frozen=True)
+class _Numbering:
+    """Which joint each row of the table is of."""
+
+    joint: Int[np.ndarray, " N"]
+    """-1 for one that is left out."""
+    count: int
+    """Of joints; the last of the skeleton may never have been seen."""
+    skeleton: str | None
+    """Its name, where that is known."""
+
+
+def _number_joints(path: Path, point: Float[np.ndarray, " N"], skeleton: str | None) -> _Numbering:
+    """Return the joints of points by their numbers. Raises GhptDataError."""
+    there = np.unique(point)
+    body = there[there < _HANDS]
+    if not len(body):
+        problem = f"has no point below {_HANDS}, and so none of a body"
+        raise GhptDataError(path, "point_id", problem, _WRITE)
+    name = skeleton
+    if body[-1] < _BODY and there[-1] >= _HANDS:
+        known = point < len(_PLACES)
+        joint = np.where(known, _PLACES[np.where(known, point, 0).astype(np.int64)], -1)
+        has_hands = bool((joint >= _BODY).any())
+        name = name or ("mediapipe_75" if has_hands else "mediapipe_33")
+        if name == "mediapipe_33":
+            joint[joint >= _BODY] = -1
+    else:
+        joint = np.minimum(point, _LARGEST_POINT).astype(np.int64)
+    count = int(joint.max()) + 1
+    most = len(joints_of(path, name)) if name else max(map(len, SKELETONS.values()))
+    if count > most:
+        problem = f"has a point of number {there[-1]:.0f}, and {name or 'a skeleton'} has {most}"
+        raise GhptDataError(path, "point_id", problem, "Name the tracker's skeleton: skeleton=.")
+    return _Numbering(joint, count, name)
 
 
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:
@@ -126,7 +176,8 @@ def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
         raise GhptDataError(path, "", "has columns that commas do not part", hint)
     try:
         header = [name.strip() for name in next(csv.reader([line]))]
-        columns = [header.index(name) for name in COLUMNS]
+        camera = next((name for name in _CAMERAS if name in header), _CAMERAS[0])
+        columns = [header.index(name) for name in (_FRAME, camera, *_POINT)]
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # of a table without rows
             table = np.loadtxt(
@@ -138,4 +189,4 @@ def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
             )
     except (ValueError, StopIteration, csv.Error) as error:
         raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
-    return table.reshape(-1, len(COLUMNS))
+    return table.reshape(-1, len(columns))

@@ -38,7 +38,8 @@ def test_rows_become_an_array_whatever_their_order(tmp_path):
 
 def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):
     rows = ("0,0,0,1.5,0,10,20,,", "0,1,0,1.5,0,,,,", "0,1,0,1.5,1,3,4,,")
-    found = read_person(table(tmp_path, *rows))
+    found = read_person(table(tmp_path, *rows), "coco_17")
+    assert found.joints == SKELETONS["coco_17"]
     assert found.valid[0, :, :2].tolist() == [[True, False], [False, True]]
     assert (found.key_points[~found.valid] == 0).all()
 
@@ -46,18 +47,57 @@ def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):
 @pytest.mark.parametrize(
     ("rows", "says"),
     [
-        ([], "no body landmark"),
+        ([], "none of a body"),
         (["0,0,0,1,0,1,2,,"] * 2, "a point is there twice"),
         (["0,0,0,1,0,1"], "is damaged"),
         (["0,0,0,1,x,1,2,,"], "is damaged"),
         (["0,0.5,0,1,0,1,2,,"], "an index that is not whole"),
         (["0,0,0,1,0,1e300,2,,"], "a number beyond"),
-        (["0,0,0,1,100,1,2,,"], "no body landmark"),
+        (["0,0,0,1,100,1,2,,"], "none of a body"),
     ],
 )
 def test_a_bad_table_is_named(rows, says, tmp_path):
     with pytest.raises(GhptDataError, match=says):
-        read_person(table(tmp_path, *rows))
+        read_person(table(tmp_path, *rows), "coco_17" if "twice" in says else None)
+
+
+def upright(joints, shift):
+    """A person seen from the front, in a skeleton's order."""
+    heights = {
+        "ankle": 0,
+        "heel": 0,
+        "toe": 0,
+        "knee": 50,
+        "hip": 95,
+        "shoulder": 143,
+        "neck": 146,
+        "elbow": 115,
+        "wrist": 95,
+        "hand": 85,
+        "thumb": 85,
+        "finger": 85,
+        "pinky": 85,
+        "index": 85,
+        "head_top": 175,
+    }
+    aside = [20 if "left" in name else -20 if "right" in name else 0 for name in joints]
+    up = [next((h for part, h in heights.items() if part in name), 160) for name in joints]
+    return np.stack([np.array(aside) + 500 + shift, 600 - np.array(up)], -1)
+
+
+@pytest.mark.parametrize("name", ["halpe_26", "coco_17", "coco_133", "mediapipe_33", "body_25"])
+@pytest.mark.parametrize("camera", ["port", "cam_id"])
+def test_a_tracker_s_points_are_told_by_their_number_and_bones(name, camera, tmp_path):
+    rng = np.random.default_rng(0)
+    rows = []
+    for t in range(20):
+        for v in (0, 1):
+            body = upright(SKELETONS[name], 3 * t) + rng.normal(0, 2, (len(SKELETONS[name]), 2))
+            rows += [f"{t},{v},{t},0.1,{k},{x:.3f},{y:.3f},," for k, (x, y) in enumerate(body)]
+    path = table(tmp_path, *rows, header=HEADER.replace("port", camera))
+    assert read_person(path).joints == SKELETONS[name]
+    with pytest.raises(GhptDataError, match=r"has a point of number \d+, and mpi_15 has 15"):
+        read_person(path, "mpi_15")
 
 
 def test_hands_come_behind_the_body_the_right_one_first(tmp_path):

@@ -1,0 +1,109 @@
+"""Which of the people whom each view follows by itself is one person: told by essential matrices,
+before any extrinsics are known.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from ghpt.calibration.observations import observe, usable
+from ghpt.calibration.pairs import PairEstimation
+from ghpt.data.people.sequence import KeyPointArrays, Sequence
+from ghpt.data.points import KeyPoints
+
+_FRAMES = 60
+"""Of the recording, evenly spread."""
+_CLEARLY = 0.05
+"""By how much larger the mean share of inliers must be for other tracks than the first of each
+view to be taken.
+"""
+
+
+def one_person(tracks: list[Sequence], pairs: PairEstimation, noise: float, seed: int) -> Sequence:
+    """Return the sequence of one person, made of one track of each view.
+
+    ``tracks``: the k-th holds the k-th most prominent person of each view, who need not be the
+    same. Of all choices the one is taken whose key points agree with an essential matrix in the
+    largest mean share over all pairs of views; the first of each view, unless others are clearly
+    better.
+    """
+    if len(tracks) < 2:
+        return tracks[0]
+    share = _shares(tracks, pairs, noise, seed)
+    views = share.shape[0]
+    first = (0,) * views
+    choices = [_ascend(share, track) for track in range(len(tracks))]
+    best = max(choices, key=lambda choice: _mean(share, choice))
+    if _mean(share, best) < _mean(share, first) + _CLEARLY:
+        best = first
+    return combine(tracks, best)
+
+
+def combine(tracks: list[Sequence], choice: tuple[int, ...]) -> Sequence:
+    """Return the sequence that has each view of the track chosen for it."""
+    return Sequence(
+        title=tracks[0].title,
+        source=tracks[0].source,
+        cameras=tracks[0].cameras,
+        frame=tracks[0].frame,
+        rate_hz=tracks[0].rate_hz,
+        points=KeyPointArrays(
+            _by_view([track.undistorted() for track in tracks], choice),
+            _by_view([track.detected() for track in tracks], choice),
+        ),
+        skeleton=tracks[0].skeleton,
+    )
+
+
+def _by_view(points: list[KeyPoints], choice: tuple[int, ...]) -> KeyPoints:
+    def stack(name: str) -> np.ndarray:
+        parts = [getattr(points[track], name)[:, view] for view, track in enumerate(choice)]
+        return np.stack(parts, axis=1)
+
+    return KeyPoints(stack("pixels"), stack("confidence"), stack("valid"))
+
+
+def _shares(
+    tracks: list[Sequence], pairs: PairEstimation, noise: float, seed: int
+) -> Float[Tensor, "V P V P"]:
+    """Return the share of common key points that agree, of each two tracks in two views."""
+    joints = [track.as_joints() for track in tracks]
+    rows = joints[0].spread(_FRAMES)
+    parts = [sequence.undistorted(rows) for sequence in joints]
+    pixels = torch.from_numpy(np.concatenate([part.pixels for part in parts], axis=1)).double()
+    valid = torch.from_numpy(np.concatenate([part.valid for part in parts], axis=1))
+    views = len(tracks[0].cameras)
+    K = tracks[0].cameras.K.repeat(len(tracks), 1, 1)
+    observed = observe(K, pixels, usable(K, pixels, valid), noise)
+    share = torch.zeros(views, len(tracks), views, len(tracks), dtype=torch.float64)
+    for a, b in combinations(range(views), 2):
+        for i in range(len(tracks)):
+            for j in range(len(tracks)):
+                found = pairs.pair(observed, views * i + a, views * j + b, seed)
+                if found is not None:
+                    _, common, inliers, *_ = found
+                    share[a, i, b, j] = inliers / common.clamp(min=1)
+                    share[b, j, a, i] = share[a, i, b, j]
+    return share
+
+
+def _mean(share: Float[Tensor, "V P V P"], choice: tuple[int, ...]) -> float:
+    pairs = combinations(range(len(choice)), 2)
+    return float(torch.stack([share[a, choice[a], b, choice[b]] for a, b in pairs]).mean())
+
+
+def _ascend(share: Float[Tensor, "V P V P"], track: int) -> tuple[int, ...]:
+    """Return the choice that a track of the first view leads to: of the others those that agree
+    best with it, and then each in turn the one that agrees best with all.
+    """
+    choice = [track, *share[0, track, 1:].argmax(-1).tolist()]
+    for _ in range(3):
+        for view in range(len(choice)):
+            others = [share[view, :, o, choice[o]] for o in range(len(choice)) if o != view]
+            choice[view] = int(torch.stack(others).sum(0).argmax())
+    return tuple(choice)
