@@ -17,7 +17,7 @@ def choices(group: str) -> list[str]:
 
 def test_the_groups_hold_the_issue_s_choices():
     assert {"cmu1", "cmu2", "cmu3", "cmu4", "h36m"} <= set(choices("data"))
-    assert choices("model") == ["camera", "pose"]
+    assert choices("model") == ["camera", "key_points", "pose"]
     assert choices("experiment") == [
         "coordinates_only",
         "lengths_only",
@@ -87,6 +87,7 @@ def test_every_test_configuration_builds(data):
     assert build(config["data"], "data").name == data
     assert sorted(build(config["baselines"], "baselines")) == [
         "adaptive_ransac",
+        "frame_learned",
         "linear",
         "lo_ransac",
         "m_estimator",

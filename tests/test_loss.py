@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from ghpt.errors import GhptConfigError
-from ghpt.models.loss import StochasticLoss, mean_over_all
+from ghpt.models.loss import PrecisionLoss, StochasticLoss, mean_over_all
 
 
 def weights_and_errors(items=6, count=9):
@@ -113,3 +113,17 @@ def test_negative_weights_are_refused(name):
     settings = {"alpha": 1.0, "beta": 1.0, "gamma": 1.0} | {name: -0.1}
     with pytest.raises(GhptConfigError, match=rf"^model\.loss\.{name}: "):
         StochasticLoss(**settings, relative_errors=True)
+
+
+def test_precisions_of_the_errors_are_the_best_weights():
+    errors = torch.tensor([[1.0, 2.0, 4.0, 0.0]])
+    loss = PrecisionLoss(alpha=1.0, gamma=0.0)
+
+    def value(weights):
+        weights = torch.tensor([weights]) / sum(weights)
+        return loss(weights, errors, torch.zeros(1)).total.item()
+
+    best = value([1.0, 1 / 4, 1 / 16, 0.0])
+    assert best < value([1.0, 1.0, 1.0, 0.0])
+    assert best < value([1.0, 1 / 8, 1 / 64, 0.0])
+    assert best < value([1.0, 1 / 3, 1 / 12, 0.0])

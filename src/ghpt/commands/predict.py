@@ -395,11 +395,12 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
     group = _with_flips(settings, settings.predictor.classical)
     baseline = settings.baselines[name]
     factory = build(group, "predictor.classical")
-    predictor: Classical = factory(estimator=build(baseline, f"baselines.{name}"))
+    estimator: Estimator = build(baseline, f"baselines.{name}")
+    predictor: Classical = factory(estimator=estimator)
     shown = NAMES.get(name, name.replace("_", " "))
     return PoseEstimator(
         name=name,
-        text=f"{shown}, a classical estimator (no ckpt was given)",
+        text=f"{shown}, {estimator.sort} (no ckpt was given)",
         predictor=predictor,
         flips=predictor.flips,
         weights=None,

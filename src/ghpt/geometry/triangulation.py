@@ -6,7 +6,7 @@ product, whatever the number of subsets; then each joint is a 3x3 solve.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import torch
@@ -148,6 +148,11 @@ def solve_in_parts(function: Callable[[slice], Triangulation], shape: torch.Size
     for start in range(0, max(frames, 1), size):
         rows = slice(start, start + size)
         parts.append(function(rows))
+    return concatenate(parts)
+
+
+def concatenate(parts: Sequence[Triangulation]) -> Triangulation:
+    """Return successive parts of a batch as one."""
     if len(parts) == 1:
         return parts[0]
     return _map_fields(lambda *x: torch.cat(x), *parts)

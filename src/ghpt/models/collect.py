@@ -9,7 +9,6 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.pool import Pool
 from ghpt.models.predictions import PredictionWriter
 from ghpt.models.problem import Problem
@@ -49,14 +48,14 @@ class CollectPredictions(Callback):
         for baseline in self.baselines.values():
             if isinstance(baseline, OfRecordings):
                 baseline.open(dataset)
-        names = [*AGGREGATIONS, *self.baselines]
+        names = [*self.problem.aggregations, *self.baselines]
         self._dataset = dataset
         self._writer = PredictionWriter(self._folder, len(dataset), names, self.problem.schema)
 
     def write(self, batch: Labelled[Any, Any], pool: Pool) -> None:
         """Write what the aggregations of a pool and the baselines make of a batch."""
         observations = batch.observations
-        estimates = {name: pool.estimate(name) for name in AGGREGATIONS}
+        estimates = {name: pool.estimate(name) for name in self.problem.aggregations}
         for name, baseline in self.baselines.items():
             estimate = baseline(observations)
             estimates[name] = self.problem.from_baseline(estimate, observations)

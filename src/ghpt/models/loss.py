@@ -58,6 +58,40 @@ class StochasticLoss(nn.Module):
         return LossTerms(total, stochastic, entropy, estimate_error)
 
 
+class PrecisionLoss(nn.Module):
+    """``alpha (l_error + l_spread) + gamma l_est`` for each item: of weights that are precisions.
+
+    ``l_error``, the logarithm of the mean weighted squared error, and ``l_spread``, minus the mean
+    logarithm of the weights, are together the negative logarithm of the likelihood of Gaussian
+    errors whose precisions the weights are, but for a factor that is all's, under the best such
+    factor. Hypotheses without a weight do not count.
+    """
+
+    def __init__(self, alpha: float, gamma: float) -> None:
+        super().__init__()
+        for name, value in {"alpha": alpha, "gamma": gamma}.items():
+            check(value >= 0, f"model.loss.{name}", f"is {value}", "It must be >= 0.")
+        self.alpha = alpha
+        self.gamma = gamma
+
+    def forward(
+        self,
+        weights: Float[Tensor, "B H"],
+        errors: Float[Tensor, "B H"],
+        estimate_error: Float[Tensor, " B"],
+    ) -> LossTerms:
+        """Return the loss of each item; the arguments are those of ``StochasticLoss``."""
+        tiny = torch.finfo(weights.dtype).tiny
+        counts = weights > 0
+        number = counts.sum(dim=-1).clamp_min(1)
+        square = (weights * errors.square()).sum(dim=-1) / number
+        likelihood = square.clamp_min(tiny).log()
+        logarithm = torch.where(counts, weights.clamp_min(tiny).log(), 0.0)
+        spread = -logarithm.sum(dim=-1) / number
+        total = self.alpha * (likelihood + spread) + self.gamma * estimate_error
+        return LossTerms(total, likelihood, spread, estimate_error)
+
+
 def mean_over_all(
     values: Float[Tensor, " B"], has_truth: Bool[Tensor, " B"], total: Tensor, world: int
 ) -> Tensor:

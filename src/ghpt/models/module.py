@@ -6,6 +6,7 @@ from typing import Any
 import lightning as L
 import torch
 from torch import Tensor, nn
+from torch.optim.lr_scheduler import LRScheduler
 from torchmetrics import MeanMetric
 
 from ghpt import randomness
@@ -26,14 +27,18 @@ MOST_HYPOTHESES = 100_000
 """In a pool: of more, the poses of one batch alone are gigabytes."""
 
 
+_VALIDATED = ("weight", "average", "random")
+"""The aggregations whose errors a training shows."""
+
+
 class StochasticEstimator(L.LightningModule):
     """Hypothesis generator, scorer and loss (paper, section 3), for any ``Problem``.
 
     ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like
     ``StochasticLoss``. ``logit_std_cap`` limits how much a pool's logits differ
     (``cap_logit_std``). ``selection``: the aggregation of the estimation loss, ``weight`` or
-    ``stochastic`` (straight through). All randomness is a function of seed, optimiser step and
-    sample: see ``ghpt.randomness``.
+    ``stochastic`` (straight through). ``schedule``: of the learning rate, step by step. All
+    randomness is a function of seed, optimiser step and sample: see ``ghpt.randomness``.
     """
 
     def __init__(
@@ -48,6 +53,7 @@ class StochasticEstimator(L.LightningModule):
         logit_std_cap: float | None,
         selection: str,
         seed: int,
+        schedule: Callable[[torch.optim.Optimizer], LRScheduler] | None = None,
     ) -> None:
         possible = 1 <= hypotheses <= MOST_HYPOTHESES
         hint = f"Draw at least 1 and at most {MOST_HYPOTHESES} (the paper: 200)."
@@ -64,6 +70,7 @@ class StochasticEstimator(L.LightningModule):
         self.problem = problem
         self.loss = loss
         self.optimizer = optimizer
+        self.schedule = schedule
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)  # the initial weights too are a function of the seed alone
             self.scorer = scorer(problem.feature_size)
@@ -73,9 +80,8 @@ class StochasticEstimator(L.LightningModule):
         self.logit_std_cap = logit_std_cap
         self.selection = selection
         self.seed = seed
-        self.validation = torch.nn.ModuleDict(
-            {name: _mean() for name in ("weight", "average", "random")}
-        )
+        shown = [name for name in _VALIDATED if name in problem.aggregations]
+        self.validation = torch.nn.ModuleDict({name: _mean() for name in shown})
 
     def sample(
         self,
@@ -133,7 +139,7 @@ class StochasticEstimator(L.LightningModule):
             )
             chosen = drawn + weights - weights.detach()
         estimate = self.problem.aggregate(pool.hypotheses, chosen)
-        estimate_error, _ = self.problem.error(estimate, pool.known_truth)
+        estimate_error = self.problem.training_error(estimate, pool.known_truth)
         return self.loss(weights, pool.errors, estimate_error.to(weights.dtype))
 
     def training_step(self, batch: Labelled[Any, Any], batch_idx: int) -> Tensor:
@@ -180,9 +186,13 @@ class StochasticEstimator(L.LightningModule):
         """Return the pool of a batch."""
         return self.sample(batch.observations, "test", batch.truth)
 
-    def configure_optimizers(self) -> torch.optim.Optimizer:
-        """Return the optimiser of the scorer's weights."""
-        return self.optimizer(self.scorer.parameters())
+    def configure_optimizers(self) -> Any:
+        """Return the optimiser of the scorer's weights, and its schedule over the steps if any."""
+        optimizer = self.optimizer(self.scorer.parameters())
+        if self.schedule is None:
+            return optimizer
+        scheduler = {"scheduler": self.schedule(optimizer), "interval": "step"}
+        return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
 
 def _mean() -> MeanMetric:

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ghpt.config import Target
 from ghpt.data.datasets.frames import SampleSet, Sampling, draw_frames
+from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.mean_error import mean_errors
 from ghpt.models.predictions import Predictions, Schema, Tables, TrueJoints
 from ghpt.observations import Batch, Estimate, Labelled, LabelledRecording
@@ -78,6 +79,8 @@ class Problem(ABC):
     """What a test run stores."""
     headline: ClassVar[str] = "error"
     """The number of ``metrics`` that sums up a run, mm."""
+    aggregations: ClassVar[tuple[str, ...]] = AGGREGATIONS
+    """Those that mean something here; ``weight`` and ``average`` always do."""
     feature_size: int
     """D, the length of the feature vector that the scorer sees."""
 
@@ -106,6 +109,10 @@ class Problem(ABC):
 
         A sample that cannot gets 0.
         """
+
+    def training_error(self, estimate: Any, truth: Any) -> Float[Tensor, " B"]:
+        """Return what the estimation loss lessens: the error, unless a problem says otherwise."""
+        return self.error(estimate, truth)[0]
 
     def dataset(self, recordings: Sequence[LabelledRecording], sampling: Sampling) -> SampleSet:
         """Return the samples that are drawn from the recordings of a split."""

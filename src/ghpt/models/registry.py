@@ -14,10 +14,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from torch import nn, optim
+from torch.optim import lr_scheduler
 
 from ghpt.config import build, locate, suggest
 from ghpt.errors import GhptConfigError
-from ghpt.models.loss import StochasticLoss
+from ghpt.models.key_points.problem import KeyPointWeights
+from ghpt.models.key_points.scorer import KeyPointScorer
+from ghpt.models.loss import PrecisionLoss, StochasticLoss
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.authors import AuthorsScorer, WorldPoses
 from ghpt.models.pose.problem import PoseTriangulation
@@ -54,6 +57,7 @@ PARTS = {
     "model.scorer": Part(nn.Module, partial=True),
     "model.loss": Part(nn.Module),
     "model.optimizer": Part(optim.Optimizer, partial=True),
+    "model.schedule": Part(lr_scheduler.LRScheduler, partial=True),
 }
 
 
@@ -67,10 +71,11 @@ def register(part: str, *classes: type) -> None:
 
 
 register("model", StochasticEstimator)
-register("model.problem", PoseTriangulation, WorldPoses, RelativePose)
+register("model.problem", PoseTriangulation, KeyPointWeights, WorldPoses, RelativePose)
 register("model.problem.scale", KnownScale, BodyHeight, BoneLengths)
-register("model.scorer", Scorer, AuthorsScorer)
-register("model.loss", StochasticLoss)
+register("model.scorer", Scorer, KeyPointScorer, AuthorsScorer)
+register("model.loss", StochasticLoss, PrecisionLoss)
+register("model.schedule", lr_scheduler.ExponentialLR)
 for _name, _one in vars(optim).items():
     if isinstance(_one, type) and issubclass(_one, optim.Optimizer) and _one is not optim.Optimizer:
         register("model.optimizer", _one)

@@ -26,6 +26,7 @@ NAMES = {
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
     "view_weights": "view weights",
     "trajectory": "trajectory",
+    "frame_learned": "key-point weights",
     "weighted_linear": "weighted linear",
     "ransac": "RANSAC",
     "adaptive_ransac": "adaptive RANSAC",
@@ -53,7 +54,7 @@ _CAPTION = (
 )
 _MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 _PER_ACTION = ("weight", "average", "best", "view_weights", "linear", "ransac")
-_BOLD = ("weight", "view_weights")
+_BOLD = ("weight", "view_weights", "frame_learned")
 
 Metrics = Mapping[str, Any]
 """The content of metrics.json."""
@@ -115,13 +116,13 @@ def summary_document(metrics: Metrics) -> Document:
     for name, row in zip(names, main_rows(metrics), strict=True):
         cells = [cell.removesuffix(" %") for cell in row]
         rows.append([Strong(cell) for cell in cells] if name in _BOLD else list(cells))
-    last = AGGREGATIONS[-1]
+    selections = [name for name in names if name in AGGREGATIONS]
     table = Table(
         _TERMINAL,
         rows,
         title=f"MPJPE in mm on {title(metrics)}",
         caption=_CAPTION,
-        last_rows=[names.index(last)] if last in names else [],
+        last_rows=[names.index(selections[-1])] if selections else [],
     )
     return Document("", [table])
 

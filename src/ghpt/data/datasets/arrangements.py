@@ -46,7 +46,7 @@ class _Arrangement(KeyPointDataModule):
         source = "real" if self.root else "synthetic"
         key = {"name": f"{self.name}-{split}-{source}", "cameras": self.cameras}
         if files is None:
-            return key | {"synthetic": self.synthetic, "made by": _synthesis_digest()}
+            return key | {"synthetic": self.synthetic, "made by": synthesis_digest()}
         return key | {"root": self.source, "files": file_stamps(files, self._root())}
 
     def _root(self) -> Path:
@@ -57,7 +57,7 @@ class _Arrangement(KeyPointDataModule):
         return root
 
 
-def _synthesis_digest() -> str:
+def synthesis_digest() -> str:
     """Return a hash of the files that make the synthetic recordings.
 
     Whoever changes them need not clear a cache.

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field, replace
-from typing import Literal, Self
+from typing import ClassVar, Literal, Self
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,6 +22,7 @@ from ghpt.geometry.reweighting import WEIGHTS, triangulate_robustly
 from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.estimators.confidence import confidence_exponent, confidence_weights
 from ghpt.observations import Observations, PoseEstimate
+from ghpt.skeleton import Skeleton
 
 
 def person_scale(
@@ -62,12 +63,19 @@ class Estimator(ABC):
     Its points have the dtype of the key points.
     """
 
+    sort: ClassVar[str] = "a classical estimator"
+    """What it is, in a sentence."""
+
     @abstractmethod
     def triangulate(self, batch: Observations) -> Triangulation:
         """Return the batch's joints with their states."""
 
     def fitted(self, batch: Observations) -> Self:
         """Return the same estimator with what it takes from these frames of a recording."""
+        return self
+
+    def for_skeleton(self, skeleton: Skeleton) -> Self:
+        """Return the same estimator for batches of another skeleton than the 17 joints'."""
         return self
 
     def inlier_threshold(

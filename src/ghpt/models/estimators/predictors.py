@@ -146,7 +146,8 @@ class Classical(FramePredictor):
     def for_skeleton(self, skeleton: Skeleton) -> Classical:
         """Return the same for batches of another skeleton than the 17 joints'."""
         flips = self.flips and self.flips.for_skeleton(skeleton)
-        return Classical(self.estimator, self.uncertainty, flips, self.reject)
+        estimator = self.estimator.for_skeleton(skeleton)
+        return Classical(estimator, self.uncertainty, flips, self.reject)
 
     def fitted(self, batch: Observations) -> Classical:
         clean = prepare(batch, self.flips, self.estimator).batch

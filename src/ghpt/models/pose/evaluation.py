@@ -31,6 +31,7 @@ NAMES = (
     "worst",
     "view_weights",
     "trajectory",
+    "frame_learned",
     "linear",
     "weighted_linear",
     "ransac",

@@ -48,16 +48,64 @@ class PoseHypotheses(Hypotheses):
     """The joints that the frame's views determine; the others are in no hypothesis."""
 
 
-class PoseTriangulation(Problem):
+class PoseProblem(Problem):
+    """What all problems share that estimate poses: they are compared by MPJPE."""
+
+    measures = "MPJPE relative to the pelvis"
+    schema = POSES
+    headline = "mpjpe_relative"
+
+    def error(self, estimate: PoseEstimate, truth: Truth) -> Errors:
+        """Return the pelvis-relative MPJPE (eq:mpjpe), mm, and which frames can be compared.
+
+        The joints that count are estimated and have a truth.
+        """
+        extra = (None,) * (estimate.points.dim() - 3)
+        points = truth.points[:, *extra].expand_as(estimate.points)
+        valid = truth.valid[:, *extra].expand_as(estimate.estimated)
+        errors, counted = joint_errors(estimate, Truth(points, valid), "relative")
+        number = counted.sum(dim=-1)
+        total = torch.where(counted, errors, 0.0).sum(dim=-1)
+        has_truth = (number > 0).flatten(1).all(dim=1) if extra else number > 0
+        return total / number.clamp_min(1), has_truth
+
+    def baselines(
+        self, settings: BaselineSettings, model: Any
+    ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
+        """Return trajectories, where there are settings for them, and the rest."""
+        others: dict[str, Callable[[Observations], PoseEstimate]] = {}
+        if settings.trajectory:
+            others["trajectory"] = build(settings.trajectory, "trajectory")
+        return others | build(settings.baselines, "baselines")
+
+    def record(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
+        """Return the frames' true poses, recordings and numbers."""
+        observations = batch.observations
+        frame = torch.from_numpy(dataset.frame_numbers(observations.index.tolist()))
+        truth = batch.truth
+        return PoseSample(with_nan(truth), truth.valid, observations.recording, frame)
+
+    def tables(self, dataset: Frames) -> PoseTables:
+        """Return the recordings."""
+        return PoseTables.from_recordings(dataset.recordings)
+
+    def metrics(self, predictions: PosePredictions) -> dict[str, Any]:
+        """Return the content of metrics.json."""
+        return evaluate_poses(predictions)
+
+    def report(self) -> Report:
+        """Return the tables and figures; imported here, since drawing is slow to import."""
+        from ghpt.report.tensorboard import REPORT
+
+        return REPORT
+
+
+class PoseTriangulation(PoseProblem):
     """3D poses, each triangulated from random views; compared by MPJPE.
 
     ``coordinates`` and ``lengths``: whether the scorer sees the normalised coordinates, and the
     lengths of the bones.
     """
-
-    measures = "MPJPE relative to the pelvis"
-    schema = POSES
-    headline = "mpjpe_relative"
 
     def __init__(self, coordinates: bool, lengths: bool) -> None:
         problem = "neither coordinates nor lengths is on"
@@ -113,49 +161,12 @@ class PoseTriangulation(Problem):
         estimated = hypotheses.estimated[:, None].expand(points.shape[:-1])
         return PoseEstimate(points, estimated)
 
-    def error(self, estimate: PoseEstimate, truth: Truth) -> Errors:
-        """Return the pelvis-relative MPJPE (eq:mpjpe), mm, and which frames can be compared.
-
-        The joints that count are estimated and have a truth.
-        """
-        extra = (None,) * (estimate.points.dim() - 3)
-        points = truth.points[:, *extra].expand_as(estimate.points)
-        valid = truth.valid[:, *extra].expand_as(estimate.estimated)
-        errors, counted = joint_errors(estimate, Truth(points, valid), "relative")
-        number = counted.sum(dim=-1)
-        total = torch.where(counted, errors, 0.0).sum(dim=-1)
-        has_truth = (number > 0).flatten(1).all(dim=1) if extra else number > 0
-        return total / number.clamp_min(1), has_truth
-
     def baselines(
         self, settings: BaselineSettings, model: Any
     ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
-        """Return view weights and trajectories, where there are settings for them, and the rest."""
+        """Return view weights, where there are settings for them, and the rest."""
         learned: dict[str, Callable[[Observations], PoseEstimate]] = {}
         if settings.view_weights:
             view_weights = build(settings.view_weights, "view_weights")
             learned["view_weights"] = view_weights(model)
-        if settings.trajectory:
-            learned["trajectory"] = build(settings.trajectory, "trajectory")
-        return learned | build(settings.baselines, "baselines")
-
-    def record(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
-        """Return the frames' true poses, recordings and numbers."""
-        observations = batch.observations
-        frame = torch.from_numpy(dataset.frame_numbers(observations.index.tolist()))
-        truth = batch.truth
-        return PoseSample(with_nan(truth), truth.valid, observations.recording, frame)
-
-    def tables(self, dataset: Frames) -> PoseTables:
-        """Return the recordings."""
-        return PoseTables.from_recordings(dataset.recordings)
-
-    def metrics(self, predictions: PosePredictions) -> dict[str, Any]:
-        """Return the content of metrics.json."""
-        return evaluate_poses(predictions)
-
-    def report(self) -> Report:
-        """Return the tables and figures; imported here, since drawing is slow to import."""
-        from ghpt.report.tensorboard import REPORT
-
-        return REPORT
+        return learned | dict(super().baselines(settings, model))

@@ -35,7 +35,7 @@ class Classical:
 def best_classical(results: Results, test: str) -> Classical:
     """Return the classical estimator with the smallest error on a test set."""
     task = f"{test} on {test}"
-    learned = (*AGGREGATIONS, "view_weights")
+    learned = (*AGGREGATIONS, "view_weights", "frame_learned")
     names = [name for name in results.selections(task) if name not in learned]
     errors = {name: results.relative(task, name).mean for name in names}
     best = min(errors, key=errors.__getitem__)

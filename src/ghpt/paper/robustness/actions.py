@@ -22,7 +22,7 @@ from ghpt.skeleton import JOINTS
 KINDS: tuple[Kind, ...] = ("relative", "absolute")
 OF_POOL = ("weight", "average", "most", "best")
 """Selections of the model's pool; the best one looks at the truth."""
-LEARNED = (*OF_POOL, "view_weights")
+LEARNED = (*OF_POOL, "view_weights", "frame_learned")
 """Every estimator that is not classical."""
 
 Estimator = Callable[[Any], Any]

@@ -26,6 +26,7 @@ STYLES = {
     "lo_ransac": ("#666666", (0, (6, 2)), "X"),
     "view_weights": ("#000000", "-", "*"),
     "adaptive_ransac": ("#882255", (0, (5, 1, 1, 1)), "<"),
+    "frame_learned": ("#117733", "-", "p"),
     "best": ("#999999", ":", "*"),
     "trained": ("#E69F00", "-.", "D"),
     "tested": ("#D55E00", "--", "s"),
@@ -33,6 +34,7 @@ STYLES = {
 LABELS = NAMES | {
     "weight": "the paper's selection",
     "view_weights": "learned view weights",
+    "frame_learned": "learned key-point weights",
     "average": "average of its pool",
     "most": "best-scored of its pool",
     "best": "best of its pool (looks at the truth)",
