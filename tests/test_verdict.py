@@ -167,7 +167,7 @@ def test_a_stated_unit_that_makes_a_giant_is_not_to_be_used_and_the_command_mend
     assert read_cameras(rig).unit_known
     numbers = judged(tmp_path, pixels(), rig)
     assert numbers["verdict"]["level"] == "do not use"
-    (finding,) = numbers["verdict"]["findings"]
+    finding = numbers["verdict"]["findings"][0]
     assert finding["code"] == "unit"
     assert finding["value"] == 1e-3
     words = shlex.split(finding["command"])
@@ -180,7 +180,7 @@ def test_a_stated_unit_that_makes_a_giant_is_not_to_be_used_and_the_command_mend
 def test_a_view_that_is_late_is_said_with_a_command_and_strict_fails_after_writing(tmp_path):
     values = late(pixels(), 3, 10)
     with pytest.raises(
-        GhptDataError, match=r"verdict: .*cam_03 is \S+ frames late.* Next: python cameras\.py"
+        GhptDataError, match=r"verdict: .*cam_03 is \S+ frames late.* Next: python predict\.py"
     ):
         judged(tmp_path, values, None, "strict=true", SHIFTED)
     numbers = json.loads((tmp_path / "out" / "prediction.json").read_text())

@@ -26,6 +26,8 @@ def commands_on(inputs: InputSettings, own: Mapping[str, object], output: Path) 
     given = {key: value for key, value in values.items() if value is not None}
     if inputs.time == "file":
         del given["time"]
+    if not inputs.least_confidence:
+        del given["least_confidence"]
     if not inputs.keypoints:
         given |= {"data": inputs.data["name"]}
 
