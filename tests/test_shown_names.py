@@ -83,7 +83,9 @@ def prediction() -> PredictionResult:
         rate_hz=None,
         fill_frames=None,
         smooth_hz=None,
-        coverage=Coverage(3, {"observed": 1.0, "supported": 0.0, "filled": 0.0}, {BAD: 1.0}, {BAD: 2}, 1700.0),
+        coverage=Coverage(
+            3, {"observed": 1.0, "supported": 0.0, "filled": 0.0}, {BAD: 1.0}, {BAD: 2}, 1700.0
+        ),
         scales=ScaledErrors(None, {}),
         unit_mm=1.0,
         evaluation=Evaluation(3, {"linear": found, "x": found}),

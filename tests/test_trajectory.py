@@ -12,7 +12,7 @@ from ghpt.api import default_settings
 from ghpt.commands.predict import build_estimator
 from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
-from ghpt.geometry.cameras import project
+from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.state import State
 from ghpt.models.estimators.trajectory.disjoint import DisjointTest, square_distances
 from ghpt.models.estimators.trajectory.groups import body_groups, spanning_bones
@@ -206,6 +206,18 @@ def test_nan_and_absent_people_give_no_joint(predictor, batch):
     assert part.points.isfinite().all()
     assert not part.has_position[46:84].any()
     assert (part.state[10] == State.OBSERVED).all()
+
+
+@pytest.mark.parametrize("factor", [0.05, 1000.0])
+def test_a_body_of_any_size_is_followed(predictor, batch, result, factor):
+    """A mouse, or a person before cameras of a wrong unit."""
+    cameras = batch.cameras
+    resized = replace(batch, cameras=Cameras(cameras.K, cameras.R, cameras.t * factor))
+    part = predict(predictor, Source(resized))
+    assert torch.equal(part.state, result.state)
+    distance = (part.points / factor - result.points).norm(dim=-1)
+    assert float(distance.max()) < 10
+    assert float(distance.mean()) < 1
 
 
 def test_the_solver_solves_the_equations():

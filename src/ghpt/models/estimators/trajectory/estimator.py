@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.errors import check, check_positive
-from ghpt.geometry.cameras import reprojection_error
+from ghpt.geometry.cameras import Cameras, reprojection_error
 from ghpt.models.estimators.classical import Estimator, person_scale
 from ghpt.models.estimators.confidence import confidence_exponent, confidence_weights
 from ghpt.models.estimators.trajectory.disjoint import (
@@ -28,6 +28,12 @@ from ghpt.models.estimators.trajectory.windows import Clock, dense
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import HUMAN36M, Skeleton
 
+_ADULT = 1800.0
+"""mm: the diagonal of the box around an adult."""
+_PERSON = (0.25, 2.0)
+"""Sizes that a person may have, who sits or is a child."""
+_LEAST_PLACED = 5
+"""Joints of a frame, of which fewer tell no size."""
 _LEAST_EXPONENT = 0.0
 """Of the confidences: any that is surely positive counts, since many frames are averaged."""
 
@@ -75,6 +81,10 @@ class Trajectory:
     """What the recording says of its person; None: each batch tells."""
     exponent: float = 0.0
     """Of the confidences."""
+    size: float = 1.0
+    """Of the body, in that of an adult: lengths in the settings are those of an adult. 1 for every
+    person; animals, and cameras of a wrong unit, have another.
+    """
 
     def __post_init__(self) -> None:
         check_positive(agree=self.agree, longest_gap_s=self.longest_gap_s)
@@ -119,6 +129,9 @@ class Trajectory:
         They are of one recording, in the order of time; there may be gaps between them.
         """
         first = self.start(batch)
+        size = _size(first)
+        if size != self.size:
+            return replace(self, size=size).fitted(batch)
         plain = replace(self, exponent=0.0)
         found = plain.solve(batch, first)
         exchanged = found.exchanged
@@ -128,7 +141,7 @@ class Trajectory:
             relative, exchanged.confidence, exchanged.valid, _LEAST_EXPONENT
         )
         weighted = replace(self, exponent=min(exponent, self.largest_exponent))
-        frames, _ = weighted._frames(batch, first)
+        frames, _ = weighted._frames(_resize(batch, 1 / size), _resize_poses(first, 1 / size))
         return replace(weighted, body=self.solver(frames, self.skeleton).body)
 
     def calibrated(self, batch: Observations) -> Trajectory:
@@ -160,19 +173,20 @@ class Trajectory:
         self, batch: Observations, first: PoseEstimate, with_covariance: bool = False
     ) -> TrajectoryPart:
         """Return the trajectory of frames of one recording in the order of time."""
-        frames, place = self._frames(batch, first)
+        size = self.size
+        frames, place = self._frames(_resize(batch, 1 / size), _resize_poses(first, 1 / size))
         solution = self.solver(frames, self.skeleton, self.body)
         at = torch.from_numpy(place)
         origin = frames.rows.origin
         covariance = solution.points.new_zeros(len(batch), solution.points.shape[1], 6)
         if with_covariance:
-            every = self.inflation * covariances(solution)
+            every = size**2 * self.inflation * covariances(solution)
             covariance = every[..., at].permute(2, 1, 0)
         limit = self.agree * solution.body.scale[:, None]
         agrees = solution.used & (solution.residual <= limit)
         order = solution.order[..., at].permute(2, 0, 1)
         return TrajectoryPart(
-            points=solution.points[..., at].permute(2, 1, 0) + origin,
+            points=size * (solution.points[..., at].permute(2, 1, 0) + origin),
             covariance=covariance,
             views=agrees[..., at].permute(2, 0, 1),
             flipped=(order != torch.arange(order.shape[-1])).any(-1),
@@ -210,6 +224,32 @@ class Trajectory:
         before = torch.where(known, number, -torch.inf).cummax(0).values
         after = torch.where(known, -number, -torch.inf).flip(0).cummax(0).values.flip(0)
         return (number - before <= reach) | (-after - number <= reach)
+
+
+def _size(first: PoseEstimate) -> float:
+    """Return the size of the body in that of an adult; 1 where it may be a person's."""
+    placed = (first.estimated & first.points.isfinite().all(-1))[..., None]
+    largest = torch.where(placed, first.points.double(), -torch.inf).amax(1)
+    smallest = torch.where(placed, first.points.double(), torch.inf).amin(1)
+    extent = (largest - smallest).norm(dim=-1)
+    known = extent[(placed.sum(1)[:, 0] >= _LEAST_PLACED) & (extent > 0)]
+    if not len(known):
+        return 1.0
+    size = float(known.median()) / _ADULT
+    least, most = _PERSON
+    return 1.0 if least < size < most else size
+
+
+def _resize(batch: Observations, factor: float) -> Observations:
+    """Return what the cameras of a world so many times as large see."""
+    if factor == 1:
+        return batch
+    cameras = batch.cameras
+    return replace(batch, cameras=Cameras(cameras.K, cameras.R, cameras.t * factor))
+
+
+def _resize_poses(poses: PoseEstimate, factor: float) -> PoseEstimate:
+    return poses if factor == 1 else PoseEstimate(poses.points * factor, poses.estimated)
 
 
 def _recordings(batch: Observations) -> list[Int[Tensor, " n"]]:
