@@ -16,11 +16,11 @@ import torch
 
 from ghpt.data.formats.camera_writers import write_opencv, write_pose2sim
 from ghpt.data.formats.skeletons import SKELETONS
-from ghpt.data.synthetic.rigs import human36m_rig
+from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.geometry.cameras import CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import walk, write_people
-from real_layout import write_human36m_layout
+from real_layout import upright19, write_cmu_layout, write_human36m_layout
 from single_person import SinglePerson, write_person
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -133,6 +133,8 @@ def workplace(folder: Path) -> Path:
     write_opencv(folder, rig)
     write_caliscope(folder, rig, pixels)
     write_human36m_layout(folder / "human36m", takes(), chunk=40)
+    person = upright19() * 10 + np.random.default_rng(0).normal(0, 15, (FRAMES, 19, 3))
+    write_cmu_layout(folder / "cmu", panoptic_rig(range(31)), person)
     return folder
 
 

@@ -88,6 +88,7 @@ def test_what_cannot_be_seen_changes_nothing(labelled):
     torch.testing.assert_close(a.points, b.points)
 
 
+@torch.no_grad()
 def test_weights_do_not_depend_on_the_order_of_the_views(labelled):
     observations = labelled.observations.rows(slice(0, 40))
     order = torch.randperm(VIEWS, generator=torch.Generator().manual_seed(0))
