@@ -176,3 +176,14 @@ def test_every_marker_is_of_a_joint_that_its_detector_gives():
     known = {*JOINTS, *(name for names in SKELETONS.values() for name in names)}
     for path in (CONF / "marker_sets").glob("*.yaml"):
         assert set(find_marker_set(path.stem).joints.values()) <= known
+
+
+def test_who_reads_17_joints_with_numpy_finds_them(written):
+    with np.load(written[0] / "poses.npz") as arrays:
+        assert tuple(arrays["joints"]) == JOINTS
+        frames, joints, _ = arrays["points"].shape
+        assert joints == len(JOINTS)
+        more = len(arrays["more_joints"])
+        assert more > 0
+        assert arrays["more_points"].shape == (frames, more, 3)
+        assert arrays["more_views"].shape[2] == more

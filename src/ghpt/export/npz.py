@@ -5,10 +5,11 @@ from __future__ import annotations
 import json
 import tempfile
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from types import EllipsisType
 from typing import IO, Any
 
 import numpy as np
@@ -21,13 +22,15 @@ from ghpt.export.stream import PIECE, Chunks, pieces
 from ghpt.files import atomic_write
 from ghpt.geometry.masking import where
 from ghpt.reconstruction import FILE_STATES, About, Reconstruction, State
-from ghpt.skeleton import HUMAN36M, NamePair
+from ghpt.skeleton import HUMAN36M, JOINTS, NamePair
 
 FORMAT_VERSION = 3
 _POINTS = {1: "<f4", 2: "<f8", 3: "<f8"}
 """How each version that is read stores positions; the first had few digits far from the zero."""
 _WITH_SUPPORTED = 3
 """The first version that has the state SUPPORTED, as number 1; before, the others had one less."""
+_MORE = "more_"
+"""Begins the names of the arrays of what is behind the 17 joints."""
 _HINT = "Predict this recording again, or copy the file again"
 _FORMAT = "ghpt reconstruction"
 
@@ -41,20 +44,48 @@ class _Array:
     dtype: str
     row: tuple[int, ...]
     """Shape of one frame."""
+    joints: tuple[EllipsisType | slice, ...] = (...,)
+    """Which values of the field it holds."""
 
 
-def _layout(views: int, joints: int, version: int = FORMAT_VERSION) -> tuple[_Array, ...]:
-    """Return the arrays with a row for each frame."""
+def _layout(
+    views: int, joints: int, more: int, version: int = FORMAT_VERSION
+) -> tuple[_Array, ...]:
+    """Return the arrays with a row for each frame.
+
+    ``more``: key points behind the joints, which have arrays of their own.
+    """
+    arrays = _joint_arrays("", views, slice(0, joints), joints, version)
+    if more:
+        arrays += _joint_arrays(_MORE, views, slice(joints, joints + more), more, version)
     return (
         _Array("frame", "frame", "<i8", ()),
-        _Array("points", "points", _POINTS[version], (joints, 3)),
-        _Array("state", "state", "|i1", (joints,)),
-        _Array("error", "error", "<f4", (joints,)),
-        _Array("views", "views", "|b1", (views, joints)),
-        _Array("covariance", "covariance", "<f4", (joints, 6)),
+        *arrays,
         _Array("score", "score", "<f4", ()),
         _Array("swapped", "flipped", "|b1", (views,)),
     )
+
+
+def _joint_arrays(
+    prefix: str, views: int, chosen: slice, count: int, version: int
+) -> tuple[_Array, ...]:
+    rows = (slice(None), chosen)
+    by_view = (slice(None), slice(None), chosen)
+    return (
+        _Array(f"{prefix}points", "points", _POINTS[version], (count, 3), rows),
+        _Array(f"{prefix}state", "state", "|i1", (count,), rows),
+        _Array(f"{prefix}error", "error", "<f4", (count,), rows),
+        _Array(f"{prefix}views", "views", "|b1", (views, count), by_view),
+        _Array(f"{prefix}covariance", "covariance", "<f4", (count, 6), rows),
+    )
+
+
+def _joint_count(joints: Sequence[str]) -> int:
+    """Return how many of the joints the arrays without a prefix hold.
+
+    They are the 17, where these come first, so that who reads 17 joints finds them; else all.
+    """
+    return len(JOINTS) if tuple(joints[: len(JOINTS)]) == JOINTS else len(joints)
 
 
 @dataclass(frozen=True)
@@ -100,16 +131,19 @@ def write_npz(path: Path, about: About, chunks: Chunks) -> None:
     Positions are NaN where missing; errors and covariances where not observed. Stored without
     compression: numpy reads it, in parts too. The same content gives the same bytes.
     """
-    layout = _layout(len(about.camera_names), len(about.joints))
+    first = _joint_count(about.joints)
+    layout = _layout(len(about.camera_names), first, len(about.joints) - first)
     meta = json.dumps(asdict(_Meta.describe(about)), allow_nan=False)
     rate_hz = np.nan if about.rate_hz is None else about.rate_hz
     tables = {
-        "joints": np.array(about.joints, np.str_),
+        "joints": np.array(about.joints[:first], np.str_),
         "camera_names": np.array(about.camera_names, np.str_),
         "rate_hz": np.array(rate_hz, "<f8"),
         "unit": np.array("mm"),
         "meta": np.array(meta),
     }
+    if about.joints[first:]:
+        tables[f"{_MORE}joints"] = np.array(about.joints[first:], np.str_)
     with atomic_write(path, verify=read_reconstruction) as handle, ExitStack() as stack:
         # Files without a name: nothing of them is left behind, however the process ends.
         spools: list[IO[bytes]] = []
@@ -120,7 +154,7 @@ def write_npz(path: Path, about: About, chunks: Chunks) -> None:
             count += len(piece)
             masked = _mask_missing(piece)
             for array, spool in zip(layout, spools, strict=True):
-                value = getattr(masked, array.field).numpy()
+                value = getattr(masked, array.field)[array.joints].numpy()
                 spool.write(value.astype(array.dtype).tobytes())
         with zipfile.ZipFile(handle, "w") as archive:
             for array, spool in zip(layout, spools, strict=True):
@@ -160,7 +194,7 @@ def read_reconstruction(
         name=file.meta.name,
         source=file.meta.source,
         estimator=file.meta.estimator,
-        joints=file.joints,
+        joints=(*file.joints, *file.more_joints),
         camera_names=file.camera_names,
         rate_hz=file.meta.rate_hz,
         smoothed=file.meta.smoothed,
@@ -179,13 +213,15 @@ class _File:
     path: Path
     members: dict[str, Member]
     joints: tuple[str, ...]
+    more_joints: tuple[str, ...]
     camera_names: tuple[str, ...]
     meta: _Meta
     frames: int
 
     @property
     def layout(self) -> tuple[_Array, ...]:
-        return _layout(len(self.camera_names), len(self.joints), self.meta.format_version)
+        version = self.meta.format_version
+        return _layout(len(self.camera_names), len(self.joints), len(self.more_joints), version)
 
     def check_layout(self) -> None:
         """Raise GhptDataError unless all arrays are there, of their types and shapes."""
@@ -198,10 +234,14 @@ class _File:
 
     def read(self, start: int, stop: int) -> Reconstruction:
         """Read the frames from position ``start`` up to ``stop``."""
-        rows: dict[str, Tensor] = {}
+        parts: dict[str, list[Tensor]] = {}
         for array in self.layout:
             values = read_rows(self.path, self.members[array.name], start, stop)
-            rows[array.field] = torch.from_numpy(values)
+            parts.setdefault(array.field, []).append(torch.from_numpy(values))
+        rows = {
+            field: values[0] if len(values) == 1 else torch.cat(values, _JOINT_AXIS[field])
+            for field, values in parts.items()
+        }
         piece = Reconstruction(**rows)
         if self.meta.format_version < _WITH_SUPPORTED:
             piece = replace(
@@ -226,6 +266,8 @@ def _open(path: Path) -> _File:
         members = members_of(path)
         (text, *_) = text_table(path, members, "meta")
         joints = text_table(path, members, "joints")
+        more = f"{_MORE}joints"
+        more_joints = text_table(path, members, more) if more in members else ()
         camera_names = text_table(path, members, "camera_names")
         meta = json.loads(text)
     except FileNotFoundError as error:
@@ -243,11 +285,13 @@ def _open(path: Path) -> _File:
         raise GhptDataError(path, "", problem, _HINT) from error
     frame = members.get("frame")
     frames = frame.shape[0] if frame is not None and frame.shape else 0
-    file = _File(path, members, joints, camera_names, _parse_meta(path, meta), frames)
+    file = _File(path, members, joints, more_joints, camera_names, _parse_meta(path, meta), frames)
     file.check_layout()
     return file
 
 
+_JOINT_AXIS = {"points": 1, "state": 1, "error": 1, "views": 2, "covariance": 1}
+"""Of the fields that have joints."""
 _META_TYPES: dict[str, tuple[type, ...]] = {
     "name": (str,),
     "source": (str,),

@@ -55,7 +55,7 @@ def _coverage_line(result: PredictionResult) -> str:
         f"{result.coverage.frames} frames, {len(result.cameras)} views: "
         f"{100 * observed:.1f} % of the joints observed"
     )
-    if supported:
+    if supported >= 0.0005:
         line += f", {100 * supported:.1f} % supported by one view"
     if filled:
         line += f", {100 * filled:.1f} % filled"
