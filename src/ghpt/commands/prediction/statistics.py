@@ -20,14 +20,12 @@ from ghpt.models.estimators.classical import person_scale
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
 from ghpt.models.estimators.predictors import Estimate
 from ghpt.models.estimators.trajectory.disjoint import DisjointTest
-from ghpt.models.estimators.trajectory.windows import spread_runs
+from ghpt.models.estimators.trajectory.windows import RUN, spread_runs
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, stature
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import FILE_STATES, Reconstruction, State
 from ghpt.skeleton import JOINTS, Skeleton
 
-_RUN = 100
-"""Successive frames that are evaluated together."""
 _LEAST = 20
 """Key points for a median that a verdict may rest on."""
 
@@ -134,10 +132,10 @@ def evaluate(
     ``flips``, which are of the sequence's skeleton, are undone for all estimators. ``test_halves``:
     how the covariances of the first one are tested.
     """
-    rows = spread_runs(len(sequence), most, _RUN)
+    rows = spread_runs(len(sequence), most)
     batches = []
-    for start in range(0, len(rows), _RUN):
-        batch = sequence.read(rows[start : start + _RUN])
+    for start in range(0, len(rows), RUN):
+        batch = sequence.read(rows[start : start + RUN])
         batches.append(batch if flips is None else undo_flips(batch, flips)[0])
     held_out = {name: _hold_out_views(batches, estimate) for name, estimate in estimates.items()}
     common = torch.stack([found.valid for found in held_out.values()]).all(0)

@@ -26,9 +26,6 @@ from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import Reconstruction, concatenate, select_frames
 from ghpt.skeleton import Skeleton
 
-_RUN = 100
-"""Successive frames of which the recording's sample is made."""
-
 
 @dataclass(frozen=True)
 class TrajectoryPredictor:
@@ -47,7 +44,7 @@ class TrajectoryPredictor:
         return replace(self, trajectory=replace(self.trajectory, skeleton=skeleton))
 
     def fit(self, source: FrameSource, frames: int) -> TrajectoryPredictor:
-        batch = source.read(spread_runs(len(source.frame), frames, _RUN))
+        batch = source.read(spread_runs(len(source.frame), frames))
         clean = prepare(batch, None, self.trajectory.start).batch
         clock = self._clock(source)
         start = self.trajectory.start.fitted(clean)

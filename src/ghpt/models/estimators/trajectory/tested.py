@@ -14,8 +14,6 @@ from ghpt.models.estimators.trajectory.estimator import Trajectory
 from ghpt.models.estimators.trajectory.windows import spread_runs
 from ghpt.observations import LabelledRecording, Observations, PoseEstimate
 
-_RUN = 100
-"""Successive frames of which the sample of a recording is made."""
 _PIECE = 4096
 """Frames that are solved at a time."""
 
@@ -53,7 +51,7 @@ class TestedTrajectory:
     def _solve(self, recording: int) -> PoseEstimate:
         """Return the poses of all frames of a recording."""
         frames = self.dataset.recordings[recording]
-        sample = _read(frames, spread_runs(len(frames), self.fitted_frames, _RUN))
+        sample = _read(frames, spread_runs(len(frames), self.fitted_frames))
         trajectory = self.trajectory.at_rate(sample, frames.rate_hz).fitted(sample)
         parts = []
         for start in range(0, len(frames), _PIECE):

@@ -86,7 +86,11 @@ class Windows:
             yield Window(within, core)
 
 
-def spread_runs(frames: int, total: int, length: int) -> Rows:
+RUN = 100
+"""Successive frames of which a sample of a recording is made, and which are evaluated together."""
+
+
+def spread_runs(frames: int, total: int, length: int = RUN) -> Rows:
     """Return at most about ``total`` of the rows of a recording: runs of ``length``, spread."""
     if frames <= total:
         return np.arange(frames)
