@@ -12,7 +12,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import poselib
 import torch
@@ -20,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.errors import check, check_positive
+from ghpt.extras import check_installed
 from ghpt.geometry.epipolar import MINIMUM, eight_point, pose_in_front, sampson_error
 from ghpt.models.estimators.classical import person_scale
 from ghpt.observations import PairObservations, RelativePoseEstimate
@@ -160,6 +160,9 @@ class Usac(Robust):
     iterations: int
 
     def __post_init__(self) -> None:
+        check_installed("cv2", self.method)
+        import cv2
+
         known = [name for name in dir(cv2) if name.startswith("USAC_")]
         hint = f"Choose from {', '.join(known)}."
         check(self.method in known, "method", f"is {self.method!r}", hint)
@@ -168,6 +171,8 @@ class Usac(Robust):
         check(possible, "confidence", f"is {self.confidence}", "It must be between 0 and 1.")
 
     def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        import cv2
+
         focal = self.pixels / pair.size
         x = (focal * pair.a).cpu().numpy()
         y = (focal * pair.b).cpu().numpy()

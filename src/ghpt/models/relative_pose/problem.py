@@ -15,10 +15,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt import randomness
-from ghpt.config import build
 from ghpt.data.datasets.frames import Sampling
 from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.errors import check
+from ghpt.extras import build_installed
 from ghpt.geometry.cameras import project
 from ghpt.geometry.epipolar import (
     MINIMUM,
@@ -215,7 +215,7 @@ class RelativePose(Problem):
         self, settings: BaselineSettings, model: Any
     ) -> Mapping[str, Callable[[PairObservations], RelativePoseEstimate]]:
         """Return the classical estimators."""
-        return build(settings.camera_baselines, "camera_baselines")
+        return build_installed(settings.camera_baselines, "camera_baselines")
 
     def from_baseline(
         self, estimate: RelativePoseEstimate, observations: PairObservations
