@@ -57,6 +57,8 @@ PLACEHOLDERS = {
 }
 
 
+OWN_SCORERS = {"model=attending"}
+"""Models whose scorer has no layers to be made small."""
 SLOW = {"data=people", "data=random"}
 """Data sets that no override makes small; tests of their own run a part of them."""
 
@@ -115,6 +117,8 @@ class Page:
         if SLOW & set(words):
             return
         given = {word.split("=")[0] for word in words}
+        if OWN_SCORERS & set(words):
+            given.add("model.scorer.layers")
         more = SMALL[command.script] + (SMALL_PAIRS if "model=camera" in words else ())
         words += [word for word in more if word.split("=")[0] not in given]
         main, files = MAINS[command.script]

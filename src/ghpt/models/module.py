@@ -31,13 +31,17 @@ _VALIDATED = ("weight", "average", "random")
 """The aggregations whose errors a training shows."""
 
 
+_OF_LIGHTNING = ("map_location", "hparams_file", "strict", "weights_only")
+"""Arguments of Lightning's ``load_from_checkpoint``."""
+
+
 class StochasticEstimator(L.LightningModule):
     """Hypothesis generator, scorer and loss (paper, section 3), for any ``Problem``.
 
     ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like
     ``StochasticLoss``. ``logit_std_cap`` limits how much a pool's logits differ
     (``cap_logit_std``). ``selection``: the aggregation of the estimation loss, ``weight`` or
-    ``stochastic`` (straight through). ``schedule``: of the learning rate, step by step. All
+    ``stochastic`` (straight through). ``scheduler``: of the learning rate, step by step. All
     randomness is a function of seed, optimiser step and sample: see ``ghpt.randomness``.
     """
 
@@ -53,7 +57,7 @@ class StochasticEstimator(L.LightningModule):
         logit_std_cap: float | None,
         selection: str,
         seed: int,
-        schedule: Callable[[torch.optim.Optimizer], LRScheduler] | None = None,
+        scheduler: Callable[[torch.optim.Optimizer], LRScheduler] | None = None,
     ) -> None:
         possible = 1 <= hypotheses <= MOST_HYPOTHESES
         hint = f"Draw at least 1 and at most {MOST_HYPOTHESES} (the paper: 200)."
@@ -70,7 +74,7 @@ class StochasticEstimator(L.LightningModule):
         self.problem = problem
         self.loss = loss
         self.optimizer = optimizer
-        self.schedule = schedule
+        self.scheduler = scheduler
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)  # the initial weights too are a function of the seed alone
             self.scorer = scorer(problem.feature_size)
@@ -187,12 +191,24 @@ class StochasticEstimator(L.LightningModule):
         return self.sample(batch.observations, "test", batch.truth)
 
     def configure_optimizers(self) -> Any:
-        """Return the optimiser of the scorer's weights, and its schedule over the steps if any."""
+        """Return the optimiser of the scorer's weights, and its scheduler over the steps if any."""
         optimizer = self.optimizer(self.scorer.parameters())
-        if self.schedule is None:
+        if self.scheduler is None:
             return optimizer
-        scheduler = {"scheduler": self.schedule(optimizer), "interval": "step"}
+        scheduler = {"scheduler": self.scheduler(optimizer), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
+
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *_: Any, **changes: Any) -> Any:
+        """Return the model of a checkpoint of train.py, as `load_model` reads it: no code is run.
+
+        ``changes`` replace settings, as in ``hypotheses=50``; those that Lightning adds of its own
+        (``map_location``, ``strict``) change nothing: the model is on the CPU, and whole.
+        """
+        from ghpt.models.checkpoint import load_model
+
+        own = {name: value for name, value in changes.items() if name not in _OF_LIGHTNING}
+        return load_model(checkpoint_path, own.pop("trust", ()), **own)[0]
 
 
 def _mean() -> MeanMetric:
