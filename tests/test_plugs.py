@@ -59,7 +59,7 @@ def test_a_run_that_overfits_has_one_step_an_epoch_and_stops_early(curves):
 def test_lightning_s_own_method_loads_a_checkpoint(run):
     model = StochasticEstimator.load_from_checkpoint(run / "last.ckpt", hypotheses=7)
     assert model.hypotheses == 7
-    assert model.scheduler.func is CosineAnnealingLR
+    assert model.schedule.func is CosineAnnealingLR
 
 
 @pytest.mark.parametrize(

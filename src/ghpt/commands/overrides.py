@@ -31,10 +31,10 @@ _FORMER_NAMES = {
     "triangulation": "estimator",
     "estimator.classical": "predictor.classical",
     "estimator.learned": "predictor.learned",
-    "model.schedule": "model.scheduler",
+    "model.scheduler": "model.schedule",
     "model.spread": "model.logit_std_cap",
 }
-"""Settings by the names that scripts written for earlier versions give."""
+"""Settings by the names that scripts for earlier versions, or others of their kind, give."""
 
 
 @dataclass(frozen=True)

@@ -41,7 +41,7 @@ class StochasticEstimator(L.LightningModule):
     ``scorer(feature_size)`` gives a module like ``Scorer``, and ``loss`` is one like
     ``StochasticLoss``. ``logit_std_cap`` limits how much a pool's logits differ
     (``cap_logit_std``). ``selection``: the aggregation of the estimation loss, ``weight`` or
-    ``stochastic`` (straight through). ``scheduler``: of the learning rate, step by step. All
+    ``stochastic`` (straight through). ``schedule``: of the learning rate, step by step. All
     randomness is a function of seed, optimiser step and sample: see ``ghpt.randomness``.
     """
 
@@ -57,7 +57,7 @@ class StochasticEstimator(L.LightningModule):
         logit_std_cap: float | None,
         selection: str,
         seed: int,
-        scheduler: Callable[[torch.optim.Optimizer], LRScheduler] | None = None,
+        schedule: Callable[[torch.optim.Optimizer], LRScheduler] | None = None,
     ) -> None:
         possible = 1 <= hypotheses <= MOST_HYPOTHESES
         hint = f"Draw at least 1 and at most {MOST_HYPOTHESES} (the paper: 200)."
@@ -74,7 +74,7 @@ class StochasticEstimator(L.LightningModule):
         self.problem = problem
         self.loss = loss
         self.optimizer = optimizer
-        self.scheduler = scheduler
+        self.schedule = schedule
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)  # the initial weights too are a function of the seed alone
             self.scorer = scorer(problem.feature_size)
@@ -191,11 +191,11 @@ class StochasticEstimator(L.LightningModule):
         return self.sample(batch.observations, "test", batch.truth)
 
     def configure_optimizers(self) -> Any:
-        """Return the optimiser of the scorer's weights, and its scheduler over the steps if any."""
+        """Return the optimiser of the scorer's weights, and its schedule over the steps if any."""
         optimizer = self.optimizer(self.scorer.parameters())
-        if self.scheduler is None:
+        if self.schedule is None:
             return optimizer
-        scheduler = {"scheduler": self.scheduler(optimizer), "interval": "step"}
+        scheduler = {"scheduler": self.schedule(optimizer), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
 
     @classmethod

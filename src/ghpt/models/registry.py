@@ -57,7 +57,7 @@ PARTS = {
     "model.scorer": Part(nn.Module, partial=True),
     "model.loss": Part(nn.Module),
     "model.optimizer": Part(optim.Optimizer, partial=True),
-    "model.scheduler": Part(lr_scheduler.LRScheduler, partial=True),
+    "model.schedule": Part(lr_scheduler.LRScheduler, partial=True),
 }
 
 
@@ -76,7 +76,7 @@ register("model.problem.scale", KnownScale, BodyHeight, BoneLengths)
 register("model.scorer", Scorer, KeyPointScorer, AuthorsScorer)
 register("model.loss", StochasticLoss, PrecisionLoss)
 register(
-    "model.scheduler",
+    "model.schedule",
     lr_scheduler.ConstantLR,
     lr_scheduler.CosineAnnealingLR,
     lr_scheduler.CosineAnnealingWarmRestarts,

@@ -11,7 +11,7 @@ def flatten(config: Any, path: str) -> Iterator[tuple[str, Any]]:
     """Yield ``("a.b", value)`` of nested settings, lists as text, classes by their names."""
     if isinstance(config, Mapping):
         for name, value in config.items():
-            if name == "_target_":
+            if name == "_target_" and "." in path:
                 yield path, str(value).rpartition(".")[2]
             elif not name.startswith("_"):
                 yield from flatten(value, f"{path}.{name}")

@@ -71,10 +71,8 @@ class ForgivingTensorBoard(TensorBoardLogger):
         super().log_metrics(shown, step)
 
     @_forgiving
-    def log_hyperparams(  # type: ignore[override]  # the metrics are curves already
-        self, params: Mapping[str, Any], metrics: Mapping[str, float]
-    ) -> None:
-        """Write the run's row of hyper-parameters beside the last values of its metrics."""
+    def log_hyperparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
+        """Write the run's row of hyper-parameters beside its metrics, which are curves already."""
         write_row(self.experiment, params, metrics)
 
     save = _forgiving(EventsOnly.save)

@@ -127,7 +127,7 @@ class KeyPointDataModule(L.LightningDataModule):
         return recordings
 
     def train_dataloader(self) -> FrameLoader:
-        if self.trainer and self.trainer.overfit_batches > 0:
+        if getattr(self.trainer, "overfit_batches", 0) > 0:
             return self._loader("train")  # the first batches, in every epoch
         return self._loader("train", seed=self.seed, done=self._batches_done)
 
