@@ -23,9 +23,9 @@ from ghpt.commands.overrides import Source, check_overrides
 MAINS = {
     "train.py": (train.COMMAND, {"last.ckpt", "best.ckpt"}),
     "test.py": (testing.COMMAND, {"predictions.npz", "metrics.json", "report.md"}),
-    "predict.py": (predict.COMMAND, {"poses.npz", "report.md", "prediction.json"}),
-    "cameras.py": (camera_check.COMMAND, {"cameras.json", "report.md"}),
-    "calibrate.py": (calibrate.COMMAND, {"rig.toml", "calibration.json", "report.md"}),
+    "predict.py": (predict.COMMAND, {"poses.npz", "report.html", "prediction.json"}),
+    "cameras.py": (camera_check.COMMAND, {"cameras.json", "report.html"}),
+    "calibrate.py": (calibrate.COMMAND, {"rig.toml", "calibration.json", "report.html"}),
 }
 """What a script runs, and what its output folder then holds."""
 
