@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float
 
-from ghpt.models.estimators.confidence import confidence_exponent
+from ghpt.models.estimators.confidence import confidence_exponent, confidence_weights
 from ghpt.models.estimators.trajectory.estimator import LEAST_EXPONENT, Trajectory
 from ghpt.models.estimators.trajectory.solver import joint_noise
 
@@ -65,14 +65,17 @@ def measure(samples: Sequence[Sample], trajectory: Trajectory) -> RunningBody:
     free = torch.from_numpy(np.stack([sample.free_lengths for sample in samples], axis=-1))
     _, precision = solver.bones.measure(lengths, placed)
     length, _ = solver.bones.measure(free, placed)
-    scale = joint_noise(residual.permute(1, 2, 0), used.permute(1, 2, 0), solver.noise)
     exponent = confidence_exponent(residual, confidence, used, LEAST_EXPONENT)
+    exponent = min(exponent, trajectory.largest_exponent)
+    weight = confidence_weights(confidence, exponent)
+    of_joints = [values.permute(1, 2, 0) for values in (residual, used, weight)]
+    scale = joint_noise(*of_joints, solver.noise)
     extents = torch.tensor([sample.extent for sample in samples])
     return RunningBody(
         scale=scale.clamp(max=_LARGEST_NOISE).numpy(),
         length=length.numpy(),
         precision=precision.numpy(),
-        exponent=min(exponent, trajectory.largest_exponent),
+        exponent=exponent,
         extent=float(extents.nanmedian()),
     )
 
