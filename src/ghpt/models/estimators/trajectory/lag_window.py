@@ -87,6 +87,8 @@ class LagWindow:
     """The key points as the detector gives them."""
     current: Stack
     """The same with left and right put right."""
+    seen: Bool[Array, "K J"]
+    """Whether any view counts."""
     median: Float[Array, "K V"]
     """Of the residuals of each view, in their deviations."""
     gain: Float[Array, "K V L"]
@@ -129,9 +131,10 @@ class LagWindow:
         self.as_given = np.arange(joints)
         self.order: Int[Array, "K V J"] = np.broadcast_to(self.as_given, self.given.used.shape)
         self.seen = self.given.used.any(1)
-        """[K J]: whether any view counts."""
-        self.solved = 0
-        """Frames whose points are a solution."""
+        self.residual = self.given.residuals(self.points)
+        """[K V J]: the lengths of the residuals, mm at the body's depth."""
+        self.squares = np.zeros((0, joints))
+        """Mean squares of the second differences around the inner frames that are solved."""
         self.total: Float[Array, "K J 4 4"] = self.given.gram.sum(1)
         """The normal equations of the key points alone."""
         self.groups_terms: list[WindowTerms] = []
@@ -173,7 +176,7 @@ class LagWindow:
             found = self.factored[number]
             self.factored[number] = replace(found, points=found.points[1:])
         motion = self.settings.motion
-        self.past_square = self._keep(self.past_square, self._squares(), motion.window_s)
+        self.past_square = self._keep(self.past_square, self.squares, motion.window_s)
         if self.solver.others is not None:
             window_s = self.solver.others.window_s
             self.past_median = self._keep(self.past_median, self.median, window_s)
@@ -181,7 +184,7 @@ class LagWindow:
             window_s = self.solver.exchange.window_s
             self.past_gain = self._keep(self.past_gain, self.gain, window_s)
         number = self.frames[0].number
-        self.placed_at = np.where(self._placed_bones[0], number, self.placed_at)
+        self.placed_at = np.where(np.asarray(self._placed_bones)[0], number, self.placed_at)
         del self.frames[0]
         del self.rigs[0]
         self.given = self.given.without_oldest()
@@ -191,7 +194,8 @@ class LagWindow:
         self.order = self.order[1:]
         self.seen = self.seen[1:]
         self.total = self.total[1:]
-        self.solved -= 1
+        self.residual = self.residual[1:]
+        self.squares = self.squares[1:]
 
     def _recover(self, body: RunningBody) -> None:
         """Begin anew with the joints that have lost their key points.
@@ -199,11 +203,12 @@ class LagWindow:
         In all frames of the window their views agree on other points, and more of them do.
         """
         limit = self.settings.trajectory.agree * body.scale
-        merit = (self.current.used / (1 + (self.residuals() / limit) ** 2)).sum(1)
-        worse = (self.alone.merit - merit).mean(0) > _LOST
+        merit = (self.current.used / (1 + (self.residual / limit) ** 2)).sum(1)
+        fit = merit.sum(0) / len(self)
+        alone = self.alone.merit.sum(0) / len(self)
         # the points of two views fit them whatever they are
-        told = (self.alone.merit.mean(0) > 2) | (merit.mean(0) < 1)
-        lost = worse & told
+        told = (alone > 2) | (fit < 1)
+        lost = (alone - fit > _LOST) & told
         if not lost.any() or len(self) < _LEAST_LOST:
             return
         self.points[:, lost] = self.alone.points[:, lost]
@@ -213,10 +218,6 @@ class LagWindow:
             if prior is not None and chosen.any():
                 self.prior[number] = prior.forget(chosen)
         self.refine(body)
-
-    def residuals(self) -> Float[Array, "K V J"]:
-        """Return the lengths of the residuals, mm at the body's depth."""
-        return self.current.residuals(self.points)
 
     def depth(self, place: int) -> Float[Array, "V J"]:
         """Return the depth of a frame's joints in each view, mm."""
@@ -238,7 +239,12 @@ class LagWindow:
         """Return what a frame, which has these residuals, tells of the person."""
         lengths = _lengths(self._across(self.points[place]))
         free = _lengths(self._across(self._alone(place)))
-        extent = self.frames[place].extent * self.depth(place).mean(1) / self.rigs[place].focal
+        extent = (
+            self.frames[place].extent
+            * self.depth(place).sum(1)
+            / len(self.as_given)
+            / self.rigs[place].focal
+        )
         known = np.sort(extent[np.isfinite(extent) & (extent > 0)])
         return Sample(
             residual=residual,
@@ -314,7 +320,8 @@ class LagWindow:
             self.groups_terms.append(terms)
             self.factored.append(found)
         self.points = points
-        self.solved = len(points)
+        self.residual = self.current.residuals(points)
+        self.squares = self._squares()
 
     def _exchange_sides(self, body: RunningBody) -> Float[Array, "K V J"]:
         """Decide anew in which views left and right are exchanged; return the residuals."""
@@ -325,7 +332,7 @@ class LagWindow:
         self.order = np.broadcast_to(self.as_given, given.used.shape)
         if exchange is None or not self.limbs:
             return residual
-        other = residual_lengths(given.rows[:, :, self.mirror], self.points[:, None])
+        other = residual_lengths(given.rows[..., self.mirror], self.points)
         both = given.used & given.used[..., self.mirror]
         loss = np.log1p((residual / body.scale) ** 2) - np.log1p((other / body.scale) ** 2)
         gain = np.where(both, loss, 0.0)
@@ -362,7 +369,7 @@ class LagWindow:
         """Return the precisions of second differences, mm^-2."""
         motion = self.settings.motion
         inner = max(len(self) - 2, 0)
-        square = np.concatenate((self.past_square, self._squares()))
+        square = np.concatenate((self.past_square, self.squares))
         deviation = np.full((inner, square.shape[1]), motion.first)
         if inner and len(square):
             sigma = motion.window_s * self.clock.rate_hz
@@ -372,14 +379,11 @@ class LagWindow:
         limited: Array = deviation.clip(motion.least, motion.most)
         return (limited * self.unit) ** -2.0
 
-    def _squares(self) -> Float[Array, "N J"]:
-        """Return the mean squares of the second differences of what is solved."""
-        solved = self.points[: self.solved]
-        if len(solved) < 3:
-            return np.zeros((0, solved.shape[1]))
-        second = solved[2:] - 2 * solved[1:-1] + solved[:-2]
-        mean: Array = (second * second).mean(-1)
-        return mean
+    def _squares(self) -> Float[Array, "K-2 J"]:
+        points = self.points
+        second = points[2:] - 2 * points[1:-1] + points[:-2]
+        square: Array = (second * second).sum(-1) / 3
+        return square
 
     def _across(self, points: Float[Array, "*K J 3"]) -> Float[Array, "*K B 3"]:
         start, end = self.ends
@@ -389,9 +393,8 @@ class LagWindow:
     def _near(self) -> Bool[Array, " B"]:
         """Return which bones count: both ends have been placed of late."""
         reach = round(self.solver.bones.reach_s * self.clock.rate_hz) * self.clock.step
-        lately = self.frames[0].number - self.placed_at <= reach
-        near: Array = lately | self._placed_bones.any(0)
-        return near
+        lately: Array = self.frames[0].number - self.placed_at <= reach
+        return lately | np.asarray(self._placed_bones.any(0))
 
     @property
     def _placed_bones(self) -> Bool[Array, "K B"]:
@@ -415,7 +418,7 @@ class LagWindow:
         pairs = np.linalg.solve(matrix[..., :3, :3] + ridge, -matrix[..., :3, 3:])[..., 0]
         both = used[one] & used[other]
         candidates = np.concatenate((predicted[None], pairs))
-        residual = residual_lengths(new.rows, candidates[:, None])
+        residual = residual_lengths(new.rows, candidates)
         limit = self.settings.trajectory.agree * body.scale
         fits = used & (rig.depth(candidates) > 0)
         merit = (fits / (1 + (residual / limit) ** 2)).sum(1)

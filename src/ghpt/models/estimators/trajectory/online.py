@@ -197,7 +197,7 @@ class OnlineStream:
 
     def _measure(self, window: LagWindow) -> RunningBody:
         """Measure the body anew, by the frames that are given and those of the window."""
-        residual = window.residuals()
+        residual = window.residual
         places = range(self.given, len(window))
         now = [window.sample(place, residual[place]) for place in places]
         samples = [*self.memory.samples, *now]
@@ -217,7 +217,7 @@ class OnlineStream:
 
     def _estimates(self, window: LagWindow, until: int) -> list[Estimate]:
         """Return the results of the first frames of the window that have not been given."""
-        residual = window.residuals()
+        residual = window.residual
         limit = self.settings.trajectory.agree * self._known_body.scale
         agrees = window.current.used & (residual <= limit)
         observed = agrees.sum(1) >= 2

@@ -68,8 +68,10 @@ def measure(samples: Sequence[Sample], trajectory: Trajectory) -> RunningBody:
     exponent = confidence_exponent(residual, confidence, used, LEAST_EXPONENT)
     exponent = min(exponent, trajectory.largest_exponent)
     weight = confidence_weights(confidence, exponent)
-    of_joints = [values.permute(1, 2, 0) for values in (residual, used, weight)]
-    scale = joint_noise(*of_joints, solver.noise)
+    order = (1, 2, 0)
+    scale = joint_noise(
+        residual.permute(order), used.permute(order), weight.permute(order), solver.noise
+    )
     extents = torch.tensor([sample.extent for sample in samples])
     return RunningBody(
         scale=scale.clamp(max=_LARGEST_NOISE).numpy(),

@@ -96,7 +96,8 @@ class Rig:
 class Stack:
     """The key points of K frames."""
 
-    rows: Float[Array, "K V J 2 4"]
+    rows: Float[Array, "4 2 K V J"]
+    """Residuals at the body's depth, mm, of a point (x, y, z, 1)."""
     gram: Float[Array, "K V J 4 4"]
     """Products of the two rows of each key point."""
     used: Bool[Array, "K V J"]
@@ -106,24 +107,25 @@ class Stack:
     def of(frame: Frame, rig: Rig) -> Stack:
         rows = rig.rows(frame.key_points)
         gram = np.swapaxes(rows, -1, -2) @ rows
-        return Stack(rows[None], gram[None], frame.used[None], frame.confidence[None])
+        rows = np.ascontiguousarray(rows.transpose(3, 2, 0, 1))[:, :, None]
+        return Stack(rows, gram[None], frame.used[None], frame.confidence[None])
 
     def join(self, other: Stack) -> Stack:
         """Return the frames of both."""
         return Stack(
-            np.concatenate((self.rows, other.rows)),
+            np.concatenate((self.rows, other.rows), axis=2),
             np.concatenate((self.gram, other.gram)),
             np.concatenate((self.used, other.used)),
             np.concatenate((self.confidence, other.confidence)),
         )
 
     def without_oldest(self) -> Stack:
-        return Stack(self.rows[1:], self.gram[1:], self.used[1:], self.confidence[1:])
+        return Stack(self.rows[:, :, 1:], self.gram[1:], self.used[1:], self.confidence[1:])
 
     def exchange(self, order: Int[Array, "K V J"]) -> Stack:
         """Return the same with each joint having the key point of another one of its view."""
         return Stack(
-            np.take_along_axis(self.rows, order[..., None, None], 2),
+            np.take_along_axis(self.rows, order[None, None], 4),
             np.take_along_axis(self.gram, order[..., None, None], 2),
             np.take_along_axis(self.used, order, 2),
             np.take_along_axis(self.confidence, order, 2),
@@ -131,14 +133,18 @@ class Stack:
 
     def residuals(self, points: Float[Array, "K J 3"]) -> Float[Array, "K V J"]:
         """Return the lengths of the residuals, mm."""
-        return residual_lengths(self.rows, points[:, None])
+        return residual_lengths(self.rows, points)
 
 
 def residual_lengths(
-    rows: Float[Array, "*P V J 2 4"], points: Float[Array, "*P V J 3"]
+    rows: Float[Array, "4 2 *P V J"], points: Float[Array, "*P J 3"]
 ) -> Float[Array, "*P V J"]:
-    value = np.einsum("...a,...a->...", rows[..., :3], points[..., None, :]) + rows[..., 3]
-    length: Array = np.sqrt(value[..., 0] ** 2 + value[..., 1] ** 2)
+    """Return the lengths of the residuals of points, mm."""
+    x = points[..., None, :, 0]
+    y = points[..., None, :, 1]
+    z = points[..., None, :, 2]
+    over, down = rows[0] * x + rows[1] * y + rows[2] * z + rows[3]
+    length: Array = np.sqrt(over * over + down * down)
     return length
 
 
