@@ -155,7 +155,7 @@ class Diagnostics:
             findings += self._geometry(case, case.rig)
             findings += self._proportions(case)
             findings += self._evidence(case)
-            findings += self._determined(case, case.rig, uncertainty)
+            findings += self._check_determined(case, case.rig, uncertainty)
         return (*findings, *self._repairs(case, findings))
 
     def _repairs(self, case: Case, findings: list[Finding]) -> Iterator[Finding]:
@@ -290,7 +290,7 @@ class Diagnostics:
                 needed=evidence.frames_for(self.rotation_wanted),
             )
 
-    def _determined(
+    def _check_determined(
         self, case: Case, rig: PlacedRig, uncertainty: Uncertainty
     ) -> Iterator[Finding]:
         """Yield what says that another rig would do as well."""

@@ -30,11 +30,11 @@ from ghpt.commands.display import as_started, until_reader_leaves
 from ghpt.commands.jobs import (
     Job,
     Program,
-    awaited,
     chosen_launcher,
     first_of_several_ends,
     is_first_process,
     own_command,
+    record_jobs,
     take_signals,
 )
 from ghpt.commands.outputs import Files, OutputFolder, SweepFolder
@@ -52,7 +52,7 @@ from ghpt.config import plain
 from ghpt.config import settings as typed_settings
 from ghpt.errors import GhptConfigError, GhptError, one_line, out_of_memory
 from ghpt.files import atomic_write
-from ghpt.signals import stopped_by_signals
+from ghpt.signals import stop_on_signals
 
 S = TypeVar("S")
 R = TypeVar("R")
@@ -97,7 +97,7 @@ class Command(Generic[S, R]):
     """Called after a sweep with all of its jobs, the failed ones included."""
 
 
-@stopped_by_signals()
+@stop_on_signals()
 def run(conf: Path, command: Command[Any, Any] | str) -> None:
     """Compose ``<conf>/<command.name>.yaml`` with ``sys.argv`` and call ``command.task``.
 
@@ -158,16 +158,16 @@ def _run(
     launcher = chosen_launcher(overrides, compose_only=bool(arguments.cfg))
     if sweep:
         sys.argv += _folder_names(overrides)
-    with SweepFolder.released():
+    with SweepFolder.release_after():
         try:
-            with awaited(ended) if launcher != "basic" else nullcontext():
+            with record_jobs(ended) if launcher != "basic" else nullcontext():
                 start()
         finally:
             if sweep and ended:
                 lines = [f"  {job.name}: {job.said}" for job in ended]
                 print("\n".join(["", "Jobs of the sweep:", *lines]))
         if sweep and ended:
-            after = job.loaded().after
+            after = job.load().after
             if after is not None:
                 after(ended)
 
@@ -264,7 +264,7 @@ class _Job:
     trace: bool
     ended: list[Job[Any, Any]]
 
-    def loaded(self) -> Command[Any, Any]:
+    def load(self) -> Command[Any, Any]:
         """Return the command, imported if it is given by its name."""
         return load(self.command, self.conf) if isinstance(self.command, str) else self.command
 
@@ -282,19 +282,19 @@ class _Job:
                 values = plain(config)
                 if self.sweep and values.get("resume") is False and not values.get("overwrite"):
                     values["resume"] = "auto"
-                command = self.loaded()
+                command = self.load()
                 _quieten()  # not before: the import of Lightning sets its levels anew
                 settings = typed_settings(command.settings, values)
                 files = command.files(settings)
                 folder = stack.enter_context(_output_folder(output, files, values))
-                before = folder.finished(values) if folder is not None and self.sweep else None
+                before = folder.read_summary(values) if folder is not None and self.sweep else None
                 if before is not None and not values.get("overwrite"):
                     said = f"{before} (finished before)"
                     failed = False
                 else:
                     stack.enter_context(_records(config, output))
                     stack.enter_context(self._as_command(values))
-                    with stopped_by_signals():
+                    with stop_on_signals():
                         result = command.task(settings, output)
                     said = command.summary(result) if self.sweep else ""
                     failed = False
