@@ -213,7 +213,7 @@ def test_a_shift_beyond_the_evidence_is_refused():
     good = case()
     evidence, setup = good.evidence, good.setup
     with pytest.raises(ValueError, match="beyond"):
-        RayCache(evidence).view(setup.changed(1, shift=3), 1)
+        RayCache(evidence).view(setup.replace_camera(1, shift=3), 1)
 
 
 def test_frames_that_are_left_out_are_gaps():
