@@ -24,9 +24,9 @@ from ghpt.commands.overrides import Source, check_overrides
 MAINS = {
     "train.py": (train.COMMAND, {"last.ckpt", "best.ckpt"}),
     "test.py": (testing.COMMAND, {"predictions.npz", "metrics.json", "report.md"}),
-    "predict.py": (predict.COMMAND, {"poses.npz", "report.md", "prediction.json"}),
-    "cameras.py": (camera_check.COMMAND, {"cameras.json", "report.md"}),
-    "calibrate.py": (calibrate.COMMAND, {"rig.toml", "calibration.json", "report.md"}),
+    "predict.py": (predict.COMMAND, {"poses.npz", "report.html", "prediction.json"}),
+    "cameras.py": (camera_check.COMMAND, {"cameras.json", "report.html"}),
+    "calibrate.py": (calibrate.COMMAND, {"rig.toml", "calibration.json", "report.html"}),
 }
 """What a script runs, and what its output folder then holds."""
 
@@ -58,6 +58,8 @@ PLACEHOLDERS = {
 }
 
 
+OWN_SCORERS = {"model=attending"}
+"""Models whose scorer has no layers to be made small."""
 SLOW = {"data=people", "data=random"}
 """Data sets that no override makes small; tests of their own run a part of them."""
 
@@ -116,6 +118,8 @@ class Page:
         if SLOW & set(words):
             return
         given = {word.split("=")[0] for word in words}
+        if OWN_SCORERS & set(words):
+            given.add("model.scorer.layers")
         more = SMALL[command.script] + (SMALL_PAIRS if "model=camera" in words else ())
         words += [word for word in more if word.split("=")[0] not in given]
         main, files = MAINS[command.script]

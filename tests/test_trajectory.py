@@ -152,6 +152,24 @@ def test_one_view_supports_a_joint_that_is_observed_near_by(predictor, batch, tr
     assert within > 1.5 * before
 
 
+def test_what_a_detector_guesses_with_little_confidence_spoils_nothing(predictor, batch, truth):
+    """Half of the views take an arm for another, at first these, then those."""
+    arm = [JOINT["left_elbow"], JOINT["left_wrist"]]
+    key_points = batch.key_points.clone()
+    confidence = torch.full_like(batch.confidence, 0.9)
+    half = slice(None, FRAMES // 2), slice(FRAMES // 2, None)
+    for frames, views in zip(half, ((0, 1), (2, 3)), strict=True):
+        for view in views:
+            key_points[frames, view, arm] += torch.tensor([120.0, 40.0])
+            confidence[frames, view, arm] = 0.1
+    guessed = replace(batch, key_points=key_points, confidence=confidence)
+    found = predict(predictor, Source(guessed))
+    seen = batch.valid & (confidence > 0.5)
+    assert error(found, truth, arm) < 2 * error(
+        predict(predictor, Source(replace(batch, valid=seen))), truth, arm
+    )
+
+
 def test_what_no_view_sees_is_missing(predictor, batch):
     wrist = JOINT["right_wrist"]
     gap = list(range(60, 72))

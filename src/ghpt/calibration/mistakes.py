@@ -440,18 +440,11 @@ FEW_FRAMES = Mistake(
     "record longer, with a person that several cameras see at a time",
     Severity.WARNING,
 )
-NO_MOTION = Mistake(
-    "little_motion",
-    "joints move by {value:.2g} of the person's size in the image: {count} frames are worth "
-    "little more than one",
-    "let the person walk through the whole volume",
-)
 LITTLE_MOTION = Mistake(
     "little_motion",
     "{used} frames are worth {independent:.0f} independent ones, and people turn by {turned:.0f} "
     "degrees: rotations are known to ± {value:.1f} degrees",
-    "let somebody walk through the whole volume and turn: ± {limit:g} takes about {needed} frames "
-    "like these, and fewer of more motion",
+    "let somebody walk through the whole volume and turn: {needed}",
     Severity.WARNING,
 )
 OUTSIDE_IMAGE = Mistake(

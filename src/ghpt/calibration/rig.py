@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ghpt.calibration.bundle import Adjusted, BundleAdjustment
 from ghpt.calibration.diagnostics import Case, Diagnostics, Joints
+from ghpt.calibration.error_model import ErrorModel
 from ghpt.calibration.findings import Finding, Severity
-from ghpt.calibration.independence import Evidence, turning
+from ghpt.calibration.independence import Evidence, persistence, turning
 from ghpt.calibration.mistakes import size_finding
 from ghpt.calibration.observations import (
     Correspondences,
@@ -121,7 +122,7 @@ class RigCalibration:
     sizes of the person in the image. ``seeds``: best-conditioned pairs that the rig is begun from
     in turn, until one places every linked view with a share of ``good`` inliers; the best is kept.
     ``rounds``: bundle adjustments, each with the noise of views and joints that the one before has
-    shown and points triangulated anew. ``blocks``: see ``uncertainty``.
+    shown and points triangulated anew. ``draws``: see ``uncertainty``.
     """
 
     frames: int
@@ -134,7 +135,7 @@ class RigCalibration:
     good: float
     bundle: BundleAdjustment
     rounds: int
-    blocks: int
+    draws: int
     diagnostics: Diagnostics
 
     def __post_init__(self) -> None:
@@ -147,7 +148,7 @@ class RigCalibration:
             good=self.good,
             rounds=self.rounds,
         )
-        check_positive(blocks=self.blocks)
+        check_positive(draws=self.draws)
 
     @torch.no_grad()
     def __call__(
@@ -196,15 +197,18 @@ class RigCalibration:
         evidence = None
         if adjusted is not None:
             facing = turning(shown.points, shown.estimated)
-            final = adjusted.final
-            spread = uncertainty(observed, adjusted.rig, final, self.blocks, facing.sector)
+            used = frame[frames].unique()
+            height = float(stature(shown.points, shown.estimated)) or 1.0
+            errors = ErrorModel.of(observed, adjusted.rig, used, facing.axes, height)
+            lasting = persistence(observed, adjusted.rig)
+            spread = uncertainty(errors, adjusted.rig, self.bundle.loss_scale, self.draws)
             evidence = Evidence(
                 frames=len(frame.unique()),
                 used=observed.frames,
-                independent=spread.persistence.independent,
+                independent=lasting.independent,
                 turned_deg=facing.degrees,
                 rotation_sd_deg=3**0.5 * float(_rotation_std_deg(spread.covariance).max()),
-                repeatability=spread.repeatability,
+                lasting=spread.lasting,
             )
         case = Case(
             names=tuple(names),

@@ -30,6 +30,7 @@ from ghpt.commands.display import as_started, until_reader_leaves
 from ghpt.commands.jobs import (
     Job,
     Program,
+    check_search,
     chosen_launcher,
     first_of_several_ends,
     is_first_process,
@@ -95,6 +96,8 @@ class Command(Generic[S, R]):
     """Says what the settings make it read and write."""
     after: Callable[[list[Job[S, R]]], object] | None = None
     """Called after a sweep with all of its jobs, the failed ones included."""
+    objective: Callable[[S, R], float] | None = None
+    """The number that a search over settings makes small or great."""
 
 
 @stop_on_signals()
@@ -139,6 +142,7 @@ def _run(
         print(f"ghpt {ghpt.__version__}")
         return
     arguments = parse_options(get_args_parser(), sys.argv[1:])
+    check_search(arguments.overrides, bool(arguments.multirun))
     source = _source(conf, name, arguments)
     sweep = bool(arguments.multirun)
     job = _Job(command, source.folder, _program(), os.getpid(), sweep, trace, ended)
@@ -283,7 +287,7 @@ class _Job:
                 if self.sweep and values.get("resume") is False and not values.get("overwrite"):
                     values["resume"] = "auto"
                 command = self.load()
-                _quieten()  # not before: the import of Lightning sets its levels anew
+                quieten()  # not before: the import of Lightning sets its levels anew
                 settings = typed_settings(command.settings, values)
                 files = command.files(settings)
                 folder = stack.enter_context(_output_folder(output, files, values))
@@ -315,8 +319,14 @@ class _Job:
                 if not elsewhere:
                     raise
             finally:
-                self.ended.append(Job(output.name, settings, result, said, failed))
+                objective = None if failed else self._objective(settings, result)
+                self.ended.append(Job(output.name, settings, result, said, failed, objective))
         return self.ended[-1]
+
+    def _objective(self, settings: Any, result: Any) -> float | None:
+        """Return what a search over settings looks at; None of a job that had finished before."""
+        measure = self.load().objective
+        return None if measure is None or result is None else measure(settings, result)
 
     def _as_command(self, values: dict[str, Any]) -> AbstractContextManager[None]:
         if not self.sweep:
@@ -371,7 +381,7 @@ def _folder_names(overrides: Sequence[Override]) -> list[str]:
     return [f"hydra.job.config.override_dirname.exclude_keys=[{fixed}]"]
 
 
-def _quieten() -> None:
+def quieten() -> None:
     """Leave out what Lightning says that its users can neither use nor act on."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)

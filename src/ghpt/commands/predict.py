@@ -29,6 +29,7 @@ from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
 from ghpt.commands.prediction.gaps import OWN, Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
+from ghpt.commands.prediction.page import PicturedPerson, limbs_of, write_page
 from ghpt.commands.prediction.pictures import write_pictures
 from ghpt.commands.prediction.report import report_document, summary_document, verdict_document
 from ghpt.commands.prediction.result import PersonSummary, PredictionResult
@@ -48,7 +49,7 @@ from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Chunks, Evidence, Scene, find_marker_set
-from ghpt.export.scene import origin_note
+from ghpt.export.scene import images_of, origin_note
 from ghpt.files import remove, sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Estimator
@@ -59,11 +60,14 @@ from ghpt.models.estimators.trajectory.predictor import TrajectoryPredictor
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, Reconstruction
+from ghpt.report.course import sample_course
+from ghpt.report.course_figure import ViewCourse
 from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NAMES
 from ghpt.report.terminal import print_document
 from ghpt.skeleton import Skeleton
 
+_REPORTS = ("prediction.json", "report.md", "report.html")
 SHARDS = ".shards"
 """The folder of the shards, within the output. It may be deleted: the next run then starts anew."""
 _OWN_FORMATS = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if name in WRITERS)
@@ -182,7 +186,7 @@ def files(settings: PredictSettings) -> Files:
     names = [WRITERS[name].file for name in settings.formats or _OWN_FORMATS]
     return Files(
         reads=input_paths(settings.ckpt, settings.cameras, settings.keypoints, root),
-        writes=(*names, "prediction.json", "report.md"),
+        writes=(*names, *_REPORTS),
         growing=(SHARDS,),
     )
 
@@ -200,25 +204,31 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     sequences = open_sequences(settings, setup.camera_check)
     sweep_temporaries(output)
     results: list[PredictionResult] = []
+    pictured: list[PicturedPerson] = []
     world: World | None = None
     for person, sequence in enumerate(sequences):
         folder = _person_folder(output, person)
         folder.mkdir(parents=True, exist_ok=True)
         shards = _person_folder(output / SHARDS, person)
-        result, world = _predict_person(settings, setup, sequence, world, folder, shards)
-        if result is not None:
-            results.append(_judge(settings, setup, sequence, result, person, output))
-    if not results:
+        found = _predict_person(settings, setup, sequence, world, folder, shards)
+        if found is not None:
+            world = found.world
+            results.append(_judge(settings, setup, sequence, found.result, person, output))
+            pictured.append(found.pictured)
+    if world is None:
         return None
     _remove_others(output, len(sequences))
     first = results[0]
-    if len(results) > 1 and world is not None:
-        scene = Scene(world.cameras(sequences[0].cameras.cameras))
+    cameras = world.cameras(sequences[0].cameras.cameras)
+    if len(results) > 1:
+        scene = Scene(cameras, images=images_of(sequences[0].cameras))
         folders = [_person_folder(output, person) for person in range(len(results))]
         write_pictures(output, folders, own_title(settings), first.formats, scene)
         first = replace(first, people=tuple(map(_about_person, results)))
     for person, result in enumerate([first, *results[1:]]):
-        _write_report(result, _person_folder(output, person))
+        folder = _person_folder(output, person)
+        write_page(folder, result, pictured[person], pictured, world, cameras)
+        _write_report(result, folder)
     verdict = first.verdict
     if settings.strict and verdict is not None and verdict.level != Level.GOOD:
         worst = verdict.findings[0]
@@ -257,12 +267,23 @@ def _person_folder(output: Path, person: int) -> Path:
 
 def _remove_others(output: Path, count: int) -> None:
     """Remove the files of people of an earlier run who are not among the ``count`` of this one."""
-    names = (*(writer.file for writer in WRITERS.values()), "prediction.json", "report.md")
+    names = (*(writer.file for writer in WRITERS.values()), *_REPORTS)
     for folder in output.glob("person_*"):
         number = folder.name.removeprefix("person_")
         if number.isdecimal() and int(number) >= count:
             for name in names:
                 remove(folder / name)
+
+
+@dataclass(frozen=True)
+class _Predicted:
+    """What became of a person."""
+
+    result: PredictionResult
+    """Without a verdict."""
+    world: World
+    """That of the files."""
+    pictured: PicturedPerson
 
 
 def _predict_person(
@@ -272,11 +293,11 @@ def _predict_person(
     world: World | None,
     output: Path,
     folder: Path,
-) -> tuple[PredictionResult | None, World | None]:
+) -> _Predicted | None:
     """Predict one person and write their poses into ``output``, with shards in ``folder``.
 
-    ``world`` is that of the files, None where it is to be chosen by this person. Returns what was
-    found, without a verdict, and the world; None twice in the processes beside the first.
+    ``world`` is that of the files, None where it is to be chosen by this person. Returns None in
+    the processes beside the first.
     """
     estimator = setup.estimator
     gaps = Gaps(
@@ -308,7 +329,7 @@ def _predict_person(
     weights = estimator.weights
     with predict_shards(sequence, predictor, weights, folder, key, how) as shards:
         if shards is None:
-            return None, None
+            return None
         with apply_gaps(gaps, shards, len(sequence.skeleton), output) as key_points:
             own = _map_chunks(key_points, joints)
             world = world or _choose_world(settings, sequence, about, own)
@@ -316,7 +337,8 @@ def _predict_person(
             _write_formats(settings, output, world, about, chunks, formats, sequence, shards)
             views = about.camera_names
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
-    evaluation = _evaluate(estimator, setup.compared, sequence, settings)
+            course = sample_course(chunks(), len(sequence), limbs_of(about.joints))
+    evaluation, view_course = _evaluate(estimator, setup.compared, sequence, settings)
     result = PredictionResult(
         data=sequence.title,
         source=sequence.source,
@@ -334,7 +356,7 @@ def _predict_person(
         world=world.numbers(),
         provenance=about.provenance,
     )
-    return result, world
+    return _Predicted(result, world, PicturedPerson(about, view_course, course))
 
 
 def _judge(
@@ -558,8 +580,10 @@ def _evaluate(
     compared: Mapping[str, Estimator],
     sequence: Sequence,
     settings: PredictSettings,
-) -> Evaluation:
-    """Return what the estimators are worth on the 17 joints, or on all key points without them."""
+) -> tuple[Evaluation, ViewCourse]:
+    """Return what the estimators are worth on the 17 joints, or on all key points without them, and
+    the held-out errors of the prediction's own over time.
+    """
     judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
     sample = judged.read(judged.spread(settings.fitted_frames))
     own = _fit(estimator, judged, settings)
@@ -651,7 +675,12 @@ def _write_formats(
     shards: Shards,
 ) -> None:
     cameras = world.cameras(sequence.cameras.cameras)
-    scene = Scene(cameras, lambda: _evidence(sequence, shards))
+    scene = Scene(
+        cameras,
+        evidence=lambda: _evidence(sequence, shards),
+        images=images_of(sequence.cameras),
+        key_point_joints=joints_of(settings, sequence.skeleton).key_point_joints,
+    )
     up = {"world_up": "z"} if world.name == "people" else {}
     given = {name: value for name, value in settings.trc.items() if value is not None}
     arguments: dict[str, dict[str, Any]] = {
@@ -683,7 +712,7 @@ def _write_report(result: PredictionResult, output: Path) -> None:
     print_document(summary_document(result))
     written = ", ".join(WRITERS[name].file for name in result.formats)
     _log.info("Written: %s and report.md in %s.", written, display_path(output))
-    print_document(verdict_document(result))
+    print_document(verdict_document(result, display_path(output / "report.html")))
 
 
 COMMAND = Command(

@@ -142,6 +142,7 @@ def measure(settings: TestSettings, output: Path) -> TestResult | None:
         "split": data.evaluate,
         "seed": settings.seed,
         "hypotheses": model.hypotheses,
+        "model": trained["config"]["model"],
         "provenance": origin,
     }
     baselines = problem.baselines(settings.estimators(), model)

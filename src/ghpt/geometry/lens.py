@@ -128,23 +128,20 @@ def _invert_lens(
 
     Newton's steps are kept within the radius ``limit``.
     """
-    tolerance = _CONVERGED * (1 + target.abs().amax(-1))
-    lens = lens.expand(*tolerance.shape, -1)
-    limit = limit.expand(tolerance.shape)
+    largest = target.abs().amax(-1)
+    tolerance = _CONVERGED * (1 + largest)
     point = _clamp_radius(target, limit)
-    remaining = torch.ones_like(tolerance, dtype=torch.bool)
+    converged = torch.zeros_like(largest, dtype=torch.bool)
     for _ in range(_STEPS):
-        # those that are done stay: the digits of a point must not depend on the points beside it
-        now = point[remaining]
-        distorted, jacobian = _apply_lens(now, lens[remaining])
-        error = distorted - target[remaining]
-        converged = error.abs().amax(-1) <= tolerance[remaining]
-        moved = _clamp_radius(now - jacobian.solve(error), limit[remaining])
-        point[remaining] = where(converged, now, moved)
-        remaining = remaining.masked_scatter(remaining, ~converged)
-        if not remaining.any():
+        distorted, jacobian = _apply_lens(point, lens)
+        error = distorted - target
+        converged = converged | (error.abs().amax(-1) <= tolerance)
+        if converged.all():
             break
-    return point, ~remaining
+        step = jacobian.solve(error)
+        # those that are done stay: the digits of a point must not depend on the points beside it
+        point = where(converged, point, _clamp_radius(point - step, limit))
+    return point, converged
 
 
 def _normalise(
@@ -192,7 +189,7 @@ class _Jacobian:
 
 def _apply_lens(
     point: Float[Tensor, "*B N 2"],
-    lens: Float[Tensor, "*B #N 8"],
+    lens: Float[Tensor, "*B 1 8"],
 ) -> tuple[Float[Tensor, "*B N 2"], _Jacobian]:
     """Return the distorted points and the Jacobian."""
     k1, k2, p1, p2, k3, k4, k5, k6 = lens.unbind(-1)
@@ -218,7 +215,7 @@ def _apply_lens(
 
 def _clamp_radius(
     point: Float[Tensor, "*B N 2"],
-    limit: Float[Tensor, "*B #N"],
+    limit: Float[Tensor, "*B 1"],
 ) -> Float[Tensor, "*B N 2"]:
     """Pull points back onto the circle of radius ``limit``, where the lens folds the image over."""
     radius = vector_norm(point, dim=-1)

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.calibration.check.agreement import Agreement, triangulate_choices
@@ -47,8 +47,11 @@ class CameraCheckResult:
     """The same as the files have it."""
     stature: float
     """Of the person, mm; 0 where it was not measured."""
-    unit_mm: float | None = None
+    unit_mm: float | None
     """The unit of the file, mm, where the file does not say it and the person tells."""
+    points: Float[Tensor, "F J 3"]
+    """The person before the cameras of ``setup``, mm."""
+    estimated: Bool[Tensor, "F J"]
 
 
 @dataclass(frozen=True)
@@ -129,7 +132,19 @@ class CameraCheck:
                 setup = replace(setup, t=wrong_size.value * setup.t)
                 height *= wrong_size.value
         error_px = pixels_of(cache, setup, search.now.error)
-        return CameraCheckResult(tuple(result), setup, error_px, given_px, height, unit_mm)
+        agrees = search.now.error < self.thresholds.level
+        used = search.now.core if bool(agrees.any()) else torch.ones_like(agrees)
+        points, known = triangulate_choices(cache.all(setup), setup, used[None], self.consensus)
+        return CameraCheckResult(
+            findings=tuple(result),
+            setup=setup,
+            error_px=error_px,
+            given_px=given_px,
+            stature=height,
+            unit_mm=unit_mm,
+            points=points[0],
+            estimated=known[0],
+        )
 
     def _partly_repaired(self, search: Search, findings: list[Finding]) -> set[int]:
         """Return the views that were repaired and are still worse than the others.

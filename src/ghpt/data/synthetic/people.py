@@ -127,7 +127,7 @@ def record_people(name: str, scene: Scene, detector: Detector, seed: int) -> Peo
     """
     rig = panoptic_rig(scene.cameras)
     truth = _keep_apart(_motions(name, scene, seed), scene.rate_hz)
-    truth = _y_down(truth)
+    truth = y_down(truth)
     present = _presence(scene)
     found = []
     for person in range(len(scene.people)):
@@ -205,7 +205,7 @@ def _keep_apart(points: Float[np.ndarray, "T P J 3"], rate_hz: float) -> np.ndar
     return points + np.concatenate([shift, np.zeros_like(shift[..., :1])], -1)[:, :, None]
 
 
-def _y_down(points: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
+def y_down(points: Float[np.ndarray, "*B 3"]) -> Float[np.ndarray, "*B 3"]:
     """Return points of a world with z up in Panoptic's, whose y points down."""
     x, y, z = np.moveaxis(points, -1, 0)
     return np.stack([x, -z, y], axis=-1)

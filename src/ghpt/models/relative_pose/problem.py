@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -214,8 +215,12 @@ class RelativePose(Problem):
     def baselines(
         self, settings: BaselineSettings, model: Any
     ) -> Mapping[str, Callable[[PairObservations], RelativePoseEstimate]]:
-        """Return the classical estimators."""
-        return build_installed(settings.camera_baselines, "camera_baselines")
+        """Return the other estimators; those that need the model have it."""
+        built = build_installed(settings.camera_baselines, "camera_baselines")
+        return {
+            name: one(model=model) if isinstance(one, partial) else one
+            for name, one in built.items()
+        }
 
     def from_baseline(
         self, estimate: RelativePoseEstimate, observations: PairObservations

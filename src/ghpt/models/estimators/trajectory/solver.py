@@ -265,7 +265,8 @@ class _Rounds:
         """Return the directions and the lengths of the bones."""
         start, end = self.ends
         across = points[:, start] - points[:, end]
-        length = torch.linalg.vector_norm(across, dim=0)
+        x, y, z = across
+        length = torch.addcmul(torch.addcmul(x * x, y, y), z, z).sqrt_()
         return across / length.clamp(min=1e-9), length
 
     def _measure(
@@ -281,10 +282,15 @@ class _Rounds:
     def _noise(self, residual: Float[Tensor, "V J T"]) -> Float[Tensor, " J"]:
         """Return the deviation of each joint's key points, mm.
 
-        That of a joint that nobody sees is the median joint's.
+        It is told by the median that the weights make: what a detector guesses, with little
+        confidence, says nothing of the others. That of a joint that nobody sees is the median
+        joint's.
         """
-        measured = torch.where(self.rows.used, residual, torch.nan)
-        median = measured.transpose(0, 1).flatten(1).nanmedian(-1).values
+        measured = self.rows.used & residual.isfinite()
+        median = _weighted_median(
+            torch.where(measured, residual, torch.inf).transpose(0, 1).flatten(1),
+            torch.where(measured, self.weight, 0.0).transpose(0, 1).flatten(1),
+        )
         typical = median.nanmedian()
         median = torch.where(median.isnan(), typical, median).nan_to_num(1.0)
         return self.solver.noise * (median / _MEDIAN_LENGTH).clamp(min=_LEAST_NOISE)
@@ -292,3 +298,15 @@ class _Rounds:
 
 _LEAST_NOISE = 1.0
 """mm. No detector is better; key points without any error would leave time and bones no say."""
+
+
+def _weighted_median(
+    values: Float[Tensor, "J N"], weights: Float[Tensor, "J N"]
+) -> Float[Tensor, " J"]:
+    """Return the least value up to which lies half of the weight; NaN where there is none."""
+    ordered, order = values.sort(dim=-1)
+    below = weights.gather(-1, order).cumsum(-1)
+    total = below[:, -1:]
+    at = (below < total / 2).sum(-1, keepdim=True)
+    median = ordered.gather(-1, at)
+    return torch.where(total > 0, median, torch.nan)[:, 0]
