@@ -95,6 +95,8 @@ _log = logging.getLogger(__name__)
 
 TRAJECTORY = "trajectory"
 """The estimator of all frames together."""
+ONLINE = "online"
+"""The same while they are recorded."""
 _ALIASES = {"frame": "adaptive_ransac"}
 """Other names of baselines."""
 
@@ -106,6 +108,7 @@ class PredictorSettings:
     classical: Target
     learned: Target
     trajectory: Target
+    online: Target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +121,7 @@ class PredictSettings(InputSettings):
     trust: list[str]
     hypotheses: int | None
     estimator: str
+    lag: float
     fill: int | str | None
     interpolation: str | None
     smooth: float | None
@@ -152,7 +156,7 @@ class PredictSettings(InputSettings):
             count = getattr(self, name)
             check(count >= 1, name, f"is {count}", "Give 1 or more.")
         if not self.ckpt:
-            names = (TRAJECTORY, *_ALIASES, *self.baselines)
+            names = (TRAJECTORY, ONLINE, *_ALIASES, *self.baselines)
             _check_exists("estimator", self.estimator, dict.fromkeys(names))
         for name in self.compare:
             _check_exists("compare", name, self.baselines)
@@ -306,7 +310,7 @@ def _predict_person(
         cut_off_hz=settings.smooth,
         rate_hz=sequence.rate_hz,
     )
-    if settings.smooth and estimator.name == TRAJECTORY:
+    if settings.smooth and estimator.name in (TRAJECTORY, ONLINE):
         _log.info("smooth: a trajectory is smooth already; it is filtered once more.")
     joints = joints_of(settings, sequence.skeleton)
     about = _about(sequence, joints, estimator, gaps, setup.origin)
@@ -413,7 +417,14 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
         return _learned_estimator(settings, settings.ckpt)
     name = _ALIASES.get(settings.estimator, settings.estimator)
     if name == TRAJECTORY:
-        return _trajectory(settings)
+        text = "the trajectory of the whole recording (no ckpt was given)"
+        group = _with_exchange(settings, settings.predictor.trajectory)
+        return _trajectory(settings, TRAJECTORY, text, group)
+    if name == ONLINE:
+        text = f"the trajectory with a lag of {settings.lag:g} s (no ckpt was given)"
+        online = dict(settings.predictor.online)
+        own = _with_exchange(settings, online["settings"]) | {"lag_s": settings.lag}
+        return _trajectory(settings, ONLINE, text, online | {"settings": own})
     group = _with_flips(settings, settings.predictor.classical)
     baseline = settings.baselines[name]
     factory = build(group, "predictor.classical")
@@ -430,18 +441,23 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
     )
 
 
-def _trajectory(settings: PredictSettings) -> PoseEstimator:
-    group = dict(settings.predictor.trajectory)
-    if not settings.flips:
-        trajectory = dict(group["trajectory"])
-        group["trajectory"] = trajectory | {
-            "solver": dict(trajectory["solver"]) | {"exchange": None}
-        }
+def _with_exchange(settings: PredictSettings, group: Target) -> dict[str, Any]:
+    """Return what holds a trajectory, without exchanged sides if none are looked for."""
+    if settings.flips:
+        return dict(group)
+    trajectory = dict(group["trajectory"])
+    solver = dict(trajectory["solver"]) | {"exchange": None}
+    return dict(group) | {"trajectory": trajectory | {"solver": solver}}
+
+
+def _trajectory(
+    settings: PredictSettings, name: str, text: str, group: dict[str, Any]
+) -> PoseEstimator:
     flips: LeftRightFlips | None = build(settings.predictor.classical["flips"], "flips")
     return PoseEstimator(
-        name=TRAJECTORY,
-        text="the trajectory of the whole recording (no ckpt was given)",
-        predictor=build(group, "predictor.trajectory"),
+        name=name,
+        text=text,
+        predictor=build(group, f"predictor.{name}"),
         flips=flips if settings.flips else None,
         weights=None,
         identity=group,
