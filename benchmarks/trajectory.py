@@ -286,9 +286,9 @@ def main() -> None:
             start = time.process_time()
             first = frame(batch)
             alone.add(first, one, time.process_time() - start)
-            fitted = trajectory.at_rate(batch, one.rate_hz).fitted(batch)
+            fitted = trajectory.at_rate(batch, one.rate_hz).fit_to(batch)
             if condition == "as it is":
-                fitted = fitted.calibrated(batch)
+                fitted = fitted.calibrate(batch)
             start = time.process_time()
             found = fitted.complete(batch)
             whole.add(found, one, time.process_time() - start)

@@ -146,7 +146,7 @@ class PredictSettings(InputSettings):
     strict: bool
     seed: int
 
-    def changed(self) -> dict[str, object]:
+    def non_defaults(self) -> dict[str, object]:
         """Return what says whose joints are written how, where it is not the default."""
         values = {name: getattr(self, name) for name in _DEFAULTS}
         return {name: value for name, value in values.items() if value != _DEFAULTS[name]}
@@ -217,7 +217,7 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         found = _predict_person(settings, setup, sequence, world, folder, shards)
         if found is not None:
             world = found.world
-            results.append(_judged(settings, setup, sequence, found.result, person, output))
+            results.append(_judge(settings, setup, sequence, found.result, person, output))
             pictured.append(found.pictured)
     if world is None:
         return None
@@ -325,7 +325,7 @@ def _predict_person(
         len(about.camera_names),
         estimator.text,
     )
-    predictor = _fitted(estimator, sequence, settings)
+    predictor = _fit(estimator, sequence, settings)
     key = _shard_key(sequence, estimator, setup.origin)
     how = RunSettings(
         settings.shard_frames, settings.batch, settings.progress_bar, settings.trainer
@@ -335,9 +335,9 @@ def _predict_person(
         if shards is None:
             return None
         with apply_gaps(gaps, shards, len(sequence.skeleton), output) as key_points:
-            own = _mapped(key_points, joints)
+            own = _map_chunks(key_points, joints)
             world = world or _choose_world(settings, sequence, about, own)
-            chunks = _mapped(own, world.reconstruction)
+            chunks = _map_chunks(own, world.reconstruction)
             _write_formats(settings, output, world, about, chunks, formats, sequence, shards)
             views = about.camera_names
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
@@ -363,7 +363,7 @@ def _predict_person(
     return _Predicted(result, world, PicturedPerson(about, view_course, course))
 
 
-def _judged(
+def _judge(
     settings: PredictSettings,
     setup: _Setup,
     sequence: Sequence,
@@ -375,7 +375,7 @@ def _judged(
     measures = _measures(result)
     asked = not person and setup.camera_check.is_worthwhile(measures.view_errors)
     mistakes = check_cameras(sequence.as_joints(), setup.camera_check) if asked else ()
-    own = settings.changed() | ({"person": person} if person else {})
+    own = settings.non_defaults() | ({"person": person} if person else {})
     commands = commands_on(settings, own, output)
     verdict = setup.judge(measures, mistakes, result.unit_mm, commands)
     return replace(result, verdict=verdict)
@@ -568,7 +568,7 @@ def _interpolation(estimator: PoseEstimator) -> str:
     return OWN if estimator.name == TRAJECTORY else "pchip"
 
 
-def _mapped(chunks: Chunks, function: Callable[[Reconstruction], Reconstruction]) -> Chunks:
+def _map_chunks(chunks: Chunks, function: Callable[[Reconstruction], Reconstruction]) -> Chunks:
     return lambda: map(function, chunks())
 
 
@@ -585,7 +585,7 @@ def joints_of(settings: PredictSettings, skeleton: Skeleton) -> JointMeans:
     return human_joints(skeleton) if settings.joints == "human36m" else all_joints(skeleton)
 
 
-def _fitted(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:
+def _fit(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:
     """Return the predictor for a sequence's key points, with what they tell of the recording."""
     predictor = estimator.predictor.for_skeleton(sequence.skeleton)
     return predictor.fit(sequence, settings.fitted_frames)
@@ -602,10 +602,10 @@ def _evaluate(
     """
     judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
     sample = judged.read(judged.spread(settings.fitted_frames))
-    own = _fitted(estimator, judged, settings)
+    own = _fit(estimator, judged, settings)
     estimates: dict[str, Estimate] = {estimator.name: own.estimate}
     for name, other in compared.items():
-        estimates.setdefault(name, other.fitted(sample))
+        estimates.setdefault(name, other.fit_to(sample))
     flips = estimator.flips and estimator.flips.for_skeleton(judged.skeleton)
     test_halves = None
     if isinstance(own, TrajectoryPredictor):

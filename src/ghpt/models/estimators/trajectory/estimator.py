@@ -123,7 +123,7 @@ class Trajectory:
         clock = Clock.of_frames(batch.index.numpy(), rate_hz, self.longest_gap_s)
         return replace(self, clock=clock)
 
-    def fitted(self, batch: Observations) -> Trajectory:
+    def fit_to(self, batch: Observations) -> Trajectory:
         """Return the same with the body that these frames show, and the worth of confidences.
 
         They are of one recording, in the order of time; there may be gaps between them.
@@ -131,7 +131,7 @@ class Trajectory:
         first = self.start(batch)
         size = body_size(first)
         if size != self.size:
-            return replace(self, size=size).fitted(batch)
+            return replace(self, size=size).fit_to(batch)
         plain = replace(self, exponent=0.0)
         found = plain.solve(batch, first)
         exchanged = found.exchanged
@@ -144,7 +144,7 @@ class Trajectory:
         frames, _ = weighted._frames(_resize(batch, 1 / size), _resize_poses(first, 1 / size))
         return replace(weighted, body=self.solver(frames, self.skeleton).body)
 
-    def calibrated(self, batch: Observations) -> Trajectory:
+    def calibrate(self, batch: Observations) -> Trajectory:
         """Return the same with the inflation of the covariances that these frames show."""
         views = int(batch.valid.any(-1).any(0).sum())
         prior = replace(self, inflation=self.inflation * LEAST_VIEWS / max(views, 2))

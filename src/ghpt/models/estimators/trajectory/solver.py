@@ -184,7 +184,7 @@ class _Rounds:
         if self.given is None:
             self.body = self._measure(self.points, residual)
         if adapt:
-            self.deviation = solver.motion.adapted(self.points, frames.axis)
+            self.deviation = solver.motion.adapt(self.points, frames.axis)
         scale = self.body.scale[:, None]
         relative = residual / scale
         robust = (1 + (relative / kernel).square()).square().reciprocal()
