@@ -1,12 +1,12 @@
 """Triangulation of whole recordings beside its peers: ``python benchmarks/recordings.py``.
 
-Two tables of the same key points and cameras for all. Synthetic Human3.6M, 320 frames of each take
-(the conditions are those of ``trajectory.py``): the mean error of the joints that a method
-estimates, and of the joints that all of them do, mm; and the share that it estimates, because who
-leaves the hard joints out has a smaller error. Real recordings of ``folder=`` (Pose2Sim's demo and
-caliscope's, 17 joints), which have no truth: each view is left out in turn, and the joints of the other views
-are projected into it; the median distance from its key points, pixels, and the share of its key
-points that get one. The cameras are the file's.
+The key points and cameras are the same for all. Synthetic Human3.6M, 320 frames of each take (the
+conditions are those of ``trajectory.py``): the mean error of the joints that a method estimates,
+and of the joints that all of them do, mm; and the share that it estimates, because who leaves the
+hard joints out has a smaller error. Real recordings of ``folder=`` (Pose2Sim's demo and
+caliscope's, 17 joints), which have no truth: each view is left out in turn, and the joints of the
+other views are projected into it; the median distance from its key points, pixels, and the share of
+its key points that get one. The cameras are the file's.
 
 aniposelib is the PyTorch one, and is left out where it is not installed. Pose2Sim's method is
 written anew from its publication, without the exchange of sides (off by default there).
