@@ -26,7 +26,7 @@ NAMES = {
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
     "view_weights": "view weights",
     "trajectory": "trajectory",
-    "frame_learned": "key-point weights",
+    "frame_learned": "learned frames",
     "weighted_linear": "weighted linear",
     "ransac": "RANSAC",
     "adaptive_ransac": "adaptive RANSAC",
