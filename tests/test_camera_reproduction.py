@@ -10,7 +10,7 @@ import pytest
 
 import real_layout as layout
 from ghpt.files import write_json
-from ghpt.paper.camera.tables import ARTEFACTS, Shape
+from ghpt.paper.camera.tables import ARTEFACTS, METHODS, Shape
 from ghpt.paper.engine.artefact import Artefact, Results, Section
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task, perform, read_json, with_dependencies
@@ -191,13 +191,12 @@ def metrics(e3d: dict[str, float | None], alone: tuple[float, float]) -> dict[st
         for pair, x in e3d.items()
     }
     worse = {pair: numbers | {"E_3D": 100.0} for pair, numbers in pairs.items()}
-    names = ("average", "best", "ransac", "usac_magsac", "usac_accurate", "poselib", "rig")
+    names = [*METHODS, "best"]
     return {
         "draws": 1,
         "selections": {
-            "weight": {"pairs": pairs},
             "eight_point": {"pairs": worse},
-            **{name: {"pairs": pairs} for name in names},
+            **{name: {"pairs": pairs} for name in names if name != "eight_point"},
         },
     }
 

@@ -96,11 +96,13 @@ def test_every_test_configuration_builds(data):
     ]
     assert sorted(build(config["camera_baselines"], "camera_baselines")) == [
         "eight_point",
+        "five_point",
         "poselib",
         "ransac",
         "rig",
         "usac_accurate",
         "usac_magsac",
+        "weight_refined",
     ]
 
 

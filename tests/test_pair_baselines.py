@@ -10,12 +10,15 @@ from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.metrics.relative_pose import rotation_deg, translation_deg
 from ghpt.models.relative_pose.baselines import (
     EightPoint,
+    FivePoint,
     PoseLib,
     Ransac,
+    Refined,
     Usac,
     _distinct,
     size_in_image,
 )
+from ghpt.models.relative_pose.refinement import PoseRefinement
 from ghpt.observations import Labelled, PairObservations, RelativePoseEstimate
 from ghpt.randomness import key, uniform
 from scenes import labelled_pairs, random_scene
@@ -29,6 +32,10 @@ ROBUST = {
         method="USAC_ACCURATE", threshold=0.02, pixels=200.0, confidence=0.999, iterations=1000
     ),
     "poselib": PoseLib(threshold=0.02, loss="CAUCHY", scale=0.01, iterations=1000, seed=0),
+    "five_point": Refined(
+        FivePoint(samples=100, threshold=0.02, seed=0),
+        PoseRefinement(kernel=4.0, trim=4.0, rounds=12),
+    ),
 }
 ALL = {"eight_point": EightPoint(), **ROBUST}
 each = pytest.mark.parametrize("baseline", ALL.values(), ids=ALL.keys())

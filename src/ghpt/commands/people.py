@@ -15,6 +15,7 @@ from ghpt.commands.trainer import make_trainer, progress
 from ghpt.config import Target, build
 from ghpt.data.datasets.people import People
 from ghpt.errors import GhptConfigError, check
+from ghpt.extras import build_installed
 from ghpt.files import write_json
 from ghpt.models.people import PeopleScores, PeopleTriangulation, SceneScores
 from ghpt.provenance import provenance
@@ -89,9 +90,7 @@ def test_people(
         hint = "Leave ckpt out: the classical estimators are tested."
         raise GhptConfigError("ckpt", "is not for several people", hint)
     check(len(baselines) > 0, "baselines", "is empty", "Leave one in.")
-    estimators = {
-        name: build(baseline, f"baselines.{name}") for name, baseline in baselines.items()
-    }
+    estimators = build_installed(baselines, "baselines")
     recordings = build(data, "data")
     module = PeopleTriangulation(estimators)
     run = make_trainer(

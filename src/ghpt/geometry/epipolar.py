@@ -101,7 +101,7 @@ def _hartley(
     return centred * scale[..., None, None], T
 
 
-def _correspondence_rows(
+def correspondence_rows(
     a: Float[Tensor, "*B N d"],
     b: Float[Tensor, "*B N d"],
 ) -> Float[Tensor, "*B N d*d"]:
@@ -128,7 +128,7 @@ def eight_point(
     safe_b = where(used, b, 0.0).double()
     normalised_a, Ta = _hartley(safe_a, weights)
     normalised_b, Tb = _hartley(safe_b, weights)
-    rows = _correspondence_rows(homogeneous(normalised_a), homogeneous(normalised_b))
+    rows = correspondence_rows(homogeneous(normalised_a), homogeneous(normalised_b))
     normal = rows.mT @ (weights[..., None] * rows)
     return _solve_essential(normal, used.sum(-1), Ta, Tb)
 
@@ -147,7 +147,7 @@ def eight_point_subsets(
     used_by_any = (weights > 0).any(-2).double()
     normalised_a, Ta = _hartley(a.double(), used_by_any)
     normalised_b, Tb = _hartley(b.double(), used_by_any)
-    rows = _correspondence_rows(homogeneous(normalised_a), homogeneous(normalised_b))
+    rows = correspondence_rows(homogeneous(normalised_a), homogeneous(normalised_b))
     i, j = torch.triu_indices(9, 9, device=rows.device)
     upper = weights @ (rows[..., i] * rows[..., j])
     shape = (*weights.shape[:-1], 9, 9)
@@ -322,7 +322,7 @@ def _count_in_front(
     """
     fa = _unit_rays(a)
     fb = _unit_rays(b)
-    pairs = _correspondence_rows(fa, fb).mT
+    pairs = correspondence_rows(fa, fb).mT
     R_rows = R.flatten(-2).flatten(-3, -2)
     uv = (R_rows @ pairs).unflatten(-2, (-1, 2))
     t_in_a = apply(R.mT, t)
@@ -354,7 +354,7 @@ def ray_distances(
     f_b|: two products of matrices for all poses and points. Rays closer than 1e-6 rad to parallel
     have no well-defined distance and get at most 1.
     """
-    pairs = _correspondence_rows(_unit_rays(a), _unit_rays(b)).mT
+    pairs = correspondence_rows(_unit_rays(a), _unit_rays(b)).mT
     E = essential(R, t)
     numerator = (E.flatten(-2) @ pairs).abs()
     cosine = R.flatten(-2) @ pairs
@@ -377,13 +377,32 @@ def sampson_error(
     return residual.abs() / gradient.clamp_min(tiny).sqrt()
 
 
+def sampson_jacobian(
+    E: Float[Tensor, "*B 3 3"],
+    a: Float[Tensor, "*B N 3"],
+    b: Float[Tensor, "*B N 3"],
+) -> tuple[Float[Tensor, "*B N"], Float[Tensor, "*B N 9"]]:
+    """Return signed Sampson distances of homogeneous points, and their derivatives by vec(E)."""
+    tiny = torch.finfo(E.dtype).tiny
+    lines_a = a @ E.mT
+    lines_b = b @ E
+    residual = (b * lines_a).sum(-1)
+    normals_a = torch.cat((lines_a[..., :2], torch.zeros_like(lines_a[..., :1])), dim=-1)
+    normals_b = torch.cat((lines_b[..., :2], torch.zeros_like(lines_b[..., :1])), dim=-1)
+    gradient = (normals_a.square() + normals_b.square()).sum(-1).clamp_min(tiny)
+    distance = residual / gradient.sqrt()
+    of_residual = correspondence_rows(a, b) / gradient.sqrt()[..., None]
+    of_gradient = correspondence_rows(a, normals_a) + correspondence_rows(normals_b, b)
+    return distance, of_residual - (distance / gradient)[..., None] * of_gradient
+
+
 def _sampson_terms(
     E: Float[Tensor, "*B H 3 3"],
     a: Float[Tensor, "*B N 3"],
     b: Float[Tensor, "*B N 3"],
 ) -> tuple[Float[Tensor, "*B H N"], Float[Tensor, "*B H N"]]:
     """Return the residual b^T E a and its squared gradient in image coordinates."""
-    residual = E.flatten(-2) @ _correspondence_rows(a, b).mT
+    residual = E.flatten(-2) @ correspondence_rows(a, b).mT
     square_a = _square_line_normals(E, a)
     square_b = _square_line_normals(E.mT, b)
     return residual, square_a + square_b

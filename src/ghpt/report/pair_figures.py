@@ -38,6 +38,7 @@ METHOD_STYLES = {
     "usac_magsac": MethodStyle("#009E73", (0, (1, 1)), "^"),
     "usac_accurate": MethodStyle("#999999", (0, (5, 1, 1, 1)), "<"),
     "poselib": MethodStyle("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"),
+    "five_point": MethodStyle("#332288", (0, (2, 2)), "p"),
     "rig": MethodStyle("#000000", (0, (6, 2)), "X"),
 }
 OTHER_STYLE = MethodStyle("#F0E442", ":", "*")

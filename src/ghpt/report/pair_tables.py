@@ -19,6 +19,8 @@ NAMES = {
     "usac_magsac": "USAC_MAGSAC",
     "usac_accurate": "USAC_ACCURATE",
     "poselib": "PoseLib",
+    "five_point": "5-point, refined",
+    "weight_refined": "weight, refined",
     "rig": "rig (all views)",
 }
 """What people call a row, where it is not its name in metrics.json."""

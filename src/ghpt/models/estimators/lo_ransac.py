@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.colmap import pycolmap
 from ghpt.errors import check_positive
+from ghpt.extras import check_installed
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation, triangulate
@@ -36,6 +37,7 @@ class LoRansac(ConfidenceWeighted):
     seed: int
 
     def __post_init__(self) -> None:
+        check_installed("pycolmap", "LO-RANSAC")
         check_positive(threshold=self.threshold)
 
     def inlier_threshold(
@@ -62,6 +64,8 @@ class LoRansac(ConfidenceWeighted):
         key_points: Float[np.ndarray, "B V J 2"],
         valid: Bool[np.ndarray, "B V J"],
     ) -> Bool[Tensor, "B V J"]:
+        from ghpt.colmap import pycolmap
+
         options = pycolmap.EstimateTriangulationOptions()
         options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
         options.ransac.max_error = self.threshold
@@ -87,8 +91,10 @@ class LoRansac(ConfidenceWeighted):
 
 def pycolmap_cameras(
     cameras: Cameras, valid: Bool[np.ndarray, " V"]
-) -> tuple[dict[int, pycolmap.Camera], dict[int, pycolmap.Rigid3d]]:
-    """Return the intrinsics and poses of the valid cameras by view: pycolmap refuses others."""
+) -> tuple[dict[int, Any], dict[int, Any]]:
+    """Return pycolmap's Camera and Rigid3d of each valid view: it refuses others."""
+    from ghpt.colmap import pycolmap
+
     K = cameras.K.numpy()
     intrinsics = {}
     poses = {}

@@ -13,6 +13,7 @@ from torch import Tensor
 from ghpt.config import build
 from ghpt.data.datasets.frames import Frames
 from ghpt.errors import check
+from ghpt.extras import build_installed
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.metrics.pose_error import joint_errors
@@ -76,7 +77,7 @@ class PoseProblem(Problem):
         others: dict[str, Callable[[Observations], PoseEstimate]] = {}
         if settings.trajectory:
             others["trajectory"] = build(settings.trajectory, "trajectory")
-        return others | build(settings.baselines, "baselines")
+        return others | build_installed(settings.baselines, "baselines")
 
     def record(self, batch: Labelled[Observations, Truth], dataset: Frames) -> PoseSample:
         """Return the frames' true poses, recordings and numbers."""

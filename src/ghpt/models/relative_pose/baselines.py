@@ -12,7 +12,6 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import poselib
 import torch
@@ -20,8 +19,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.errors import check, check_positive
+from ghpt.extras import check_installed
 from ghpt.geometry.epipolar import MINIMUM, eight_point, pose_in_front, sampson_error
+from ghpt.geometry.five_point import SAMPLE, five_point
 from ghpt.models.estimators.classical import person_scale
+from ghpt.models.module import StochasticEstimator
+from ghpt.models.relative_pose.refinement import PoseRefinement
 from ghpt.observations import PairObservations, RelativePoseEstimate
 from ghpt.randomness import key, uniform
 
@@ -134,12 +137,48 @@ class Ransac(Robust):
         chosen = _distinct(uniform(keys, (self.samples, MINIMUM)), len(a))
         ones = torch.ones(chosen.shape, dtype=a.dtype, device=a.device)
         E, ok = eight_point(a[chosen], b[chosen], ones)
-        error = sampson_error(E, a, b) / (self.threshold * pair.size)
-        gain = (1 - error.square()).clamp_min(0).sum(-1)
-        score = torch.where(ok, gain, -1.0)
-        best = score.argmax()
-        inlier = error[best] <= 1
+        best, inlier = _best_essential(E, ok, pair, self.threshold)
         return linear_pose(a, b, inlier)[0] if ok[best] else None
+
+
+@dataclass(frozen=True)
+class FivePoint(Robust):
+    """RANSAC with the 5-point algorithm.
+
+    Of the essential matrices of ``samples`` random minimal samples it takes the one with the least
+    truncated squared error (MSAC). ``threshold``, ``seed``: as of ``Ransac``.
+    """
+
+    samples: int
+    threshold: float
+    seed: int
+
+    def __post_init__(self) -> None:
+        check_positive(samples=self.samples, threshold=self.threshold)
+
+    def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        keys = key(self.seed, "pair five-point", pair.index, device=pair.a.device)
+        chosen = _distinct(uniform(keys, (self.samples, SAMPLE)), len(pair.a))
+        solutions, exists = five_point(pair.a[chosen], pair.b[chosen])
+        E = solutions[exists]
+        if not len(E):
+            return None
+        all_of_them = torch.ones(len(E), dtype=torch.bool, device=E.device)
+        best, inlier = _best_essential(E, all_of_them, pair, self.threshold)
+        R, t, ok = pose_in_front(E[best], pair.a, pair.b, inlier)
+        return RelativePoseEstimate(R, t, ok)
+
+
+@dataclass(frozen=True)
+class Refined(PairBaseline):
+    """Another estimator's pose, refined to the most likely one of all correspondences."""
+
+    estimator: PairBaseline
+    refinement: PoseRefinement
+
+    @torch.no_grad()
+    def __call__(self, batch: PairObservations) -> RelativePoseEstimate:
+        return self.refinement(self.estimator(batch), batch)
 
 
 @dataclass(frozen=True)
@@ -160,6 +199,9 @@ class Usac(Robust):
     iterations: int
 
     def __post_init__(self) -> None:
+        check_installed("cv2", self.method)
+        import cv2
+
         known = [name for name in dir(cv2) if name.startswith("USAC_")]
         hint = f"Choose from {', '.join(known)}."
         check(self.method in known, "method", f"is {self.method!r}", hint)
@@ -168,6 +210,8 @@ class Usac(Robust):
         check(possible, "confidence", f"is {self.confidence}", "It must be between 0 and 1.")
 
     def pose(self, pair: Correspondences) -> RelativePoseEstimate | None:
+        import cv2
+
         focal = self.pixels / pair.size
         x = (focal * pair.a).cpu().numpy()
         y = (focal * pair.b).cpu().numpy()
@@ -228,6 +272,28 @@ class PoseLib(Robust):
         if info["num_inliers"] < MINIMUM or not determined:
             return None
         return RelativePoseEstimate(torch.tensor(found.R), t / t.norm(), torch.tensor(True))
+
+
+@dataclass(frozen=True)
+class RefinedSelection(PairBaseline):
+    """The weighted estimate of a model, refined to the most likely one of all correspondences."""
+
+    model: StochasticEstimator
+    refinement: PoseRefinement
+
+    @torch.no_grad()
+    def __call__(self, batch: PairObservations) -> RelativePoseEstimate:
+        return self.refinement(self.model.sample(batch, "test").estimate("weight"), batch)
+
+
+def _best_essential(
+    E: Float[Tensor, "S 3 3"], ok: Bool[Tensor, " S"], pair: Correspondences, threshold: float
+) -> tuple[Int[Tensor, ""], Bool[Tensor, " N"]]:
+    """Return the essential matrix with the least truncated squared error, and its inliers."""
+    error = sampson_error(E, pair.a, pair.b) / (threshold * pair.size)
+    gain = (1 - error.square()).clamp_min(0).sum(-1)
+    best = torch.where(ok, gain, -1.0).argmax()
+    return best, error[best] <= 1
 
 
 def _distinct(draws: Float[Tensor, "S T"], count: int) -> Int[Tensor, "S T"]:

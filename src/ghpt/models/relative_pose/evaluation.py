@@ -25,7 +25,17 @@ from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.relative_pose.schema import PairChunk, PairPredictions
 
 FORMAT_VERSION = 1
-NAMES = (*AGGREGATIONS, "eight_point", "ransac", "usac_magsac", "usac_accurate", "poselib", "rig")
+NAMES = (
+    *AGGREGATIONS,
+    "weight_refined",
+    "eight_point",
+    "ransac",
+    "usac_magsac",
+    "usac_accurate",
+    "poselib",
+    "five_point",
+    "rig",
+)
 """The order of every table: the selections, then the baselines."""
 ERRORS = ("E_R", "E_t", "E_2D", "E_3D", "rotation_deg", "translation_deg")
 """Section 4.5's four, and the angles in degrees."""

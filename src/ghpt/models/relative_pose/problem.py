@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,10 +16,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt import randomness
-from ghpt.config import build
 from ghpt.data.datasets.frames import Sampling
 from ghpt.data.datasets.pairs import Pairs, PairSettings
 from ghpt.errors import check
+from ghpt.extras import build_installed
 from ghpt.geometry.cameras import project
 from ghpt.geometry.epipolar import (
     MINIMUM,
@@ -214,8 +215,12 @@ class RelativePose(Problem):
     def baselines(
         self, settings: BaselineSettings, model: Any
     ) -> Mapping[str, Callable[[PairObservations], RelativePoseEstimate]]:
-        """Return the classical estimators."""
-        return build(settings.camera_baselines, "camera_baselines")
+        """Return the other estimators; those that need the model have it."""
+        built = build_installed(settings.camera_baselines, "camera_baselines")
+        return {
+            name: one(model=model) if isinstance(one, partial) else one
+            for name, one in built.items()
+        }
 
     def from_baseline(
         self, estimate: RelativePoseEstimate, observations: PairObservations

@@ -45,12 +45,14 @@ COLUMNS = {
 }
 METHODS = (
     "weight",
+    "weight_refined",
     "average",
     "eight_point",
     "ransac",
     "usac_magsac",
     "usac_accurate",
     "poselib",
+    "five_point",
     "rig",
 )
 NARROW = ("1-3", "2-4")

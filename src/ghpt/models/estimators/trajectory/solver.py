@@ -265,7 +265,8 @@ class _Rounds:
         """Return the directions and the lengths of the bones."""
         start, end = self.ends
         across = points[:, start] - points[:, end]
-        length = torch.linalg.vector_norm(across, dim=0)
+        x, y, z = across
+        length = torch.addcmul(torch.addcmul(x * x, y, y), z, z).sqrt_()
         return across / length.clamp(min=1e-9), length
 
     def _measure(
