@@ -38,8 +38,8 @@ def _section(results: Results) -> Section:
     for name in names:
         cells: list[Text] = []
         for data, one in found.items():
-            text = one.errors["relative"][name][0].text(_DIGITS)
-            cells.append(Strong(text) if one.mean(name, 0) == least[data] else text)
+            error = one.errors["relative"][name][0].text(_DIGITS)
+            cells.append(Strong(error) if one.mean(name, 0) == least[data] else error)
         rows.append([LABELS.get(name, name), *cells])
     frames = sum(one.frames for one in found.values())
     training = results.display_name(results.setup.sizes.robustness.trained_on)
