@@ -200,13 +200,14 @@ def _evidence_line(evidence: Evidence) -> str:
     """Return a sentence on what the recording is worth."""
     needed = evidence.frames_for(_WANTED_DEG)
     enough = "which is enough"
-    if needed > evidence.frames:
-        enough = f"and about {needed} like these would do"
+    if needed is None:
+        enough = "no number of frames is enough in which people turn no more than here"
+    elif needed > evidence.frames:
+        enough = f"about {needed} like these would do"
     return (
         f"Evidence: {evidence.used} of {evidence.frames} frames, worth "
         f"{evidence.independent:.0f} independent ones, in which people turn by "
-        f"{evidence.turned_deg:.0f}°; for rotations to ± {_WANTED_DEG}° {enough}. "
-        f"Another recording like this one would differ by {evidence.repeatability:.0%} of the ±."
+        f"{evidence.turned_deg:.0f}°; for rotations to ± {_WANTED_DEG}° {enough}."
     )
 
 

@@ -26,6 +26,7 @@ NAMES = {
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
     "view_weights": "view weights",
     "trajectory": "trajectory",
+    "online": "trajectory, online",
     "frame_learned": "key-point weights",
     "weighted_linear": "weighted linear",
     "ransac": "RANSAC",
