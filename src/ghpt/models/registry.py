@@ -75,7 +75,17 @@ register("model.problem", PoseTriangulation, KeyPointWeights, WorldPoses, Relati
 register("model.problem.scale", KnownScale, BodyHeight, BoneLengths)
 register("model.scorer", Scorer, KeyPointScorer, AuthorsScorer)
 register("model.loss", StochasticLoss, PrecisionLoss)
-register("model.schedule", lr_scheduler.ExponentialLR)
+register(
+    "model.schedule",
+    lr_scheduler.ConstantLR,
+    lr_scheduler.CosineAnnealingLR,
+    lr_scheduler.CosineAnnealingWarmRestarts,
+    lr_scheduler.ExponentialLR,
+    lr_scheduler.LinearLR,
+    lr_scheduler.MultiStepLR,
+    lr_scheduler.PolynomialLR,
+    lr_scheduler.StepLR,
+)
 for _name, _one in vars(optim).items():
     if isinstance(_one, type) and issubclass(_one, optim.Optimizer) and _one is not optim.Optimizer:
         register("model.optimizer", _one)

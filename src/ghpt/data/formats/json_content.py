@@ -130,7 +130,7 @@ def _of_dict(path: Path, content: dict[str, Any]) -> JsonContent | None:
             return JsonContent(owner, (frame,), False)
     if "instance_info" in content:
         joints = _joint_names(path, content.get("meta_info"))
-        frames = _numbered(path, "instance_info", content["instance_info"])
+        frames = _number_frames(path, "instance_info", content["instance_info"])
         return JsonContent("mmpose", frames, True, joints)
     if "annotations" in content or "images" in content:
         return JsonContent("coco", _coco(path, content), True)
@@ -156,9 +156,9 @@ def _of_list(path: Path, content: Any) -> JsonContent | None:
     if "image_id" in first:
         return JsonContent("coco", _coco(path, {"annotations": content}), True)
     if any(name in first for name in (*_NUMBERS, *_PEOPLE, "predictions")):
-        return JsonContent("mmpose", _numbered(path, "", content), True)
+        return JsonContent("mmpose", _number_frames(path, "", content), True)
     if _depth(first.get("keypoints")) == 3:
-        return JsonContent("rtmlib", _numbered(path, "", content), True)
+        return JsonContent("rtmlib", _number_frames(path, "", content), True)
     if any(name in first for name in _POINTS):
         frame = JsonFrame(None, _people(path, "", content), "")
         return JsonContent("mmpose", (frame,), False)
@@ -172,7 +172,7 @@ def _people(path: Path, field: str, listed: Any) -> tuple[dict[str, Any], ...]:
     return tuple(listed)
 
 
-def _numbered(path: Path, field: str, listed: Any) -> tuple[JsonFrame, ...]:
+def _number_frames(path: Path, field: str, listed: Any) -> tuple[JsonFrame, ...]:
     """Return a list of frames; one without a number has its place in the list as its number."""
     if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
         hint = "It must be a file that MMPose wrote for a video (save_predictions, pred_out_dir)."
