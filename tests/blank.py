@@ -7,6 +7,8 @@ from unittest.mock import patch
 import numpy as np
 from matplotlib.figure import Figure
 
+from ghpt.commands import cameras
+from ghpt.commands.prediction import page
 from ghpt.report import pair_tensorboard, rig_files, tensorboard
 
 FIGURES = (
@@ -14,6 +16,9 @@ FIGURES = (
     (tensorboard, "pose_prior_bars"),
     (pair_tensorboard, "rig_figure"),
     (rig_files, "rig_figure"),
+    (page, "rig_figure"),
+    (page, "course_figure"),
+    (cameras, "rig_figure"),
 )
 
 

@@ -36,6 +36,7 @@ QUICK_CHECK = ("camera_check.frames=16", "camera_check.shift=2")
 """The check of the file's own extrinsics, which tests/test_camera_check.py tests, made small."""
 OUTPUTS = {
     "calibration.json",
+    "report.html",
     "report.md",
     "rig.png",
     "rig.svg",
@@ -265,7 +266,7 @@ def test_without_a_usable_rig_there_is_none(command, scene, after_a_run):
     assert status == 1
     assert "no rig is written" in errors
     left = {file.name for file in (after_a_run / "rig").iterdir()} & OUTPUTS
-    assert left <= {"calibration.json", "report.md", "rig.png", "rig.svg"}
+    assert left <= {"calibration.json", "report.md", "report.html", "rig.png", "rig.svg"}
     assert "error" in said
 
 

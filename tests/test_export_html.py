@@ -14,20 +14,20 @@ import numpy as np
 import pytest
 import torch
 
-from ghpt.export import WRITERS, Scene
+from ghpt.export import WRITERS, Evidence, Scene
 from ghpt.export.html import MOST_FRAMES
-from ghpt.export.scene import frustum, to_z_up
+from ghpt.export.scene import Images, frustum, to_z_up, upward
 from ghpt.geometry.cameras import project
+from ghpt.geometry.lens import distort
 from ghpt.reconstruction import State
-from ghpt.skeleton import BONES, JOINT
+from ghpt.skeleton import BONES, JOINT, JOINTS
 from reconstructions import about, in_parts, random_reconstruction, rig
 
 LOGIC = """
 const fs = require("fs"), p = require(process.argv[2]);
 const page = fs.readFileSync(process.argv[3], "utf8");
-const data = p.load(/application\\/json">(.*?)<\\/script>/s.exec(page)[1]);
+p.load(/application\\/json">(.*?)<\\/script>/s.exec(page)[1]).then(data => {
 const { view } = p.overview(data, 800, 600);
-view.focal = 960;
 const frames = Float64Array.of(3, 4, 8, 9);
 console.log(JSON.stringify({
   count: data.frame.length, first: Array.from(data.points.slice(0, 3)),
@@ -37,7 +37,12 @@ console.log(JSON.stringify({
   middle: p.look(view, view.target),
   behind: p.look({ ...view, yaw: 0, pitch: 0 }, [view.target[0], view.target[1] - 1e6, 0]),
   up: p.look(view, [view.target[0], view.target[1], view.target[2] + 100])[1] < 300,
+  points: Array.from(data.points, value => Number.isNaN(value) ? 0 : value),
+  cameras: data.cameras.map(camera => p.look(view, camera.centre)),
+  pixels: data.cameras.map(camera => p.project(camera, [100, 200, 300])),
+  errors: data.cameras.map((_, v) => p.viewError(data, v, 0)),
 }));
+});
 """
 
 
@@ -84,7 +89,7 @@ def test_the_page_loads_nothing_and_tells_what_it_shows(tmp_path):
     assert not re.search(r"https?://|//cdn|src=|@import|fetch\(|XMLHttp", text)
     assert "default-src 'none'" in text
     data = data_of(text)
-    assert data["title"] == "S1/Walking-1: 3D poses from synthetic data"
+    assert data["title"] == "S1/Walking-1 (synthetic data)"
     assert [camera["name"] for camera in data["cameras"]] == ["cam_1", "cam_2", "cam_3"]
     assert "20 frames" in data["about"]
 
@@ -101,8 +106,8 @@ def test_long_recordings_are_thinned_with_a_note(tmp_path):
     data = data_of(page(tmp_path, made, about(("a",))))
     assert data["stride"] == 3
     assert f"{len(made)} frames" in data["about"]
-    assert "1 frame of 3, 4002 in all" in data["about"]
-    assert len(data["frame"]) < 4 / 3 * 8 * MOST_FRAMES
+    assert "1 frame of 3, 26669 in all" in data["about"]
+    assert data["frame"] == [[0, 3, 26669]]
 
 
 def test_up_is_the_body_s(tmp_path):
@@ -133,7 +138,22 @@ def test_the_player_s_logic(tmp_path):
     if node is None:
         pytest.skip("no node to run the player's logic")
     made = random_reconstruction(6)
-    page(tmp_path, made)
+    cameras = rig(3)
+    lens = torch.tensor(
+        [[0.1, -0.2, 0.01, 0.02, 0.05, 0.1, 0, 0, 0], [0.1, 0.02, 0, 0, 0, 0, 0, 0, 1]]
+    )
+    lens = torch.cat([lens, torch.zeros(1, 9)]).double()
+    ideal = project(cameras, made.points)[0]
+    beside = ideal[:, 2] + torch.tensor([3.0, 4.0])  # the last view has an ideal lens
+    key_points = torch.cat([ideal[:, :2], beside[:, None]], dim=1)
+    evidence = Evidence(key_points, torch.ones(key_points.shape[:-1], dtype=torch.bool), None)
+    shown = Scene(
+        cameras,
+        lambda: iter([evidence]),
+        Images(lens, 2 * cameras.K[:, :2, 2]),
+        tuple((joint, joint) for joint in range(17)),
+    )
+    page(tmp_path, made, scene=shown)
     (tmp_path / "logic.js").write_text(LOGIC, encoding="utf-8")
     player = resources.files("ghpt.export") / "player.js"
     command = [node, tmp_path / "logic.js", str(player), tmp_path / "poses.html"]
@@ -150,6 +170,18 @@ def test_the_player_s_logic(tmp_path):
     assert found["middle"][:2] == [400, 300]
     assert found["behind"] is None
     assert found["up"]
+    for x, y, *_ in found["cameras"]:
+        assert 0 < x < 800
+        assert 0 < y < 600
+    points = torch.tensor(found["points"], dtype=torch.float64).reshape(6, 17, 3)
+    to_world = to_z_up(upward(JOINTS, made))
+    points = points @ to_world
+    there = made.has_position
+    assert float((points - made.points)[there].abs().max()) <= 0.2501
+    point = torch.tensor([[100.0, 200.0, 300.0]], dtype=torch.float64) @ to_world
+    pixels = distort(project(cameras, point)[0], cameras.K, lens)[:, 0]
+    np.testing.assert_allclose(np.array(found["pixels"]), pixels.numpy(), atol=1e-3)
+    assert found["errors"][2] == pytest.approx(5, abs=0.5)
 
 
 def test_the_page_in_a_browser_draws_observed_filled_and_nothing_missing(tmp_path):

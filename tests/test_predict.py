@@ -103,8 +103,10 @@ def test_a_folder_and_cameras_give_poses_in_every_format(command, tmp_path):
         "poses.c3d",
         "poses.html",
         "report.md",
+        "report.html",
         "prediction.json",
     }
+    assert 'class="notice good"' in (tmp_path / "out" / "report.html").read_text()
     about, found = result(tmp_path)
     assert about.camera_names == tuple(f"cam_{i:02d}" for i in range(4))
     assert about.rate_hz == 50

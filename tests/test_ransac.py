@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from ghpt.errors import GhptConfigError
+from ghpt.geometry.cameras import project
 from ghpt.models.estimators.classical import Linear, person_scale
 from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
 from ghpt.paper.robustness.perturbation import RotatedCameras
@@ -62,6 +63,21 @@ def test_outliers_do_not_widen_it():
     assert (ADAPTIVE.inlier_threshold(batch, found.points) == 0.005).all()
     views, agreed = ADAPTIVE.inlier_views(batch, found.points, found.ok)
     assert not (views & wrong)[agreed[:, None].expand_as(wrong)].any()
+
+
+@pytest.mark.parametrize("sure", [(0, 1), (2, 3)])
+def test_of_two_pairs_that_agree_the_confident_one_counts(sure):
+    """Views 2 and 3 see another place: each pair of views explains itself."""
+    scene = random_scene(3, frames=4, views=4)
+    elsewhere, _ = project(scene.cameras, scene.points + 300.0)
+    key_points = scene.key_points.clone()
+    key_points[:, 2:] = elsewhere[:, 2:]
+    confidence = torch.full(key_points.shape[:-1], 0.1, dtype=torch.float64)
+    confidence[:, list(sure)] = 0.9
+    batch = replace(scene, key_points=key_points).batch(confidence=confidence)
+    offset = (FIXED(batch).points - scene.points).norm(dim=-1)
+    expected = 0.0 if sure == (0, 1) else 300.0 * 3**0.5
+    torch.testing.assert_close(offset, torch.full_like(offset, expected), atol=0.1, rtol=0)
 
 
 def test_a_frame_in_which_nothing_is_seen_keeps_the_threshold():

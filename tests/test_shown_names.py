@@ -41,7 +41,7 @@ from ghpt.report.camera_check import (
     camera_check_summary,
 )
 from ghpt.report.markdown import render_markdown
-from ghpt.report.rig_figure import DrawnRig, rig_figure
+from ghpt.report.rig_figure import DrawnPerson, DrawnRig, rig_figure
 from ghpt.report.terminal import print_document
 
 BAD = "a|b<c>[red]"
@@ -130,6 +130,7 @@ def calibration() -> CalibrationResult:
         explains={},
         findings=(Finding("x", Severity.ERROR, BAD),),
         provenance=PROVENANCE,
+        command="next",
     )
 
 
@@ -143,6 +144,7 @@ def camera_check() -> CameraReport:
         findings=(Finding("x", Severity.ERROR, BAD, before_px=2.0, after_px=1.0, mended=True),),
         cameras=(CheckedCamera(BAD, 1.0, 1.0),),
         provenance=PROVENANCE,
+        command="next",
     )
 
 
@@ -163,7 +165,7 @@ def test_a_report_shows_names_as_they_are(numbers, report, times):
     ("numbers", "show", "times"),
     [
         (prediction, summary_document, 4),
-        (prediction, verdict_document, 3),
+        (prediction, lambda numbers: verdict_document(numbers, "out/report.html"), 3),
         (calibration, calibration_summary, 6),
         (camera_check, camera_check_summary, 3),
     ],
@@ -182,7 +184,9 @@ def test_a_dollar_in_a_camera_s_name_is_no_formula():
     )
     same = Similarity(torch.eye(3).double(), 1.0, torch.zeros(3).double())
     points, estimated = torch.zeros(1, 17, 3).double(), torch.zeros(1, 17).bool()
-    drawn = DrawnRig((r"$\b$",), rig, torch.zeros(1, 6, 6).double(), points, estimated)
+    drawn = DrawnRig(
+        (r"$\b$",), rig, (DrawnPerson(points, estimated),), torch.zeros(1, 6, 6).double()
+    )
     figure = rig_figure(r"$\a$", drawn, same)
     FigureCanvasAgg(figure).draw()
     assert np.isfinite(figure.get_size_inches()).all()

@@ -36,18 +36,23 @@ NOISE = 4.0
 
 @pytest.fixture(scope="module")
 def truth():
-    motion = draw_motion(0, "S8", "S8/Walking-1", "Walking", FRAMES, 50.0)
-    return torch.from_numpy(motion)
+    return walk(FRAMES)[0]
 
 
 @pytest.fixture(scope="module")
-def batch(truth):
-    """A person who walks before Human3.6M's four cameras, with Gaussian noise."""
+def batch():
+    return walk(FRAMES)[1]
+
+
+def walk(frames):
+    """Return a person who walks before Human3.6M's four cameras, and what they see with noise."""
+    motion = draw_motion(0, "S8", "S8/Walking-1", "Walking", FRAMES, 50.0)
+    truth = torch.from_numpy(motion)[:frames]
     rig = human36m_rig("S8").cameras.to(torch.float64)
-    pixels, _ = project(rig.expand(FRAMES), truth)
+    pixels, _ = project(rig.expand(FRAMES), torch.from_numpy(motion))
     noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0))
     valid = torch.ones(pixels.shape[:-1], dtype=torch.bool)
-    return Observations(
+    batch = Observations(
         index=torch.arange(FRAMES),
         recording=torch.zeros(FRAMES, dtype=torch.int64),
         cameras=rig.expand(FRAMES),
@@ -55,6 +60,7 @@ def batch(truth):
         confidence=torch.ones(valid.shape),
         valid=valid,
     )
+    return truth, batch.rows(slice(0, frames))
 
 
 @pytest.fixture(scope="module")
@@ -150,6 +156,24 @@ def test_one_view_supports_a_joint_that_is_observed_near_by(predictor, batch, tr
     before = part.covariance[40:55, wrist, [0, 3, 5]].sum(-1).mean()
     within = part.covariance[list(gap), wrist][:, [0, 3, 5]].sum(-1).mean()
     assert within > 1.5 * before
+
+
+def test_what_a_detector_guesses_with_little_confidence_spoils_nothing(predictor, batch, truth):
+    """Half of the views take an arm for another, at first these, then those."""
+    arm = [JOINT["left_elbow"], JOINT["left_wrist"]]
+    key_points = batch.key_points.clone()
+    confidence = torch.full_like(batch.confidence, 0.9)
+    half = slice(None, FRAMES // 2), slice(FRAMES // 2, None)
+    for frames, views in zip(half, ((0, 1), (2, 3)), strict=True):
+        for view in views:
+            key_points[frames, view, arm] += torch.tensor([120.0, 40.0])
+            confidence[frames, view, arm] = 0.1
+    guessed = replace(batch, key_points=key_points, confidence=confidence)
+    found = predict(predictor, Source(guessed))
+    seen = batch.valid & (confidence > 0.5)
+    assert error(found, truth, arm) < 2 * error(
+        predict(predictor, Source(replace(batch, valid=seen))), truth, arm
+    )
 
 
 def test_what_no_view_sees_is_missing(predictor, batch):

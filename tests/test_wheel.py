@@ -106,7 +106,7 @@ def test_the_console_script_lists_the_commands(installed: Installed) -> None:
 def test_every_configuration_is_composed_outside_the_clone(installed: Installed, name: str) -> None:
     done = installed.run("-m", "ghpt", name, "--cfg", "job")
     assert (done.returncode, done.stderr) == (0, "")
-    assert "\nseed: 0\n" in done.stdout
+    assert "\noverwrite: false\n" in done.stdout
 
 
 def test_help_is_in_the_words_of_the_console(installed: Installed) -> None:

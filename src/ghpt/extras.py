@@ -1,4 +1,4 @@
-"""Packages that only some estimators need, and the extras of ghpt that bring them."""
+"""Packages that only some estimators and loggers need, and the extras of ghpt that bring them."""
 
 import logging
 from importlib.util import find_spec
@@ -7,7 +7,15 @@ from typing import Any
 from ghpt.config import Target, build
 from ghpt.errors import GhptConfigError
 
-EXTRAS = {"pycolmap": "colmap", "cv2": "opencv"}
+EXTRAS = {
+    "pycolmap": "colmap",
+    "cv2": "opencv",
+    "wandb": "wandb",
+    "mlflow": "mlflow",
+    "optuna": "optuna",
+    "psutil": "device",
+    "mediapipe": "detect",
+}
 """The extra of each package, which has the name by which it is imported."""
 _log = logging.getLogger(__name__)
 
@@ -21,9 +29,14 @@ class NotInstalled(GhptConfigError):
         super().__init__(user, problem, f"Run: pip install 'ghpt[{EXTRAS[package]}]'")
 
 
+def is_installed(package: str) -> bool:
+    """Return whether a package can be imported."""
+    return find_spec(package) is not None
+
+
 def check_installed(package: str, user: str) -> None:
     """Raise NotInstalled if the package that ``user`` needs is not there."""
-    if find_spec(package) is None:
+    if not is_installed(package):
         raise NotInstalled(user, package)
 
 

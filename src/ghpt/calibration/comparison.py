@@ -10,9 +10,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras, reprojection_error
-from ghpt.geometry.rotations import nearest_rotation
+from ghpt.geometry.rotations import nearest_rotation, rotation_angle
 from ghpt.geometry.similarity import Similarity
-from ghpt.metrics.relative_pose import rotation_deg
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.observations import Observations, Recording
@@ -109,7 +108,8 @@ def rig_difference(cameras: Cameras, reference: Cameras) -> RigDifference:
     similarity = align_robustly(cameras, reference)
     moved = similarity.cameras(cameras)
     distance = torch.linalg.vector_norm(moved.centre - reference.centre, dim=-1)
-    return RigDifference(rotation_deg(moved.R, reference.R), distance, similarity.scale)
+    rotation = torch.rad2deg(rotation_angle(moved.R, reference.R))
+    return RigDifference(rotation, distance, similarity.scale)
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,6 @@ from ghpt.calibration.mistakes import (
     ILL_CONDITIONED,
     LARGE_RESIDUALS,
     LITTLE_MOTION,
-    NO_MOTION,
     NOT_CONVERGED,
     NOTHING_LINKED,
     OUTSIDE_IMAGE,
@@ -109,10 +108,10 @@ class Diagnostics:
     """Where a number becomes a finding. Standard deviations: of rotations in degrees, of centres
     in sizes of the rig.
 
-    ``few_frames``: fewer are a finding. ``motion``: least motion of a joint in the image, in sizes
-    of the person. ``rotation_wanted``: a larger standard deviation of a rotation is a finding that
-    says how much recording would do, and an error from ``rotation_useless`` on. ``flat``: least
-    thickness of the cloud of all points, in its length. ``inliers``: least share of a view's key
+    ``few_frames``: fewer are a finding. ``rotation_wanted``: a larger standard deviation of a
+    rotation is a finding that says how much recording would do, and an error from
+    ``rotation_useless`` on. ``flat``: least thickness of the cloud of all points, in its length.
+    ``inliers``: least share of a view's key
     points that agree. ``noise``: largest noise of the key points that the residuals show, in sizes
     of the person; ``contrast``: and in the median of the views. ``distance``: least distance of two
     cameras, in sizes of the rig. ``proportions``: largest ratio of the bones' lengths, in an
@@ -122,7 +121,6 @@ class Diagnostics:
     """
 
     few_frames: int
-    motion: float
     flat: float
     inliers: float
     noise: float
@@ -147,7 +145,7 @@ class Diagnostics:
         Where the recording does not determine a rig nothing is said of the rig: what is wrong with
         it comes from that, and shows nothing of the cameras.
         """
-        recording = [*self._frames(case), *self._motion(case)]
+        recording = list(self._frames(case))
         determined = all(found.severity != Severity.ERROR for found in recording)
         findings = [*recording, *self._resolution(case), *self._links(case)]
         if case.rig is not None and uncertainty is not None and determined:
@@ -155,7 +153,7 @@ class Diagnostics:
             findings += self._geometry(case, case.rig)
             findings += self._proportions(case)
             findings += self._evidence(case)
-            findings += self._determined(case, case.rig, uncertainty)
+            findings += self._check_determined(case, case.rig, uncertainty)
         return (*findings, *self._repairs(case, findings))
 
     def _repairs(self, case: Case, findings: list[Finding]) -> Iterator[Finding]:
@@ -186,12 +184,6 @@ class Diagnostics:
             severity = Severity.ERROR if count < 2 else Severity.WARNING
             plural = "" if count == 1 else "s"
             yield FEW_FRAMES.finding((), count, self.few_frames, severity, plural=plural)
-
-    def _motion(self, case: Case) -> Iterator[Finding]:
-        count = len(case.frames)
-        motion = _motion(case.key_points[case.frames], case.valid[case.frames])
-        if count > 1 and motion < self.motion:
-            yield NO_MOTION.finding((), motion, self.motion, count=count)
 
     def _resolution(self, case: Case) -> Iterator[Finding]:
         """Yield the views whose key points lie outside the image, or leave much of it unused."""
@@ -287,10 +279,10 @@ class Diagnostics:
                 used=evidence.used,
                 independent=evidence.independent,
                 turned=evidence.turned_deg,
-                needed=evidence.frames_for(self.rotation_wanted),
+                needed=_needed(evidence, self.rotation_wanted),
             )
 
-    def _determined(
+    def _check_determined(
         self, case: Case, rig: PlacedRig, uncertainty: Uncertainty
     ) -> Iterator[Finding]:
         """Yield what says that another rig would do as well."""
@@ -308,6 +300,14 @@ class Diagnostics:
             yield ILL_CONDITIONED.finding(names, most, self.centre_std, degrees=degrees)
 
 
+def _needed(evidence: Evidence, wanted: float) -> str:
+    """Return what would give a smaller standard deviation, in words."""
+    frames = evidence.frames_for(wanted)
+    if frames is None:
+        return f"however many frames like these leave ± {evidence.least_sd_deg:.1f}"
+    return f"± {wanted:g} takes about {frames} frames like these, and fewer of more motion"
+
+
 def _extent(pixels: Float[Tensor, "N 2"]) -> Float[Tensor, " 2"]:
     rank = max(round(_REACH * len(pixels)), 1)
     return torch.stack([x.kthvalue(rank).values for x in pixels.T])
@@ -318,20 +318,3 @@ def _most_common(table: PairTable, pairs: Bool[Tensor, " P"]) -> tuple[int, int]
     if not pairs.any():
         return 0, 0
     return int(table.common[pairs].max()), int(table.inliers[pairs].max())
-
-
-def _motion(key_points: Float[Tensor, "T V J 2"], valid: Bool[Tensor, "T V J"]) -> float:
-    """Return how much the joints move in the view with most motion, in sizes of the person.
-
-    The motion of a view is the median over the joints of half the range of the middle 80 % of
-    their positions.
-    """
-    size = typical_size(key_points.double(), valid)
-    position = torch.where(valid[..., None], key_points.double(), torch.nan)
-    if not len(position):
-        return 0.0
-    middle = torch.tensor([0.1, 0.9], dtype=torch.float64)
-    low, high = position.nanquantile(middle, dim=0)
-    half_range = (high - low).norm(dim=-1) / 2
-    motion = half_range.nanmedian(-1).values / size
-    return float(motion.nan_to_num(0.0).max())

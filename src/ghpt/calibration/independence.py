@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.calibration.observations import Correspondences
@@ -19,11 +19,6 @@ _DECAYED = 0.05
 """A smaller correlation counts as none, and so do those of all longer lags."""
 _ROUNDS = 20
 """Of the correction for the mean, which is taken from errors of the same recording."""
-_SECTOR = 60.0
-"""Degrees; people who face so far apart show a detector different sides, with errors of their own.
-"""
-_LEAST_SHARE = 0.02
-"""Of the frames, for a sector to count."""
 _SIDES = (
     (JOINT["left_shoulder"], JOINT["right_shoulder"]),
     (JOINT["left_hip"], JOINT["right_hip"]),
@@ -47,12 +42,6 @@ class Persistence:
     def independent(self) -> float:
         """The number of independent frames that all are worth."""
         return self.frames / self.time
-
-    def share(self, length: float) -> float:
-        """Return the share of the variance of a mean that blocks of so many frames show."""
-        lag = torch.arange(1, len(self.correlation) + 1, dtype=torch.float64)
-        within = (1 - lag / max(length, 1.0)).clamp(min=0.0)
-        return (1.0 + 2.0 * float((within * self.correlation).sum())) / self.time
 
 
 def persistence(observed: Correspondences, rig: PlacedRig) -> Persistence:
@@ -111,13 +100,10 @@ class Turning:
 
     degrees: float
     """By how much they turn in all: the range of headings, at most 360."""
-    sector: Int[Tensor, " R"]
-    """The sector that each row faces, from 0."""
-
-    @property
-    def sectors(self) -> int:
-        """The number of sectors."""
-        return int(self.sector.max()) + 1 if len(self.sector) else 0
+    axes: Float[Tensor, "R 3 3"]
+    """Of each row's body, unit vectors in columns: left, and across it in the plane of turning,
+    and the axis of turning.
+    """
 
 
 def turning(points: Float[Tensor, "R 17 3"], estimated: Bool[Tensor, "R 17"]) -> Turning:
@@ -134,24 +120,16 @@ def turning(points: Float[Tensor, "R 17 3"], estimated: Bool[Tensor, "R 17"]) ->
     length = across.norm(dim=-1)
     known = torch.isfinite(length) & (length > 0)
     if not known.any():
-        return Turning(0.0, torch.zeros(len(points), dtype=torch.int64))
-    unit = across[known] / length[known, None]
-    plane = torch.linalg.svd(unit, full_matrices=False)[2][:2]
-    mean = plane @ unit.mean(0)
-    angle = torch.atan2(*(unit @ plane.T).flip(-1).unbind(-1))
-    # counted from the mean heading, so that people who hardly turn lie in one sector
-    angle = angle - torch.atan2(mean[1], mean[0])
-    angle = torch.rad2deg(torch.remainder(angle + math.pi, 2 * math.pi) - math.pi)
-    sector = torch.round(angle / _SECTOR).long().remainder(round(360 / _SECTOR))
-    count = torch.bincount(sector)
-    # a sector that hardly anybody faces counts with the most frequent one
-    sector = torch.where(count[sector] >= _LEAST_SHARE * len(sector), sector, count.argmax())
-    ordinal = torch.unique(sector, return_inverse=True)[1]
+        return Turning(0.0, torch.eye(3, dtype=torch.float64).repeat(len(points), 1, 1))
     rows = torch.arange(len(points))
     before = torch.where(known, rows, -1).cummax(0).values.clamp(min=int(rows[known][0]))
-    full = torch.zeros(len(points), dtype=torch.int64)
-    full[known] = ordinal
-    return Turning(_range(angle), full[before])
+    unit = (across / length[:, None])[before]
+    plane = torch.linalg.svd(unit, full_matrices=False)[2]
+    forward = torch.linalg.cross(plane[2].expand_as(unit), unit)
+    forward = torch.nn.functional.normalize(forward, dim=-1)
+    axes = torch.stack((unit, forward, plane[2].expand_as(unit)), dim=-1)
+    angle = torch.rad2deg(torch.atan2(unit[known] @ plane[1], unit[known] @ plane[0]))
+    return Turning(_range(angle), axes)
 
 
 @dataclass(frozen=True)
@@ -168,18 +146,30 @@ class Evidence:
     """By how much people turn."""
     rotation_sd_deg: float
     """The largest standard deviation of a camera's rotation, the angle about whatever axis."""
-    repeatability: float
+    lasting: float
     """See ``ghpt.calibration.uncertainty.Uncertainty``."""
 
-    def frames_for(self, rotation_sd_deg: float) -> int:
-        """Return how many frames like these would give a smaller standard deviation: it falls with
-        the square root of their number.
+    @property
+    def least_sd_deg(self) -> float:
+        """The standard deviation that however many frames like these would leave."""
+        return self.rotation_sd_deg * self.lasting**0.5
+
+    def frames_for(self, rotation_sd_deg: float) -> int | None:
+        """Return how many frames like these would give a smaller standard deviation: the part of
+        the variance that does not last falls with their number. None if no number would.
         """
-        return math.ceil(self.frames * (self.rotation_sd_deg / rotation_sd_deg) ** 2)
+        left = rotation_sd_deg**2 - self.least_sd_deg**2
+        if left <= 0:
+            return None
+        falling = self.rotation_sd_deg**2 - self.least_sd_deg**2
+        return math.ceil(self.frames * falling / left)
 
 
 def _range(angle: Float[Tensor, " N"]) -> float:
     """Return the part of the circle, degrees, that headings cover: all but the largest gap."""
+    mean = torch.deg2rad(angle)
+    mean = torch.rad2deg(torch.atan2(mean.sin().mean(), mean.cos().mean()))
+    angle = (angle - mean + 180.0).remainder(360.0) - 180.0
     low, high = angle.quantile(torch.tensor([0.05, 0.95], dtype=angle.dtype)).tolist()
     ordered = angle[(angle >= low) & (angle <= high)].sort().values
     if len(ordered) < 2:

@@ -62,6 +62,30 @@ def residuals(
 
 
 @dataclass(frozen=True)
+class Derivatives:
+    """Of the weighted errors of N points in V views."""
+
+    root: Float[Tensor, "V N"]
+    """Square root of the weight, which the others contain."""
+    by_view: Float[Tensor, "V N 2 6"]
+    by_point: Float[Tensor, "V N 2 3"]
+
+    @classmethod
+    def of(cls, observed: Correspondences, rig: PlacedRig, now: Residuals) -> Derivatives:
+        """Return the derivatives of a rig with these residuals."""
+        root = now.weight.sqrt()
+        scale = root / (observed.noise * now.in_camera[..., 2])
+        slope = now.in_camera[..., :2] / now.in_camera[..., 2:]
+        R = rig.R[:, None]
+        # the derivatives by the point: f / z (r_1 - x / z r_3), and the same with r_2 and y
+        by_point = R[..., :2, :] - slope[..., None] * R[..., 2:, :]
+        by_point = scale[..., None, None] * by_point
+        arm = (rig.points - rig.centre[:, None])[..., None, :].expand_as(by_point)
+        by_view = torch.cat((torch.linalg.cross(by_point, arm), -by_point), dim=-1)
+        return cls(root, by_view, by_point)
+
+
+@dataclass(frozen=True)
 class NormalEquations:
     """Normal matrix and gradient of V views and N points."""
 
@@ -76,16 +100,10 @@ class NormalEquations:
     @classmethod
     def of(cls, observed: Correspondences, rig: PlacedRig, now: Residuals) -> NormalEquations:
         """Return the equations of a rig with these residuals."""
-        root = now.weight.sqrt()
-        scale = root / (observed.noise * now.in_camera[..., 2])
-        slope = now.in_camera[..., :2] / now.in_camera[..., 2:]
-        R = rig.R[:, None]
-        # the derivatives by the point: f / z (r_1 - x / z r_3), and the same with r_2 and y
-        by_point = R[..., :2, :] - slope[..., None] * R[..., 2:, :]
-        by_point = scale[..., None, None] * by_point
-        arm = (rig.points - rig.centre[:, None])[..., None, :].expand_as(by_point)
-        by_view = torch.cat((torch.linalg.cross(by_point, arm), -by_point), dim=-1)
-        error = root[..., None] * now.error
+        slopes = Derivatives.of(observed, rig, now)
+        error = slopes.root[..., None] * now.error
+        by_view = slopes.by_view
+        by_point = slopes.by_point
         rows = by_view.flatten(1, 2)
         return cls(
             views=rows.mT @ rows,
@@ -266,7 +284,7 @@ def _inverse(
     return factor[:, None, None] * rows.unflatten(-1, (3, 3)), solvable
 
 
-def preconditioned(
+def precondition(
     matrix: Float[Tensor, "P P"],
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, "P P"]]:
     """Return 1 / sqrt of the diagonal (0 where it is 0), and eigenvalues and -vectors of the matrix
@@ -281,7 +299,7 @@ def preconditioned(
 def _gain(matrix: Float[Tensor, "P P"], gradient: Float[Tensor, " P"]) -> float:
     if not (torch.isfinite(matrix).all() and torch.isfinite(gradient).all()):
         return float("inf")
-    scale, values, vectors = preconditioned(matrix)
+    scale, values, vectors = precondition(matrix)
     along = vectors.T @ (scale * gradient)
     known = values > 1e-10 * values[-1].clamp_min(1e-300)
     return float((along[known] ** 2 / values[known]).sum() / 2)

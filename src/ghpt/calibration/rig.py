@@ -13,15 +13,16 @@ from torch import Tensor
 
 from ghpt.calibration.bundle import Adjusted, BundleAdjustment
 from ghpt.calibration.diagnostics import Case, Diagnostics, Joints
+from ghpt.calibration.error_model import ErrorModel
 from ghpt.calibration.findings import Finding, Severity
-from ghpt.calibration.independence import Evidence, turning
+from ghpt.calibration.independence import Evidence, persistence, turning
 from ghpt.calibration.mistakes import size_finding
 from ghpt.calibration.observations import (
     Correspondences,
     choose_frames,
     joints_of,
     observe,
-    reweighted,
+    reweight,
     spread_key_points,
     usable,
 )
@@ -91,7 +92,7 @@ class RigEstimate:
             and all(found.severity != Severity.ERROR for found in self.findings)
         )
 
-    def scaled(self, factor: float) -> RigEstimate:
+    def scale_by(self, factor: float) -> RigEstimate:
         """The rig in millimetres: lengths times ``factor``. Warns of a person who is not of human
         size.
         """
@@ -121,7 +122,7 @@ class RigCalibration:
     sizes of the person in the image. ``seeds``: best-conditioned pairs that the rig is begun from
     in turn, until one places every linked view with a share of ``good`` inliers; the best is kept.
     ``rounds``: bundle adjustments, each with the noise of views and joints that the one before has
-    shown and points triangulated anew. ``blocks``: see ``uncertainty``.
+    shown and points triangulated anew. ``draws``: see ``uncertainty``.
     """
 
     frames: int
@@ -134,7 +135,7 @@ class RigCalibration:
     good: float
     bundle: BundleAdjustment
     rounds: int
-    blocks: int
+    draws: int
     diagnostics: Diagnostics
 
     def __post_init__(self) -> None:
@@ -147,7 +148,7 @@ class RigCalibration:
             good=self.good,
             rounds=self.rounds,
         )
-        check_positive(blocks=self.blocks)
+        check_positive(draws=self.draws)
 
     @torch.no_grad()
     def __call__(
@@ -196,15 +197,18 @@ class RigCalibration:
         evidence = None
         if adjusted is not None:
             facing = turning(shown.points, shown.estimated)
-            final = adjusted.final
-            spread = uncertainty(observed, adjusted.rig, final, self.blocks, facing.sector)
+            used = frame[frames].unique()
+            height = float(stature(shown.points, shown.estimated)) or 1.0
+            errors = ErrorModel.of(observed, adjusted.rig, used, facing.axes, height)
+            lasting = persistence(observed, adjusted.rig)
+            spread = uncertainty(errors, adjusted.rig, self.bundle.loss_scale, self.draws)
             evidence = Evidence(
                 frames=len(frame.unique()),
                 used=observed.frames,
-                independent=spread.persistence.independent,
+                independent=lasting.independent,
                 turned_deg=facing.degrees,
                 rotation_sd_deg=3**0.5 * float(_rotation_std_deg(spread.covariance).max()),
-                repeatability=spread.repeatability,
+                lasting=spread.lasting,
             )
         case = Case(
             names=tuple(names),
@@ -275,11 +279,11 @@ class RigCalibration:
         adjusted = (self.bundle if self.rounds == 1 else rough)(observed, rig)
         for left in range(self.rounds - 1, 0, -1):
             error = observed.error(adjusted.rig.R, adjusted.rig.t, adjusted.rig.points)
-            observed = reweighted(observed, error, adjusted.rig.inlier)
-            rig = self.resection.triangulate(observed, unitised(adjusted.rig), seed)
-            rig = self.resection.grow(observed, table, self.resection.supported(rig), seed)
+            observed = reweight(observed, error, adjusted.rig.inlier)
+            rig = self.resection.triangulate(observed, unitise(adjusted.rig), seed)
+            rig = self.resection.grow(observed, table, self.resection.keep_supported(rig), seed)
             adjusted = (self.bundle if left == 1 else rough)(observed, rig)
-        adjusted = replace(adjusted, rig=unitised(adjusted.rig))
+        adjusted = replace(adjusted, rig=unitise(adjusted.rig))
         final = self.bundle.state(observed, adjusted.rig)
         return observed, replace(adjusted, final=final)
 
@@ -324,7 +328,7 @@ def _rotation_std_deg(covariance: Float64[Tensor, "V 6 6"]) -> Float64[Tensor, "
     return torch.rad2deg(covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(-1).sqrt())
 
 
-def unitised(rig: PlacedRig) -> PlacedRig:
+def unitise(rig: PlacedRig) -> PlacedRig:
     """The rig in the frame of its first placed view, with the size 1."""
     views = torch.nonzero(rig.placed)[:, 0]
     centre = rig.centre

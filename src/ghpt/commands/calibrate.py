@@ -47,6 +47,7 @@ from ghpt.commands.inputs import (
     resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
+from ghpt.commands.prediction.next_commands import commands_on, prediction_by
 from ghpt.commands.time import calibrate_people, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
 from ghpt.data.formats.names import Name
@@ -69,17 +70,17 @@ from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.observations import Recording
 from ghpt.provenance import provenance
 from ghpt.report.calibration import CalibrationResult, Differences, calibration_summary
-from ghpt.report.rig_figure import DrawnRig
+from ghpt.report.rig_figure import DrawnPerson, DrawnRig
 from ghpt.report.rig_files import (
     RIG_FILES,
     calibrated_cameras,
     write_poses,
     write_result,
     write_rig,
-    write_rig_figure,
 )
 from ghpt.report.terminal import print_document
 
+_REPORTS = ("calibration.json", "report.md", "report.html", "rig.png", "rig.svg")
 _ESTIMATED = "estimated"
 _UPRIGHT = (
     "z along the people's upright, x where the first camera looks, the floor at their lowest ankles"
@@ -212,7 +213,7 @@ def files(settings: CalibrateSettings) -> Files:
     """Return what a calibration reads and writes."""
     check_apart(settings.keypoints, settings.output)
     reads = input_paths(settings.cameras, settings.keypoints, settings.data.get("root"))
-    return Files(reads, (*RIG_FILES, "calibration.json", "report.md", "rig.png", "rig.svg"))
+    return Files(reads, (*RIG_FILES, *_REPORTS))
 
 
 def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
@@ -264,6 +265,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         explains=explain(halves, estimator),
         findings=_findings(case, solution, camera_check),
         provenance=provenance(settings.seed),
+        command=_next_command(settings, bool(usable), output),
     )
     points = change.points(estimate.points)
     estimated = estimate.estimated
@@ -273,15 +275,21 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         write_rig(output, cameras.select(usable).with_cameras(rig.index(usable)), result)
         write_poses(output / "poses.npz", recording, points, estimated, result)
     covariance = change.covariance(estimate.covariance)
-    drawn = DrawnRig(cameras.names, rig, covariance, points, estimated)
-    write_rig_figure(output, result, drawn, estimate.calibrated, reference)
-    write_result(output, result)
+    drawn = DrawnRig(cameras.names, rig, (DrawnPerson(points, estimated),), covariance)
+    write_result(output, result, drawn, estimate.calibrated, reference)
     print_document(calibration_summary(result))
     beside = "the figure and the rig" if usable else "the figure"
-    report = display_path(output / "report.md")
+    report = display_path(output / "report.html")
     _log.info("Report: %s, beside it %s.", report, beside)
     _raise_errors(result, report)
     return result
+
+
+def _next_command(settings: CalibrateSettings, has_rig: bool, output: Path) -> str:
+    """Return what to type after the calibration: predict by the rig, or calibrate better."""
+    if has_rig:
+        return prediction_by(settings, output, cameras=output / "rig.toml")
+    return commands_on(settings, {}, output).calibrate
 
 
 def solve_rig(
@@ -419,7 +427,7 @@ def _given_cameras(settings: CalibrateSettings, people: Detections) -> CameraSet
         cameras = own_cameras(settings, "intrinsics.toml, or image_size=[1920,1080]")
         return cameras.without_extrinsics() if cameras.unposed else cameras
     estimation: IntrinsicsEstimation = build(settings.intrinsics, "intrinsics")
-    return estimation.guessed(people.views, torch.tensor(settings.image_size))
+    return estimation.guess_cameras(people.views, torch.tensor(settings.image_size))
 
 
 def with_intrinsics(settings: CalibrateSettings, case: Case, calibration: RigCalibration) -> Case:

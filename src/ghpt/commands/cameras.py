@@ -5,18 +5,25 @@ files.
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
+from matplotlib.figure import Figure as DrawnFigure
 
 from ghpt.calibration.check.breakages import BREAKAGES
 from ghpt.calibration.check.breakages import Case as SpoiltCase
 from ghpt.calibration.check.camera_check import CameraCheck, CameraCheckResult
 from ghpt.calibration.check.evidence import Evidence, choose, gather
-from ghpt.calibration.check.mended_files import MENDED, write_mended
+from ghpt.calibration.check.mended_files import (
+    CAMERAS_FILE,
+    KEY_POINTS_FILE,
+    MENDED,
+    write_mended,
+)
 from ghpt.calibration.check.recording_time import in_one_time
 from ghpt.calibration.check.setup import Setup, setup_of
 from ghpt.calibration.findings import Finding
@@ -32,15 +39,17 @@ from ghpt.commands.inputs import (
     own_sequence,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
+from ghpt.commands.prediction.next_commands import commands_on, prediction_by
 from ghpt.commands.time import clock_of
 from ghpt.config import Target, build, suggest
 from ghpt.data.people.retimed import retime
-from ghpt.data.people.sequence import Sequence
+from ghpt.data.people.sequence import Sequence as PersonSequence
 from ghpt.data.synthetic.rigs import human36m_rig, panoptic_rig
 from ghpt.errors import GhptConfigError, GhptDataError, check
 from ghpt.files import remove, sweep_temporaries, write_json
-from ghpt.geometry.cameras import CameraSet
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.lens import distort
+from ghpt.geometry.upright import upright
 from ghpt.observations import Recording
 from ghpt.provenance import provenance
 from ghpt.report.camera_check import (
@@ -49,10 +58,18 @@ from ghpt.report.camera_check import (
     camera_check_document,
     camera_check_summary,
 )
+from ghpt.report.document import Block, Figure, Heading
+from ghpt.report.html import write_html
 from ghpt.report.markdown import write_markdown
+from ghpt.report.rig_figure import DrawnPerson, DrawnRig, rig_figure
 from ghpt.report.tables import display_name
 from ghpt.report.terminal import print_document
 
+_RIG = "rig"
+_PICTURES: tuple[Block, ...] = (
+    Heading("Who is where"),
+    Figure(_RIG, "cameras and the person from above and from the side"),
+)
 _log = logging.getLogger(__name__)
 
 
@@ -82,7 +99,7 @@ class Subject:
     evidence: Evidence
     cameras: CameraSet
     setup: Setup
-    sequence: Sequence | None
+    sequence: PersonSequence | None
     """The user's key points, in one time; None for a demonstration."""
     time: tuple[Finding, ...] = ()
     """What was wrong with their time."""
@@ -94,7 +111,7 @@ def files(settings: CamerasSettings) -> Files:
     """Return what a check reads and writes."""
     check_apart(settings.keypoints, settings.output)
     reads = input_paths(settings.cameras, settings.keypoints, settings.data.get("root"))
-    return Files(reads, (*MENDED, "cameras.json", "report.md"))
+    return Files(reads, (*MENDED, "cameras.json", "report.md", "report.html"))
 
 
 def check_cameras(settings: CamerasSettings, output: Path) -> CameraReport:
@@ -111,18 +128,48 @@ def check_cameras(settings: CamerasSettings, output: Path) -> CameraReport:
     for name in MENDED:  # of an earlier run
         remove(output / name)
     result = camera_check(subject.evidence, subject.setup)
-    report = _report(subject, result, settings.seed)
-    mended = any(finding.mended for finding in report.findings)
+    found = (*subject.time, *result.findings)
+    mended = any(finding.mended for finding in found)
     if mended:
         write_mended(output, subject.cameras, result, subject.sequence, subject.time)
+    report = _report(subject, result, settings.seed, _next_command(settings, found, output))
     write_json(output / "cameras.json", report.plain())
     write_markdown(output / "report.md", camera_check_document(report))
+    figure = _rig_figure(subject, result, mended)
+    document = camera_check_document(report, _PICTURES)
+    write_html(output / "report.html", document, {_RIG: figure})
     print_document(camera_check_summary(report))
-    path = display_path(output / "report.md")
+    path = display_path(output / "report.html")
     _log.info("Report: %s%s.", path, ", beside it the mended files" if mended else "")
     if report.findings:
-        raise GhptDataError(subject.source, "cameras", summary(report), f"See {path}.")
+        hint = f"See {path}. Next: {report.command}"
+        raise GhptDataError(subject.source, "cameras", summary(report), hint)
     return report
+
+
+def _next_command(settings: CamerasSettings, found: Sequence[Finding], output: Path) -> str:
+    """Return what to type once the cameras are checked: predict where they are good or mended."""
+    if not found or settings.spoil:
+        return prediction_by(settings, output)
+    if all(finding.mended for finding in found):
+        written = {"cameras": output / CAMERAS_FILE, "keypoints": output / KEY_POINTS_FILE}
+        files = {name: path for name, path in written.items() if path.exists()}
+        return prediction_by(settings, output, **files)
+    return commands_on(settings, {}, output).calibrate
+
+
+def _rig_figure(subject: Subject, result: CameraCheckResult, mended: bool) -> DrawnFigure:
+    """Return the figure of the cameras, beside them as the file has them where some are mended."""
+    setup = result.setup
+    cameras = Cameras(setup.K, setup.R, setup.t)
+    label = "mended" if mended else "as the file has them"
+    person = DrawnPerson(result.points, result.estimated)
+    rig = DrawnRig(subject.evidence.names, cameras, (person,), label=label)
+    given = subject.setup
+    ratio = (setup.t.norm(dim=-1) / given.t.norm(dim=-1).clamp(min=1e-9)).median()
+    reference = Cameras(given.K, given.R, ratio * given.t) if mended else None
+    up = upright(result.points, result.estimated, cameras)
+    return rig_figure("", rig, up, reference, "as the file has them")
 
 
 def summary(report: CameraReport) -> str:
@@ -196,7 +243,7 @@ def synthetic_evidence(
     return evidence, replace(rig, path=recording.name)
 
 
-def _report(subject: Subject, result: CameraCheckResult, seed: int) -> CameraReport:
+def _report(subject: Subject, result: CameraCheckResult, seed: int, command: str) -> CameraReport:
     given = subject.given_px or result.given_px.tolist()
     mended = result.error_px.tolist()
     names = subject.evidence.names
@@ -210,6 +257,7 @@ def _report(subject: Subject, result: CameraCheckResult, seed: int) -> CameraRep
         findings=(*subject.time, *result.findings),
         cameras=tuple(cameras),
         provenance=provenance(seed),
+        command=command,
     )
 
 

@@ -10,6 +10,8 @@ if TYPE_CHECKING:
     from ghpt.commands.app import Command
 
 SUMMARIES = {
+    "demo": "A synthetic person through calibrate, predict and the player: no file is needed.",
+    "detect": "From videos to 2D key points of one person, by MediaPipe.",
     "train": "Train a scorer on one camera arrangement; it then works on any other.",
     "test": "Test a trained model on any cameras: tables, figures and predictions.",
     "predict": "From 2D key points and calibrated cameras to 3D poses.",

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-_SCRIPTS = re.compile(r"(?:python )?\b(train|test|predict|calibrate|cameras|reproduce)\.py\b")
+_SCRIPTS = re.compile(
+    r"(?:python )?\b(demo|detect|train|test|predict|calibrate|cameras|reproduce)\.py\b"
+)
 
 
 @contextmanager

@@ -15,7 +15,6 @@ import numpy as np
 from ghpt.calibration.check.units import decide_unit
 from ghpt.commands.outputs import OutputSettings
 from ghpt.config import Target, build, settings, suggest
-from ghpt.data.datasets.datamodule import KeyPointDataModule
 from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.contents import explain_cameras, explain_key_points
@@ -139,8 +138,12 @@ def _required_path(inputs: InputSettings) -> Path:
     return Path(inputs.keypoints)
 
 
-def find_recording(inputs: InputSettings) -> tuple[KeyPointDataModule, Recording]:
-    """Return a recording of the data set by name; without a name S9/Walking-1 or the first."""
+def find_recording(inputs: InputSettings) -> tuple[Any, Recording]:
+    """Return the DataModule and a recording of it by name; without one S9/Walking-1 or the first.
+
+    The type of the DataModule is not named: Lightning takes seconds to import, and whoever gives
+    files needs none of it.
+    """
     data = build(inputs.data, "data")
     provenance = {"source": data.source, "split": data.evaluate}
     key = data.cache_key(data.evaluate)

@@ -2,6 +2,8 @@
 several processes.
 """
 
+import importlib.util
+import math
 import os
 import shutil
 import signal
@@ -10,7 +12,6 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -22,8 +23,10 @@ from omegaconf import open_dict, read_write
 import __main__
 from ghpt.config import suggest
 from ghpt.errors import GhptConfigError, GhptError
+from ghpt.extras import NotInstalled
 
 LAUNCHER = "hydra/launcher"
+_SEARCH = "hparams_search"
 _LAUNCHERS = ("basic", "submitit_local", "submitit_slurm")
 _PARENT = os.getppid()
 """The process that started this one, which may be gone by the time that one asks."""
@@ -63,6 +66,12 @@ class Job(Generic[S, R]):
     said: str
     """One line: the result's summary, or the error."""
     failed: bool
+    objective: float | None = None
+    """What a search over settings lessens."""
+
+    def __float__(self) -> float:
+        """Return the objective, which Hydra's sweepers ask for; NaN, a failed trial, without."""
+        return math.nan if self.objective is None else self.objective
 
 
 def chosen_launcher(overrides: Sequence[Override], compose_only: bool) -> str:
@@ -76,7 +85,7 @@ def chosen_launcher(overrides: Sequence[Override], compose_only: bool) -> str:
         raise GhptConfigError(
             LAUNCHER, f"there is no {str(name)!r}", suggest(str(name), _LAUNCHERS)
         )
-    if name != "basic" and find_spec("submitit") is None:
+    if name != "basic" and importlib.util.find_spec("submitit") is None:
         raise GhptConfigError(
             LAUNCHER, f"{name} needs hydra-submitit-launcher", "Run: pip install -e '.[slurm]'"
         )
@@ -90,8 +99,18 @@ def chosen_launcher(overrides: Sequence[Override], compose_only: bool) -> str:
     return str(name)
 
 
+def check_search(words: Sequence[str], sweep: bool) -> None:
+    """Raise GhptConfigError if the words ask for a search over settings that cannot be made."""
+    if not any(word.startswith(f"{_SEARCH}=") and word != f"{_SEARCH}=null" for word in words):
+        return
+    if not sweep:
+        raise GhptConfigError(_SEARCH, "is of several runs", "Add -m.")
+    if importlib.util.find_spec("optuna") is None:
+        raise NotInstalled(_SEARCH, "optuna")
+
+
 @contextmanager
-def awaited(ended: list[Job[Any, Any]]) -> Iterator[None]:
+def record_jobs(ended: list[Job[Any, Any]]) -> Iterator[None]:
     """Within the block, every job that submitit's launchers start is added to ``ended`` when it
     ends, however it does.
 
@@ -189,8 +208,9 @@ def _stop(jobs: list[Any]) -> None:
 
 
 def take_signals() -> None:
-    """Within a job of a local pool: an interrupt, or SIGTERM, stops it (`awaited` and submitit have
-    them ignored).
+    """Within a job of a local pool: have an interrupt, or SIGTERM, stop it.
+
+    `record_jobs` and submitit have them ignored.
     """
     if os.environ.get("SUBMITIT_EXECUTOR") == "local":
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -214,7 +234,7 @@ def own_command(program: Program, added: Sequence[str] = ()) -> Iterator[None]:
     settings = [word for word in hydra.overrides.task if not word.startswith("output=")]
     output = f"output='{hydra.runtime.output_dir}'"
     sys.argv[:] = [program.path, *settings, *added, output]
-    __main__.__spec__ = None if program.module is None else find_spec(program.module)
+    __main__.__spec__ = None if program.module is None else importlib.util.find_spec(program.module)
     try:
         yield
     finally:

@@ -6,6 +6,7 @@ A mistake is named, with what exists, before anything heavy is imported.
 import argparse
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,9 +31,10 @@ _FORMER_NAMES = {
     "triangulation": "estimator",
     "estimator.classical": "predictor.classical",
     "estimator.learned": "predictor.learned",
+    "model.scheduler": "model.schedule",
     "model.spread": "model.logit_std_cap",
 }
-"""Settings by the names that scripts written for earlier versions give."""
+"""Settings by the names that scripts for earlier versions, or others of their kind, give."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,11 @@ class Source:
 def compose(source: Source, words: Sequence[str], with_hydra: bool = False) -> Any:
     """Return the DictConfig that the words of a command line make of the yaml files."""
     overrides = [_parse(word) for word in words]
-    with hydra.initialize_config_dir(str(source.folder), version_base="1.3"):
+    with ExitStack() as stack:
+        # Under a command Hydra is initialised already, with the folder of that command.
+        if not GlobalHydra.instance().is_initialized():
+            folder = hydra.initialize_config_dir(str(source.folder), version_base="1.3")
+            stack.enter_context(folder)
         search_path = _search_path(source, overrides)
         return hydra.compose(
             source.name, overrides=[*words, *search_path], return_hydra_config=with_hydra

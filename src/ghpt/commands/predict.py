@@ -29,6 +29,7 @@ from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.camera_check import check_cameras
 from ghpt.commands.prediction.gaps import OWN, Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
+from ghpt.commands.prediction.page import PicturedPerson, limbs_of, write_page
 from ghpt.commands.prediction.pictures import write_pictures
 from ghpt.commands.prediction.report import report_document, summary_document, verdict_document
 from ghpt.commands.prediction.result import PersonSummary, PredictionResult
@@ -48,7 +49,7 @@ from ghpt.data.people.sequence import Sequence
 from ghpt.data.people.stored import open_stored, stored_sequence
 from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Chunks, Evidence, Scene, find_marker_set
-from ghpt.export.scene import origin_note
+from ghpt.export.scene import images_of, origin_note
 from ghpt.files import remove, sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Estimator
@@ -59,11 +60,14 @@ from ghpt.models.estimators.trajectory.predictor import TrajectoryPredictor
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, Reconstruction
+from ghpt.report.course import sample_course
+from ghpt.report.course_figure import ViewCourse
 from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NAMES
 from ghpt.report.terminal import print_document
 from ghpt.skeleton import Skeleton
 
+_REPORTS = ("prediction.json", "report.md", "report.html")
 SHARDS = ".shards"
 """The folder of the shards, within the output. It may be deleted: the next run then starts anew."""
 _OWN_FORMATS = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if name in WRITERS)
@@ -91,6 +95,8 @@ _log = logging.getLogger(__name__)
 
 TRAJECTORY = "trajectory"
 """The estimator of all frames together."""
+ONLINE = "online"
+"""The same while they are recorded."""
 _ALIASES = {"frame": "adaptive_ransac"}
 """Other names of baselines."""
 
@@ -102,6 +108,7 @@ class PredictorSettings:
     classical: Target
     learned: Target
     trajectory: Target
+    online: Target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,6 +121,7 @@ class PredictSettings(InputSettings):
     trust: list[str]
     hypotheses: int | None
     estimator: str
+    lag: float
     fill: int | str | None
     interpolation: str | None
     smooth: float | None
@@ -138,7 +146,7 @@ class PredictSettings(InputSettings):
     strict: bool
     seed: int
 
-    def changed(self) -> dict[str, object]:
+    def non_defaults(self) -> dict[str, object]:
         """Return what says whose joints are written how, where it is not the default."""
         values = {name: getattr(self, name) for name in _DEFAULTS}
         return {name: value for name, value in values.items() if value != _DEFAULTS[name]}
@@ -148,7 +156,7 @@ class PredictSettings(InputSettings):
             count = getattr(self, name)
             check(count >= 1, name, f"is {count}", "Give 1 or more.")
         if not self.ckpt:
-            names = (TRAJECTORY, *_ALIASES, *self.baselines)
+            names = (TRAJECTORY, ONLINE, *_ALIASES, *self.baselines)
             _check_exists("estimator", self.estimator, dict.fromkeys(names))
         for name in self.compare:
             _check_exists("compare", name, self.baselines)
@@ -182,7 +190,7 @@ def files(settings: PredictSettings) -> Files:
     names = [WRITERS[name].file for name in settings.formats or _OWN_FORMATS]
     return Files(
         reads=input_paths(settings.ckpt, settings.cameras, settings.keypoints, root),
-        writes=(*names, "prediction.json", "report.md"),
+        writes=(*names, *_REPORTS),
         growing=(SHARDS,),
     )
 
@@ -200,25 +208,31 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     sequences = open_sequences(settings, setup.camera_check)
     sweep_temporaries(output)
     results: list[PredictionResult] = []
+    pictured: list[PicturedPerson] = []
     world: World | None = None
     for person, sequence in enumerate(sequences):
         folder = _person_folder(output, person)
         folder.mkdir(parents=True, exist_ok=True)
         shards = _person_folder(output / SHARDS, person)
-        result, world = _predict_person(settings, setup, sequence, world, folder, shards)
-        if result is not None:
-            results.append(_judged(settings, setup, sequence, result, person, output))
-    if not results:
+        found = _predict_person(settings, setup, sequence, world, folder, shards)
+        if found is not None:
+            world = found.world
+            results.append(_judge(settings, setup, sequence, found.result, person, output))
+            pictured.append(found.pictured)
+    if world is None:
         return None
     _remove_others(output, len(sequences))
     first = results[0]
-    if len(results) > 1 and world is not None:
-        scene = Scene(world.cameras(sequences[0].cameras.cameras))
+    cameras = world.cameras(sequences[0].cameras.cameras)
+    if len(results) > 1:
+        scene = Scene(cameras, images=images_of(sequences[0].cameras))
         folders = [_person_folder(output, person) for person in range(len(results))]
         write_pictures(output, folders, own_title(settings), first.formats, scene)
         first = replace(first, people=tuple(map(_about_person, results)))
     for person, result in enumerate([first, *results[1:]]):
-        _write_report(result, _person_folder(output, person))
+        folder = _person_folder(output, person)
+        write_page(folder, result, pictured[person], pictured, world, cameras)
+        _write_report(result, folder)
     verdict = first.verdict
     if settings.strict and verdict is not None and verdict.level != Level.GOOD:
         worst = verdict.findings[0]
@@ -257,12 +271,23 @@ def _person_folder(output: Path, person: int) -> Path:
 
 def _remove_others(output: Path, count: int) -> None:
     """Remove the files of people of an earlier run who are not among the ``count`` of this one."""
-    names = (*(writer.file for writer in WRITERS.values()), "prediction.json", "report.md")
+    names = (*(writer.file for writer in WRITERS.values()), *_REPORTS)
     for folder in output.glob("person_*"):
         number = folder.name.removeprefix("person_")
         if number.isdecimal() and int(number) >= count:
             for name in names:
                 remove(folder / name)
+
+
+@dataclass(frozen=True)
+class _Predicted:
+    """What became of a person."""
+
+    result: PredictionResult
+    """Without a verdict."""
+    world: World
+    """That of the files."""
+    pictured: PicturedPerson
 
 
 def _predict_person(
@@ -272,11 +297,11 @@ def _predict_person(
     world: World | None,
     output: Path,
     folder: Path,
-) -> tuple[PredictionResult | None, World | None]:
+) -> _Predicted | None:
     """Predict one person and write their poses into ``output``, with shards in ``folder``.
 
-    ``world`` is that of the files, None where it is to be chosen by this person. Returns what was
-    found, without a verdict, and the world; None twice in the processes beside the first.
+    ``world`` is that of the files, None where it is to be chosen by this person. Returns None in
+    the processes beside the first.
     """
     estimator = setup.estimator
     gaps = Gaps(
@@ -285,7 +310,7 @@ def _predict_person(
         cut_off_hz=settings.smooth,
         rate_hz=sequence.rate_hz,
     )
-    if settings.smooth and estimator.name == TRAJECTORY:
+    if settings.smooth and estimator.name in (TRAJECTORY, ONLINE):
         _log.info("smooth: a trajectory is smooth already; it is filtered once more.")
     joints = joints_of(settings, sequence.skeleton)
     about = _about(sequence, joints, estimator, gaps, setup.origin)
@@ -300,7 +325,7 @@ def _predict_person(
         len(about.camera_names),
         estimator.text,
     )
-    predictor = _fitted(estimator, sequence, settings)
+    predictor = _fit(estimator, sequence, settings)
     key = _shard_key(sequence, estimator, setup.origin)
     how = RunSettings(
         settings.shard_frames, settings.batch, settings.progress_bar, settings.trainer
@@ -308,15 +333,16 @@ def _predict_person(
     weights = estimator.weights
     with predict_shards(sequence, predictor, weights, folder, key, how) as shards:
         if shards is None:
-            return None, None
+            return None
         with apply_gaps(gaps, shards, len(sequence.skeleton), output) as key_points:
-            own = _mapped(key_points, joints)
+            own = _map_chunks(key_points, joints)
             world = world or _choose_world(settings, sequence, about, own)
-            chunks = _mapped(own, world.reconstruction)
+            chunks = _map_chunks(own, world.reconstruction)
             _write_formats(settings, output, world, about, chunks, formats, sequence, shards)
             views = about.camera_names
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
-    evaluation = _evaluate(estimator, setup.compared, sequence, settings)
+            course = sample_course(chunks(), len(sequence), limbs_of(about.joints))
+    evaluation, view_course = _evaluate(estimator, setup.compared, sequence, settings)
     result = PredictionResult(
         data=sequence.title,
         source=sequence.source,
@@ -334,10 +360,10 @@ def _predict_person(
         world=world.numbers(),
         provenance=about.provenance,
     )
-    return result, world
+    return _Predicted(result, world, PicturedPerson(about, view_course, course))
 
 
-def _judged(
+def _judge(
     settings: PredictSettings,
     setup: _Setup,
     sequence: Sequence,
@@ -349,7 +375,7 @@ def _judged(
     measures = _measures(result)
     asked = not person and setup.camera_check.is_worthwhile(measures.view_errors)
     mistakes = check_cameras(sequence.as_joints(), setup.camera_check) if asked else ()
-    own = settings.changed() | ({"person": person} if person else {})
+    own = settings.non_defaults() | ({"person": person} if person else {})
     commands = commands_on(settings, own, output)
     verdict = setup.judge(measures, mistakes, result.unit_mm, commands)
     return replace(result, verdict=verdict)
@@ -391,7 +417,14 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
         return _learned_estimator(settings, settings.ckpt)
     name = _ALIASES.get(settings.estimator, settings.estimator)
     if name == TRAJECTORY:
-        return _trajectory(settings)
+        text = "the trajectory of the whole recording (no ckpt was given)"
+        group = _with_exchange(settings, settings.predictor.trajectory)
+        return _trajectory(settings, TRAJECTORY, text, group)
+    if name == ONLINE:
+        text = f"the trajectory with a lag of {settings.lag:g} s (no ckpt was given)"
+        online = dict(settings.predictor.online)
+        own = _with_exchange(settings, online["settings"]) | {"lag_s": settings.lag}
+        return _trajectory(settings, ONLINE, text, online | {"settings": own})
     group = _with_flips(settings, settings.predictor.classical)
     baseline = settings.baselines[name]
     factory = build(group, "predictor.classical")
@@ -408,18 +441,23 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
     )
 
 
-def _trajectory(settings: PredictSettings) -> PoseEstimator:
-    group = dict(settings.predictor.trajectory)
-    if not settings.flips:
-        trajectory = dict(group["trajectory"])
-        group["trajectory"] = trajectory | {
-            "solver": dict(trajectory["solver"]) | {"exchange": None}
-        }
+def _with_exchange(settings: PredictSettings, group: Target) -> dict[str, Any]:
+    """Return what holds a trajectory, without exchanged sides if none are looked for."""
+    if settings.flips:
+        return dict(group)
+    trajectory = dict(group["trajectory"])
+    solver = dict(trajectory["solver"]) | {"exchange": None}
+    return dict(group) | {"trajectory": trajectory | {"solver": solver}}
+
+
+def _trajectory(
+    settings: PredictSettings, name: str, text: str, group: dict[str, Any]
+) -> PoseEstimator:
     flips: LeftRightFlips | None = build(settings.predictor.classical["flips"], "flips")
     return PoseEstimator(
-        name=TRAJECTORY,
-        text="the trajectory of the whole recording (no ckpt was given)",
-        predictor=build(group, "predictor.trajectory"),
+        name=name,
+        text=text,
+        predictor=build(group, f"predictor.{name}"),
         flips=flips if settings.flips else None,
         weights=None,
         identity=group,
@@ -530,7 +568,7 @@ def _interpolation(estimator: PoseEstimator) -> str:
     return OWN if estimator.name == TRAJECTORY else "pchip"
 
 
-def _mapped(chunks: Chunks, function: Callable[[Reconstruction], Reconstruction]) -> Chunks:
+def _map_chunks(chunks: Chunks, function: Callable[[Reconstruction], Reconstruction]) -> Chunks:
     return lambda: map(function, chunks())
 
 
@@ -547,7 +585,7 @@ def joints_of(settings: PredictSettings, skeleton: Skeleton) -> JointMeans:
     return human_joints(skeleton) if settings.joints == "human36m" else all_joints(skeleton)
 
 
-def _fitted(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:
+def _fit(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:
     """Return the predictor for a sequence's key points, with what they tell of the recording."""
     predictor = estimator.predictor.for_skeleton(sequence.skeleton)
     return predictor.fit(sequence, settings.fitted_frames)
@@ -558,14 +596,16 @@ def _evaluate(
     compared: Mapping[str, Estimator],
     sequence: Sequence,
     settings: PredictSettings,
-) -> Evaluation:
-    """Return what the estimators are worth on the 17 joints, or on all key points without them."""
+) -> tuple[Evaluation, ViewCourse]:
+    """Return what the estimators are worth on the 17 joints, or on all key points without them, and
+    the held-out errors of the prediction's own over time.
+    """
     judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
     sample = judged.read(judged.spread(settings.fitted_frames))
-    own = _fitted(estimator, judged, settings)
+    own = _fit(estimator, judged, settings)
     estimates: dict[str, Estimate] = {estimator.name: own.estimate}
     for name, other in compared.items():
-        estimates.setdefault(name, other.fitted(sample))
+        estimates.setdefault(name, other.fit_to(sample))
     flips = estimator.flips and estimator.flips.for_skeleton(judged.skeleton)
     test_halves = None
     if isinstance(own, TrajectoryPredictor):
@@ -651,7 +691,12 @@ def _write_formats(
     shards: Shards,
 ) -> None:
     cameras = world.cameras(sequence.cameras.cameras)
-    scene = Scene(cameras, lambda: _evidence(sequence, shards))
+    scene = Scene(
+        cameras,
+        evidence=lambda: _evidence(sequence, shards),
+        images=images_of(sequence.cameras),
+        key_point_joints=joints_of(settings, sequence.skeleton).key_point_joints,
+    )
     up = {"world_up": "z"} if world.name == "people" else {}
     given = {name: value for name, value in settings.trc.items() if value is not None}
     arguments: dict[str, dict[str, Any]] = {
@@ -683,7 +728,7 @@ def _write_report(result: PredictionResult, output: Path) -> None:
     print_document(summary_document(result))
     written = ", ".join(WRITERS[name].file for name in result.formats)
     _log.info("Written: %s and report.md in %s.", written, display_path(output))
-    print_document(verdict_document(result))
+    print_document(verdict_document(result, display_path(output / "report.html")))
 
 
 COMMAND = Command(

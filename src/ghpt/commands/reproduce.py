@@ -19,7 +19,7 @@ from ghpt.commands.jobs import Job
 from ghpt.commands.outputs import Files, OutputSettings
 from ghpt.config import suggest
 from ghpt.errors import GhptConfigError, check
-from ghpt.extras import EXTRAS, check_installed
+from ghpt.extras import check_installed
 from ghpt.paper.ablations import tables as ablations
 from ghpt.paper.camera import tables as camera_tables
 from ghpt.paper.engine.artefact import Artefact, Results
@@ -31,6 +31,7 @@ from ghpt.paper.engine.tasks import Task
 from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
 from ghpt.paper.pose import figures as pose_figures
 from ghpt.paper.robustness import curves as robustness
+from ghpt.paper.robustness import sets
 from ghpt.provenance import provenance
 from ghpt.report.document import Code, Text
 from ghpt.report.tables import display_name
@@ -42,6 +43,7 @@ _PARTS = (
     pose_figures,
     camera_tables,
     view_weights,
+    sets,
     ablations,
     robustness,
 )
@@ -127,7 +129,7 @@ def _reproduce(
 ) -> Counts:
     start = time.perf_counter()
     artefacts = choose(settings.only)
-    for package in EXTRAS:  # before the work, not after hours of it
+    for package in ("pycolmap", "cv2"):  # before the work, not after hours of it
         check_installed(package, "reproduce")
     roots = _roots(settings.data)
     setups = [Setup(conf, roots, settings.overrides, settings.sizes, seed) for seed in seeds]

@@ -1,8 +1,9 @@
 """Training: from settings to a checkpoint that test.py can use on any cameras."""
 
 import logging
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,19 +12,20 @@ import torch
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import as_started, display_path, shell_override
-from ghpt.commands.lost import told
+from ghpt.commands.lost import report_end
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
 from ghpt.commands.resume import Start, resumable
-from ghpt.commands.trainer import make_trainer, progress
-from ghpt.config import Target, build, check_plain
-from ghpt.errors import GhptConfigError
+from ghpt.commands.trainer import in_our_words, make_loggers, make_trainer, progress
+from ghpt.config import Target, build, check_plain, suggest
+from ghpt.errors import GhptConfigError, check
 from ghpt.files import adopt, set_aside, sweep_temporaries
-from ghpt.models.callbacks import LogHyperparameters, SaveLast, best_checkpoint
+from ghpt.models.callbacks import Best, LogHyperparameters, SaveLast, best_checkpoint
 from ghpt.models.checkpoint import FORMAT_VERSION, LAST, PREVIOUS, AtomicCheckpointIO
+from ghpt.models.loss import LossTerms
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.registry import check_registered, packages_to_trust
 from ghpt.provenance import provenance
-from ghpt.report.logger import ForgivingTensorBoard
+from ghpt.report.hyperparameters import flatten
 from ghpt.report.tables import display_name
 
 BEST = "best.ckpt"
@@ -44,6 +46,14 @@ class TrainSettings(OutputSettings):
     resume: bool | Literal["auto"]
     """Whether to go on from a checkpoint in the output; ``auto``: where there is one."""
     progress_bar: bool
+    logger: Target = field(default_factory=dict)
+    """What shows the curves, by name; each is given the output folder."""
+    callbacks: Target = field(default_factory=dict)
+    """Lightning's callbacks, by name."""
+    best: Best = field(default_factory=Best)
+    """Which epoch ``best.ckpt`` is of, and whose metric a search lessens."""
+    compile: bool = False
+    """Whether the scorer is compiled (torch.compile)."""
 
     def decisive(self) -> dict[str, Any]:
         """Return the settings that a checkpoint is of, as plain data."""
@@ -72,6 +82,10 @@ def train(settings: TrainSettings, output: Path) -> dict[str, float]:
     model = build(settings.model, "model")
     _check_optimizer(model)
     _warn_of_classes(settings.model)
+    callbacks = build(settings.callbacks, "callbacks")
+    _check_monitored(settings.best, callbacks, model)
+    if settings.compile:
+        model.scorer.compile()
     data.bind(model.problem)
     identity = _identity(settings, data)
     last = output / LAST
@@ -80,12 +94,13 @@ def train(settings: TrainSettings, output: Path) -> dict[str, float]:
     trainer = make_trainer(
         settings.trainer,
         default_root_dir=output,
-        logger=ForgivingTensorBoard(output),
+        logger=make_loggers(settings.logger, output),
         plugins=[AtomicCheckpointIO()],
         callbacks=[
             saver,
-            best_checkpoint(output),
+            best_checkpoint(output, settings.best),
             LogHyperparameters(_hyperparameters(settings, data)),
+            *callbacks.values(),
             *progress(settings.progress_bar),
         ],
         enable_progress_bar=settings.progress_bar,
@@ -96,7 +111,7 @@ def train(settings: TrainSettings, output: Path) -> dict[str, float]:
         _begin(start, last)
     ckpt_path = start.checkpoint and str(start.checkpoint)
     try:
-        with told(trainer):
+        with report_end(trainer), in_our_words():
             trainer.fit(model, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
     except (SystemExit, Exception) as stop:
         if trainer.is_global_zero and (saver.saved is not None or isinstance(stop, SystemExit)):
@@ -135,18 +150,7 @@ def _hyperparameters(settings: TrainSettings, data: Any) -> dict[str, Any]:
         "train_samples": data.train_samples,
         "seed": settings.seed,
     }
-    return about | dict(_leaves(settings.model, "model"))
-
-
-def _leaves(config: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield ``("a.b", value)`` of nested settings, lists as text: what TensorBoard takes."""
-    if isinstance(config, Mapping):
-        for name, value in config.items():
-            if not name.startswith("_"):
-                yield from _leaves(value, f"{path}.{name}")
-    else:
-        plain = isinstance(config, bool | int | float | str)
-        yield path, config if plain else str(config)
+    return about | dict(flatten(settings.model, "model"))
 
 
 def _start(settings: TrainSettings, output: Path, model: StochasticEstimator) -> Start:
@@ -173,6 +177,20 @@ def _check_optimizer(model: StochasticEstimator) -> None:
         model.configure_optimizers()
     except (TypeError, ValueError) as error:
         raise GhptConfigError("model.optimizer", str(error), "Change this setting.") from error
+
+
+def _check_monitored(best: Best, callbacks: Mapping[str, Any], model: StochasticEstimator) -> None:
+    """Raise GhptConfigError, before the training, for a metric that it will not log."""
+    logged = [f"{_VALIDATION}{name}" for name in model.validation]
+    logged += [f"train/{name}" for name in LossTerms._fields]
+    monitored = {"best": best.monitor}
+    for name, callback in callbacks.items():
+        monitor = getattr(callback, "monitor", None)
+        if isinstance(monitor, str):
+            monitored[f"callbacks.{name}"] = monitor
+    for path, metric in monitored.items():
+        hint = suggest(metric, logged)
+        check(metric in logged, f"{path}.monitor", f"there is no metric {metric!r}", hint)
 
 
 def _warn_of_classes(model: Target) -> None:
@@ -209,7 +227,19 @@ def _say_stopped(last: Path, step: int | None) -> None:
     _log.warning("Go on with the same command and %s resume=true", output)
 
 
-COMMAND = Command(name="train", settings=TrainSettings, task=train, summary=summary, files=files)
+def objective(settings: TrainSettings, errors: Mapping[str, float]) -> float:
+    """Return what a search over settings lessens, mm."""
+    return errors.get(settings.best.monitor, math.nan)
+
+
+COMMAND = Command(
+    name="train",
+    settings=TrainSettings,
+    task=train,
+    summary=summary,
+    files=files,
+    objective=objective,
+)
 
 
 if __name__ == "__main__":

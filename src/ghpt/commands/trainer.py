@@ -1,15 +1,22 @@
 """Lightning's Trainer, as the yaml has it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import lightning as L
 from lightning.fabric.utilities.exceptions import MisconfigurationException
+from lightning.pytorch.loggers import Logger
 
 from ghpt.commands.lost import OwnSignals
 from ghpt.config import build, check_arguments
-from ghpt.errors import GhptConfigError
+from ghpt.errors import GhptConfigError, check, one_line
+from ghpt.extras import EXTRAS, NotInstalled
 from ghpt.models.callbacks import Progress
+
+_PRECISIONS = ("32-true", "bf16-mixed", "16-mixed")
+"""How the scorer may calculate; geometry is in float64 whatever is said."""
 
 
 def make_trainer(settings: Mapping[str, Any], **ours: Any) -> L.Trainer:
@@ -22,6 +29,9 @@ def make_trainer(settings: Mapping[str, Any], **ours: Any) -> L.Trainer:
     for key in set(built) & set(ours):
         problem = "is not for the configuration: ghpt sets it"
         raise GhptConfigError(f"trainer.{key}", problem, "Leave it out.")
+    precision = built.get("precision", _PRECISIONS[0])
+    hint = f"Existing: {', '.join(_PRECISIONS)}."
+    check(precision in _PRECISIONS, "trainer.precision", f"is {precision!r}", hint)
     check_arguments(L.Trainer, built, "trainer")
     try:
         return L.Trainer(**built, **ours, use_distributed_sampler=False)
@@ -33,3 +43,30 @@ def make_trainer(settings: Mapping[str, Any], **ours: Any) -> L.Trainer:
 def progress(shown: bool) -> list[L.Callback]:
     """Return the callbacks of the progress bar, none where it is not shown."""
     return [Progress()] if shown else []
+
+
+def make_loggers(settings: Mapping[str, Any], output: Path) -> list[Logger]:
+    """Return the loggers of the yaml's settings, which write into ``output``.
+
+    Raises GhptConfigError for what they do not take, and NotInstalled for a missing package.
+    """
+    loggers = []
+    for name, logger in build(settings, "logger").items():
+        with in_our_words(f"logger.{name}"):
+            loggers.append(logger(save_dir=str(output)))
+    return loggers
+
+
+@contextmanager
+def in_our_words(key: str = "trainer") -> Iterator[None]:
+    """Within the block, what Lightning says of settings names the ``key`` that they stand under."""
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        missing = next((name for name in EXTRAS if name in str(error)), None)
+        if missing is None:
+            raise
+        raise NotInstalled(key, missing) from error
+    except MisconfigurationException as error:
+        hint = "Change this setting."
+        raise GhptConfigError(key, one_line(error).rstrip("."), hint) from error

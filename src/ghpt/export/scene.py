@@ -6,11 +6,12 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.geometry.cameras import Cameras
+from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.epipolar import homogeneous
+from ghpt.geometry.lens import pad_lens
 from ghpt.reconstruction import About, Reconstruction
 
 
@@ -32,6 +33,28 @@ class Evidence:
 
 
 @dataclass(frozen=True)
+class Images:
+    """The images of V views."""
+
+    lens: Float[Tensor, "V 9"]
+    """Coefficients of ``ghpt.geometry.lens``."""
+    size: Float[Tensor, "V 2"]
+    """Width and height, pixels."""
+    videos: tuple[str | None, ...] = ()
+    """Where the page finds the video of each view; empty, or None, where there is none."""
+
+
+@dataclass(frozen=True)
+class OtherPoses:
+    """Poses beside the reconstruction's."""
+
+    name: str
+    bones: tuple[tuple[int, int], ...]
+    points: Callable[[Int[Tensor, " T"]], Float[Tensor, "T J 3"]]
+    """Returns the poses at frame numbers, mm in the world; NaN where there are none."""
+
+
+@dataclass(frozen=True)
 class Scene:
     """What a picture shows besides the skeleton."""
 
@@ -39,12 +62,25 @@ class Scene:
     """The views, in the order of ``About.camera_names``; leading dimension V."""
     evidence: Callable[[], Iterator[Evidence]] | None = None
     """In parts as long as those of the reconstruction."""
+    images: Images | None = None
+    """What the views' images are like; None: ideal pinholes, as large as twice the principal point.
+    """
+    key_point_joints: tuple[tuple[int, int], ...] = ()
+    """Key points of the evidence, and the joints of the reconstruction that they are."""
+    others: tuple[OtherPoses, ...] = ()
+    """What other estimators make of the same frames."""
+
+
+def images_of(cameras: CameraSet, videos: tuple[str | None, ...] = ()) -> Images:
+    """Return what the images of cameras are like, as far as their file says it."""
+    size = 2 * cameras.K[:, :2, 2] if cameras.size is None else cameras.size.double()
+    return Images(pad_lens(cameras.distortion), size, videos)
 
 
 def title(about: About) -> str:
     """Return the title of a picture; it says where the data are not real."""
-    source = "synthetic data" if about.source == "synthetic" else about.source
-    return f"{about.name}: 3D poses from {source}"
+    synthetic = about.source == "synthetic" and "synthetic" not in about.name
+    return f"{about.name} (synthetic data)" if synthetic else about.name
 
 
 def origin_note(about: About) -> str:

@@ -157,6 +157,19 @@ def matrix_to_vector(R: Float[Tensor, "*B 3 3"]) -> Float[Tensor, "*B 3"]:
     return axis * factor
 
 
+def rotation_angle(
+    one: Float[Tensor, "*B 3 3"], other: Float[Tensor, "*B 3 3"]
+) -> Float[Tensor, "*B"]:
+    """Return the angle of the rotation between the two, radians in [0, pi], float64."""
+    difference = one.double() @ other.double().mT
+    skew = (difference - difference.mT) / 2
+    components = (skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0])
+    sine = torch.linalg.vector_norm(torch.stack(components, dim=-1), dim=-1)
+    trace = difference.diagonal(dim1=-2, dim2=-1).sum(-1)
+    # acos loses half of the digits at 0 and 180 degrees; atan2 none.
+    return torch.atan2(sine, (trace - 1) / 2)
+
+
 def rotation_between(a: Float[Tensor, "*B 3"], b: Float[Tensor, "*B 3"]) -> Float[Tensor, "*B 3 3"]:
     """Return the smallest rotation that takes the direction of a to that of b.
 

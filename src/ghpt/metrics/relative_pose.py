@@ -13,6 +13,7 @@ from torch.linalg import vector_norm
 from torchmetrics import Metric
 
 from ghpt.geometry.cameras import Cameras, project
+from ghpt.geometry.rotations import rotation_angle
 from ghpt.geometry.triangulation import triangulate
 
 
@@ -28,30 +29,12 @@ Errors = Tensor | tuple[Tensor, Tensor]
 """Errors, or errors and which of them are measured."""
 
 
-def _angle(cross: Float[Tensor, "*B 3"], cosine: Float[Tensor, "*B"]) -> Float[Tensor, "*B"]:
-    # acos loses half of the digits at 0 and 180 degrees; atan2 none.
-    return torch.atan2(vector_norm(cross, dim=-1), cosine)
-
-
-def _rotation_angle(
-    estimate: Float[Tensor, "*B 3 3"],
-    truth: Float[Tensor, "*B 3 3"],
-) -> Float[Tensor, "*B"]:
-    """Return the angle of the rotation between the two, radians."""
-    difference = estimate.double() @ truth.double().mT
-    skew = (difference - difference.mT) / 2
-    components = (skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0])
-    axis = torch.stack(components, dim=-1)
-    trace = difference.diagonal(dim1=-2, dim2=-1).sum(-1)
-    return _angle(axis, (trace - 1) / 2)
-
-
 def rotation_deg(
     estimate: Float[Tensor, "*B 3 3"],
     truth: Float[Tensor, "*B 3 3"],
 ) -> Float[Tensor, "*B"]:
     """Return the angle of the rotation between the two, degrees in [0, 180]."""
-    return torch.rad2deg(_rotation_angle(estimate, truth))
+    return torch.rad2deg(rotation_angle(estimate, truth))
 
 
 def quaternion_error(
@@ -64,7 +47,7 @@ def quaternion_error(
     180 degrees: there the two signs may differ, and a tiny error would count as 2. With a the angle
     between R and R*, it is 2 sin(a / 4).
     """
-    return 2 * torch.sin(_rotation_angle(estimate, truth) / 4)
+    return 2 * torch.sin(rotation_angle(estimate, truth) / 4)
 
 
 def translation_error(
@@ -87,7 +70,7 @@ def translation_deg(
     truth = truth.double()
     cross = torch.linalg.cross(estimate, truth)
     cosine = (estimate * truth).sum(-1)
-    return torch.rad2deg(_angle(cross, cosine))
+    return torch.rad2deg(torch.atan2(vector_norm(cross, dim=-1), cosine))
 
 
 def error_2d(

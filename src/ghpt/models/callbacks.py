@@ -2,12 +2,14 @@
 
 import signal
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, Literal
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint, RichProgressBar
+from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from ghpt.errors import check
@@ -98,7 +100,7 @@ class SaveLast(Callback):
 
 
 class LogHyperparameters(Callback):
-    """Shows the settings beside the final validation errors in TensorBoard."""
+    """Shows the settings beside the final validation errors."""
 
     def __init__(self, values: dict[str, Any]) -> None:
         self.values = values
@@ -108,9 +110,12 @@ class LogHyperparameters(Callback):
         final = {}
         for name, value in trainer.callback_metrics.items():
             if name.startswith("validation/"):
-                final[name.replace("validation/", "final/")] = value.item()
-        if trainer.logger and final:
-            trainer.logger.log_hyperparams(self.values, final)
+                final[name] = value.item()
+        for logger in trainer.loggers if final else ():
+            if isinstance(logger, TensorBoardLogger):
+                logger.log_hyperparams(self.values, final)
+            else:
+                logger.log_hyperparams(self.values)
 
 
 class Progress(RichProgressBar):
@@ -122,12 +127,20 @@ class Progress(RichProgressBar):
         return {} if error is None else {"mm": f"{error:.1f}"}
 
 
-def best_checkpoint(folder: Path) -> ModelCheckpoint:
-    """Return the callback that keeps ``best.ckpt``: the lowest validation error of ``weight``."""
+@dataclass(frozen=True)
+class Best:
+    """Which epoch is the best: the one with the least, or the greatest, of a metric."""
+
+    monitor: str = "validation/weight"
+    mode: Literal["min", "max"] = "min"
+
+
+def best_checkpoint(folder: Path, best: Best) -> ModelCheckpoint:
+    """Return the callback that keeps ``best.ckpt``."""
     return ModelCheckpoint(
         dirpath=folder,
         filename="best",
-        monitor="validation/weight",
-        mode="min",
+        monitor=best.monitor,
+        mode=best.mode,
         enable_version_counter=False,
     )

@@ -31,6 +31,10 @@ _VALIDATED = ("weight", "average", "random")
 """The aggregations whose errors a training shows."""
 
 
+_OF_LIGHTNING = ("map_location", "hparams_file", "strict", "weights_only")
+"""Arguments of Lightning's ``load_from_checkpoint``."""
+
+
 class StochasticEstimator(L.LightningModule):
     """Hypothesis generator, scorer and loss (paper, section 3), for any ``Problem``.
 
@@ -193,6 +197,18 @@ class StochasticEstimator(L.LightningModule):
             return optimizer
         scheduler = {"scheduler": self.schedule(optimizer), "interval": "step"}
         return {"optimizer": optimizer, "lr_scheduler": scheduler}
+
+    @classmethod
+    def load_from_checkpoint(cls, checkpoint_path: Any, *_: Any, **changes: Any) -> Any:
+        """Return the model of a checkpoint of train.py, as `load_model` reads it: no code is run.
+
+        ``changes`` replace settings, as in ``hypotheses=50``; those that Lightning adds of its own
+        (``map_location``, ``strict``) change nothing: the model is on the CPU, and whole.
+        """
+        from ghpt.models.checkpoint import load_model
+
+        own = {name: value for name, value in changes.items() if name not in _OF_LIGHTNING}
+        return load_model(checkpoint_path, own.pop("trust", ()), **own)[0]
 
 
 def _mean() -> MeanMetric:

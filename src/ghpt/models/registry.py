@@ -18,6 +18,7 @@ from torch.optim import lr_scheduler
 
 from ghpt.config import build, locate, suggest
 from ghpt.errors import GhptConfigError
+from ghpt.models.joint.problem import JointSubsets
 from ghpt.models.key_points.problem import KeyPointWeights
 from ghpt.models.key_points.scorer import KeyPointScorer
 from ghpt.models.loss import PrecisionLoss, StochasticLoss
@@ -71,11 +72,28 @@ def register(part: str, *classes: type) -> None:
 
 
 register("model", StochasticEstimator)
-register("model.problem", PoseTriangulation, KeyPointWeights, WorldPoses, RelativePose)
+register(
+    "model.problem",
+    PoseTriangulation,
+    JointSubsets,
+    KeyPointWeights,
+    WorldPoses,
+    RelativePose,
+)
 register("model.problem.scale", KnownScale, BodyHeight, BoneLengths)
 register("model.scorer", Scorer, KeyPointScorer, AuthorsScorer)
 register("model.loss", StochasticLoss, PrecisionLoss)
-register("model.schedule", lr_scheduler.ExponentialLR)
+register(
+    "model.schedule",
+    lr_scheduler.ConstantLR,
+    lr_scheduler.CosineAnnealingLR,
+    lr_scheduler.CosineAnnealingWarmRestarts,
+    lr_scheduler.ExponentialLR,
+    lr_scheduler.LinearLR,
+    lr_scheduler.MultiStepLR,
+    lr_scheduler.PolynomialLR,
+    lr_scheduler.StepLR,
+)
 for _name, _one in vars(optim).items():
     if isinstance(_one, type) and issubclass(_one, optim.Optimizer) and _one is not optim.Optimizer:
         register("model.optimizer", _one)

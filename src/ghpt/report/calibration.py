@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from ghpt.calibration.comparison import Explanation, Quantiles
@@ -21,7 +21,7 @@ from ghpt.report.document import (
     Text,
     prose,
 )
-from ghpt.report.findings import finding_bullets, finding_paragraphs
+from ghpt.report.findings import finding_paragraphs, verdict_blocks
 from ghpt.report.tables import NONE
 
 _WANTED_DEG = 0.5
@@ -90,6 +90,8 @@ class CalibrationResult:
     """How well each calibration explains the key points, by its name."""
     findings: tuple[Finding, ...]
     provenance: dict[str, Any]
+    command: str
+    """What to type next."""
     intrinsics: str | None = None
     """What was estimated of the intrinsics, in words; None where they were given."""
 
@@ -103,11 +105,12 @@ def calibration_summary(result: CalibrationResult) -> Document:
     lines: list[Block] = [Paragraph(line) for line in _rig_lines(result)]
     title = f"Calibration of {result.data}"
     table = _camera_table(result, title)
-    return Document("", [table, *lines, *finding_paragraphs(result.findings)])
+    following = Paragraph(f"Next: {result.command}")
+    return Document("", [table, *lines, *finding_paragraphs(result.findings), following])
 
 
-def calibration_document(result: CalibrationResult) -> Document:
-    """Return the report."""
+def calibration_document(result: CalibrationResult, pictures: Sequence[Block] = ()) -> Document:
+    """Return the report, with the pictures below the verdict."""
     origin = result.provenance
     commit = origin["commit"] or NONE
     about = prose(
@@ -115,15 +118,15 @@ def calibration_document(result: CalibrationResult) -> Document:
         f"ghpt {origin['ghpt']}, commit `{commit}`."
     )
     blocks: list[Block] = [
-        Paragraph(about),
+        *verdict_blocks(result.findings, "the rig is consistent", result.command),
         Bullets(_rig_lines(result)),
-        Heading("Findings"),
-        finding_bullets(result.findings, "None."),
+        *pictures,
         Heading("Cameras"),
-        _camera_table(result),
+        _remarked_table(result),
     ]
     if result.explains:
         blocks += _explanation_blocks(result)
+    blocks += [Heading("How this was made"), Paragraph(about)]
     return Document(f"Calibration of {result.data}", blocks)
 
 
@@ -145,6 +148,17 @@ def _camera_table(result: CalibrationResult, title: str = "") -> Table:
             "cameras agree on",
         )
     return Table(header, rows, title=title, caption=caption)
+
+
+def _remarked_table(result: CalibrationResult) -> Table:
+    """Return the table of the cameras with what is off in each."""
+    table = _camera_table(result)
+    rows = []
+    for camera, row in zip(result.cameras, table.rows, strict=True):
+        found = [each.text for each in result.findings if camera.name in each.cameras]
+        rows.append([*row, "; ".join(found)])
+    header = [*table.header, "what is off"]
+    return replace(table, header=header, rows=rows, left_columns=(0, len(header) - 1))
 
 
 def _camera_cells(camera: CalibratedCamera, difference: Differences | None) -> list[str]:
@@ -186,13 +200,14 @@ def _evidence_line(evidence: Evidence) -> str:
     """Return a sentence on what the recording is worth."""
     needed = evidence.frames_for(_WANTED_DEG)
     enough = "which is enough"
-    if needed > evidence.frames:
-        enough = f"and about {needed} like these would do"
+    if needed is None:
+        enough = "no number of frames is enough in which people turn no more than here"
+    elif needed > evidence.frames:
+        enough = f"about {needed} like these would do"
     return (
         f"Evidence: {evidence.used} of {evidence.frames} frames, worth "
         f"{evidence.independent:.0f} independent ones, in which people turn by "
-        f"{evidence.turned_deg:.0f}°; for rotations to ± {_WANTED_DEG}° {enough}. "
-        f"Another recording like this one would differ by {evidence.repeatability:.0%} of the ±."
+        f"{evidence.turned_deg:.0f}°; for rotations to ± {_WANTED_DEG}° {enough}."
     )
 
 

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from ghpt.calibration.check.units import UNITS_MM
 from ghpt.calibration.findings import Finding
 from ghpt.report.document import Block, Document, Heading, Paragraph, Table
-from ghpt.report.findings import finding_bullets, finding_paragraphs
+from ghpt.report.findings import finding_paragraphs, verdict_blocks
 
 _NOTHING = "Nothing is wrong."
 
@@ -38,6 +39,8 @@ class CameraReport:
     findings: tuple[Finding, ...]
     cameras: tuple[CheckedCamera, ...]
     provenance: dict[str, Any]
+    command: str
+    """What to type next."""
 
     def plain(self) -> dict[str, Any]:
         """Return the report as plain data."""
@@ -52,24 +55,35 @@ def camera_check_summary(report: CameraReport) -> Document:
     blocks += finding_paragraphs(report.findings)
     if not report.findings:
         blocks.append(Paragraph(_NOTHING))
+        blocks.append(Paragraph(f"Next: {report.command}"))
     return Document("", blocks)
 
 
-def camera_check_document(report: CameraReport) -> Document:
-    """Return the report."""
+def camera_check_document(report: CameraReport, pictures: Sequence[Block] = ()) -> Document:
+    """Return the report, with the pictures below the verdict."""
     about = f"{report.frames} frames, {len(report.cameras)} views. {_stature(report)}"
     blocks: list[Block] = [
+        *verdict_blocks(report.findings, "nothing is wrong", report.command),
         Paragraph(about),
-        Heading("Findings"),
-        finding_bullets(report.findings, _NOTHING),
+        *pictures,
         Heading("Cameras"),
-        _table(report),
+        _view_table(report),
         Paragraph(
             "Each view's key points against the joints that the other views triangulate: median "
             "distance, pixels, as the files have it and with everything mended that can be."
         ),
     ]
     return Document(f"Camera check of {report.title}", blocks)
+
+
+def _view_table(report: CameraReport) -> Table:
+    """Return the errors of each view, and what is off in it."""
+    table = _table(report)
+    rows = []
+    for camera, row in zip(report.cameras, table.rows, strict=True):
+        found = [each.text for each in report.findings if camera.name in each.cameras]
+        rows.append([*row, "; ".join(found)])
+    return replace(table, header=[*table.header, "what is off"], rows=rows, left_columns=(0, 3))
 
 
 def _table(report: CameraReport, title: str = "", caption: tuple[str, ...] = ()) -> Table:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
+from enum import StrEnum
 
 
 @dataclass(frozen=True)
@@ -94,6 +95,31 @@ class Figure:
     caption: str
 
 
+class Tone(StrEnum):
+    """How good the news of a `Notice` is."""
+
+    GOOD = "good"
+    LOOK = "look"
+    BAD = "bad"
+
+
+@dataclass(frozen=True)
+class Notice:
+    """A paragraph that stands out: the verdict."""
+
+    text: Text
+    tone: Tone
+
+
+@dataclass(frozen=True)
+class Player:
+    """The page of a 3D player in the document's folder, shown within the document."""
+
+    path: str
+    """Path relative to the document's folder."""
+    caption: str
+
+
 @dataclass(frozen=True)
 class CodeBlock:
     """Lines of code."""
@@ -104,7 +130,7 @@ class CodeBlock:
     """A text before the block; in HTML the block is folded under it."""
 
 
-Block = Heading | Paragraph | Bullets | Table | Figure | CodeBlock
+Block = Heading | Paragraph | Notice | Bullets | Table | Figure | Player | CodeBlock
 
 
 @dataclass(frozen=True)

@@ -14,10 +14,9 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.report.tables import title
-from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, THORAX
+from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, SYMMETRIC_BONES, THORAX
 
 LineStyle = Literal["-", "--", "-.", ":"] | tuple[int, tuple[int, ...]]
 
@@ -117,10 +116,10 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
     width = 0.84 / len(selections)
     for index, name in enumerate(selections):
         prior = metrics["selections"][name]["pose_prior"][subject]
-        heights = [np.nan if prior[part] is None else prior[part] for part in PARTS]
+        heights = [np.nan if prior[part] is None else prior[part] for part in SYMMETRIC_BONES]
         offset = (index - (len(selections) - 1) / 2) * width
         axes.bar(
-            np.arange(len(PARTS)) + offset,
+            np.arange(len(SYMMETRIC_BONES)) + offset,
             heights,
             width,
             color=SELECTION_COLOURS[name],
@@ -130,7 +129,9 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
             label=name,
         )
     axes.set_yscale("log")
-    axes.set_xticks(range(len(PARTS)), [part.replace("_", " ") for part in PARTS])
+    axes.set_xticks(
+        range(len(SYMMETRIC_BONES)), [part.replace("_", " ") for part in SYMMETRIC_BONES]
+    )
     axes.set_ylabel("S²: variance of left / right length")
     heading = f"Pose prior of {subject} (lower is better)\n{title(metrics)}"
     axes.set_title(wrap_lines(heading, 110), fontsize=10)

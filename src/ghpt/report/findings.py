@@ -5,8 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from ghpt.calibration.findings import Finding, Severity
-from ghpt.report.document import Block, Bullets, Paragraph, Strong, Text
+from ghpt.report.document import (
+    Block,
+    Bullets,
+    CodeBlock,
+    Notice,
+    Paragraph,
+    Strong,
+    Text,
+    Tone,
+)
 
+_VERDICTS = {Tone.LOOK: "look at this", Tone.BAD: "do not use"}
+_MENDED = "wrong as the files have it, right in the mended files"
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow"}
 
 
@@ -15,6 +26,24 @@ def finding_bullets(findings: Sequence[Finding], otherwise: str) -> Block:
     if not findings:
         return Paragraph(otherwise)
     return Bullets([_bullet(finding) for finding in findings])
+
+
+def verdict_blocks(findings: Sequence[Finding], good: str, command: str) -> list[Block]:
+    """Return the verdict (``good`` where nothing was found), the findings, and what to type next.
+
+    The worst finding decides, unless all were mended.
+    """
+    tone = Tone.GOOD
+    text = good
+    if findings:
+        errors = any(finding.severity == Severity.ERROR for finding in findings)
+        mended = all(finding.mended for finding in findings)
+        tone = Tone.BAD if errors and not mended else Tone.LOOK
+        text = _MENDED if mended else _VERDICTS[tone]
+    blocks: list[Block] = [Notice(("Verdict: ", Strong(text), "."), tone)]
+    if findings:
+        blocks.append(finding_bullets(findings, ""))
+    return [*blocks, Paragraph("What to type next:"), CodeBlock(command, "bash")]
 
 
 def finding_paragraphs(findings: Sequence[Finding]) -> Iterator[Block]:

@@ -2,7 +2,7 @@
 
 import functools
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -12,6 +12,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.summary.writer import event_file_writer
 
 from ghpt.files import errors_name
+from ghpt.report.hyperparameters import write_row
 
 _log = logging.getLogger(__name__)
 
@@ -45,13 +46,13 @@ def _forgiving(method: Callable[..., Any]) -> Callable[..., Any]:
 
 
 class ForgivingTensorBoard(TensorBoardLogger):
-    """Writes event files directly into ``folder``, and no hparams.yaml.
+    """Writes event files directly into ``save_dir``, and no hparams.yaml.
 
     The checkpoint has all settings. A failure is counted in ``failures`` and logged once.
     """
 
-    def __init__(self, folder: Path) -> None:
-        super().__init__(save_dir=folder, name="", version="", default_hp_metric=False)
+    def __init__(self, save_dir: Path) -> None:
+        super().__init__(save_dir=save_dir, name="", version="", default_hp_metric=False)
         self.failures = 0
 
     @property
@@ -63,7 +64,16 @@ class ForgivingTensorBoard(TensorBoardLogger):
         with errors_name(Path(self.log_dir)):
             return super().experiment
 
-    log_metrics = _forgiving(TensorBoardLogger.log_metrics)
-    log_hyperparams = _forgiving(TensorBoardLogger.log_hyperparams)
+    @_forgiving
+    def log_metrics(self, metrics: Mapping[str, float], step: int | None = None) -> None:
+        """Write the metrics of a step; the epoch, which Lightning adds, is no curve."""
+        shown = {name: value for name, value in metrics.items() if name != "epoch"}
+        super().log_metrics(shown, step)
+
+    @_forgiving
+    def log_hyperparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
+        """Write the run's row of hyper-parameters beside its metrics, which are curves already."""
+        write_row(self.experiment, params, metrics)
+
     save = _forgiving(EventsOnly.save)
     finalize = _forgiving(TensorBoardLogger.finalize)

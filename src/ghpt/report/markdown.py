@@ -17,7 +17,9 @@ from ghpt.report.document import (
     Figure,
     Heading,
     Link,
+    Notice,
     Paragraph,
+    Player,
     Span,
     Strong,
     Table,
@@ -53,12 +55,16 @@ def _block(block: Block) -> str:
             return f'<a id="{anchor}"></a>\n\n{heading}' if anchor else heading
         case Paragraph(text):
             return _line(text)
+        case Notice(text):
+            return f"> {_inline(text)}"
         case Bullets(items):
             return "\n".join(f"- {_line(item)}" for item in items)
         case Table():
             return _table(block)
         case Figure(path, caption):
             return f"![{_escape(caption)}]({path})"
+        case Player(path, caption):
+            return f"[{_escape(caption)}]({path})"
         case CodeBlock():
             return _code_block(block)
 

@@ -1,21 +1,20 @@
 """A test run of the camera problem in TensorBoard."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from ghpt.models.relative_pose.evaluation import ERRORS, pair_errors
+from ghpt.models.relative_pose.evaluation import pair_errors
 from ghpt.models.relative_pose.schema import PairPredictions
 from ghpt.observations import RelativePoseEstimate
 from ghpt.report.figures import image
 from ghpt.report.pair_figures import rig_figure
-from ghpt.report.pair_tables import MANY, pair_report_document, pair_summary_document
+from ghpt.report.pair_tables import pair_report_document, pair_summary_document
 from ghpt.report.report import Report
 from ghpt.report.tables import Metrics, title
-from ghpt.report.tensorboard import write_hyperparameters, write_parts, write_weights
+from ghpt.report.tensorboard import write_hyperparameters, write_parts, write_text, write_weights
 
 SHOWN = ("weight", "rig")
 """The estimates in the figure of the rig, where they are; the draw is chosen by the first."""
@@ -23,33 +22,18 @@ _CHUNK = 2048
 
 
 def write_pair_events(folder: str | Path, predictions: PairPredictions, metrics: Metrics) -> int:
-    """Write scalars, histograms, the figure and hyper-parameters, as ``write_parts`` does."""
+    """Write the tables, histograms, the figure and hyper-parameters, as ``write_parts`` does."""
 
     def hyperparameters(writer: SummaryWriter) -> None:
         write_hyperparameters(writer, predictions.meta, metrics, "E_3D")
 
     parts = {
-        "scalars": lambda writer: _write_scalars(writer, metrics),
+        "the tables": lambda writer: write_text(writer, pair_report_document(metrics)),
         "the weights": lambda writer: _write_weights(writer, predictions),
         "the rig": lambda writer: _write_rig(writer, predictions, metrics),
         "the hyper-parameters": hyperparameters,
     }
     return write_parts(folder, parts)
-
-
-def _write_scalars(writer: SummaryWriter, metrics: Metrics) -> None:
-    for name, numbers in metrics["selections"].items():
-        _add_errors(writer, "", name, numbers)
-        pairs = numbers["pairs"]
-        if len(pairs) <= MANY:
-            for pair, of_pair in pairs.items():
-                _add_errors(writer, f" {pair}", name, of_pair)
-
-
-def _add_errors(writer: SummaryWriter, suffix: str, name: str, numbers: Mapping[str, Any]) -> None:
-    for error in (*ERRORS, "coverage"):
-        if numbers[error] is not None:
-            writer.add_scalar(f"{error}{suffix}/{name}", numbers[error], 0)
 
 
 def _write_weights(writer: SummaryWriter, predictions: PairPredictions) -> None:

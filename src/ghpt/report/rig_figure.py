@@ -4,7 +4,9 @@ cameras.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import cycle
 
 import numpy as np
 import torch
@@ -18,13 +20,15 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.similarity import Similarity
-from ghpt.report.figures import MIDDLE, wrap_lines
+from ghpt.report.figures import wrap_lines
 from ghpt.skeleton import BONES
 
 ESTIMATED = "#0072B2"
 REFERENCE = "#D55E00"
-PEOPLE = "#999999"
+_PEOPLE = ("#888888", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _PANELS = {"from above": (0, 1), "from the side": (0, 2)}
+_NAMED = "from above"
+"""Where cameras do not hide each other."""
 _SKELETONS = 6
 _DEVIATIONS = 2.0
 """Standard deviations that an ellipse shows."""
@@ -36,23 +40,32 @@ _VISIBLE = 0.15
 
 
 @dataclass(frozen=True)
+class DrawnPerson:
+    """Poses of a person, mm."""
+
+    points: Float[Tensor, "T J 3"]
+    estimated: Bool[Tensor, "T J"]
+    bones: Sequence[tuple[int, int]] = BONES
+
+
+@dataclass(frozen=True)
 class DrawnRig:
     """Cameras and the people they see, in one world; mm."""
 
     names: tuple[str, ...]
     cameras: Cameras
-    covariance: Float[Tensor, "V 6 6"]
-    """Of rotation and centre."""
-    points: Float[Tensor, "T J 3"]
-    estimated: Bool[Tensor, "T J"]
+    people: tuple[DrawnPerson, ...]
+    covariance: Float[Tensor, "V 6 6"] | None = None
+    """Of rotation and centre; None where it is not known."""
+    label: str = "cameras"
+    """What the legend calls cameras without a covariance."""
 
     def select(self, views: Bool[Tensor, " V"]) -> DrawnRig:
         """Return the rig of some of the cameras."""
         chosen = zip(self.names, views.tolist(), strict=True)
         names = tuple(name for name, is_chosen in chosen if is_chosen)
-        cameras = self.cameras.index(views)
-        covariance = self.covariance[views]
-        return DrawnRig(names, cameras, covariance, self.points, self.estimated)
+        covariance = None if self.covariance is None else self.covariance[views]
+        return DrawnRig(names, self.cameras.index(views), self.people, covariance, self.label)
 
 
 def rig_figure(
@@ -69,26 +82,34 @@ def rig_figure(
     figure = Figure(figsize=(11, 5.6), layout="constrained")
     cameras = upright.cameras(rig.cameras)
     other = None if reference is None else upright.cameras(reference)
-    people = (upright.points(rig.points) / 1000).numpy()
-    covariance = upright.R @ rig.covariance[:, 3:, 3:] @ upright.R.T / 1e6
+    covariance = None
+    if rig.covariance is not None:
+        covariance = upright.R @ rig.covariance[:, 3:, 3:] @ upright.R.T / 1e6
     length = _frustum_length(cameras, other)
-    magnification = _magnification(covariance, length)
+    magnification = 0 if covariance is None else _magnification(covariance, length)
     panels = figure.subplots(1, 2)
     for axes, (view, (i, j)) in zip(panels, _PANELS.items(), strict=True):
         plane = (i, j)
-        _draw_people(axes, people[..., [i, j]], rig.estimated.numpy())
+        for colour, person in zip(cycle(_PEOPLE), rig.people, strict=False):
+            points = (upright.points(person.points) / 1000).numpy()
+            estimated = person.estimated.numpy()
+            _draw_person(axes, points[..., [i, j]], estimated, person.bones, colour)
         if other is not None:
             _draw_frustums(axes, other, length, plane, REFERENCE, "--")
         _draw_frustums(axes, cameras, length, plane, ESTIMATED, "-")
         centres = (cameras.centre / 1000).numpy()[:, [i, j]]
-        in_plane = covariance[:, [i, j]][:, :, [i, j]].numpy()
-        for name, centre, own in zip(rig.names, centres, in_plane, strict=True):
-            _draw_ellipse(axes, centre, own, magnification)
-            _write_name(axes, centre, name)
+        if covariance is not None:
+            in_plane = covariance[:, [i, j]][:, :, [i, j]].numpy()
+            for centre, own in zip(centres, in_plane, strict=True):
+                _draw_ellipse(axes, centre, own, magnification)
+        if view == _NAMED:
+            for name, centre in zip(rig.names, centres, strict=True):
+                _write_name(axes, centre, name)
         _lay_out(axes, view, plane)
-    handles = _legend(magnification, None if other is None else reference_name)
+    handles = _legend(rig, magnification, None if other is None else reference_name)
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
-    figure.suptitle(wrap_lines(heading, 110), fontsize=10, parse_math=False)
+    if heading:
+        figure.suptitle(wrap_lines(heading, 110), fontsize=10, parse_math=False)
     return figure
 
 
@@ -129,13 +150,18 @@ def _lay_out(axes: Axes, view: str, plane: tuple[int, int]) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _legend(magnification: int, reference_name: str | None) -> list[Line2D]:
+def _legend(rig: DrawnRig, magnification: int, reference_name: str | None) -> list[Line2D]:
     times = f", {magnification} x" if magnification > 1 else ""
     label = f"calibrated; ellipse: {_DEVIATIONS:g} standard deviations{times}"
+    if not magnification:
+        label = rig.label
     handles = [Line2D([], [], color=ESTIMATED, label=label)]
     if reference_name is not None:
         handles.append(Line2D([], [], color=REFERENCE, linestyle="--", label=reference_name))
-    handles.append(Line2D([], [], color=PEOPLE, marker=".", label="people"))
+    several = len(rig.people) > 1
+    for person, colour in zip(range(len(rig.people)), cycle(_PEOPLE), strict=False):
+        label = f"person {person}" if several else "the person"
+        handles.append(Line2D([], [], color=colour, marker=".", label=label))
     return handles
 
 
@@ -178,16 +204,20 @@ def _draw_ellipse(
     axes.add_patch(ellipse)
 
 
-def _draw_people(
-    axes: Axes, points: Float[np.ndarray, "T J 2"], estimated: Bool[np.ndarray, "T J"]
+def _draw_person(
+    axes: Axes,
+    points: Float[np.ndarray, "T J 2"],
+    estimated: Bool[np.ndarray, "T J"],
+    bones: Sequence[tuple[int, int]],
+    colour: str,
 ) -> None:
     """Draw the middle of the person in every frame, and some skeletons."""
     frames = np.flatnonzero(estimated.any(1))
     if not len(frames):
         return
     middle = np.stack([np.median(points[t][estimated[t]], axis=0) for t in frames])
-    axes.plot(*middle.T, ".", color=PEOPLE, markersize=1.5)
+    axes.plot(*middle.T, ".", color=colour, markersize=1.5)
     spread = np.linspace(0, len(frames) - 1, min(_SKELETONS, len(frames)))
     for t in frames[spread.astype(int)]:
-        bones = [points[t][list(bone)] for bone in BONES if estimated[t][list(bone)].all()]
-        axes.add_collection(LineCollection(bones, colors=MIDDLE, linewidths=0.7, alpha=0.6))
+        lines = [points[t][list(bone)] for bone in bones if estimated[t][list(bone)].all()]
+        axes.add_collection(LineCollection(lines, colors=colour, linewidths=0.9, alpha=0.8))

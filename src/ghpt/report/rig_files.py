@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
+from matplotlib.figure import Figure as DrawnFigure
 from torch import Tensor
 
 from ghpt.calibration.comparison import align_robustly
@@ -28,12 +29,19 @@ from ghpt.report.calibration import (
     CalibrationResult,
     calibration_document,
 )
+from ghpt.report.document import Block, Figure, Heading
+from ghpt.report.html import write_html
 from ghpt.report.markdown import write_markdown
 from ghpt.report.rig_figure import DrawnRig, rig_figure
 from ghpt.skeleton import JOINTS
 
 RIG_FILES = ("rig.toml", "rig_anipose.toml", "intri.yml", "extri.yml", "poses.npz")
 """What is written of a usable rig alone."""
+_RIG = "rig"
+_PICTURES: tuple[Block, ...] = (
+    Heading("The rig"),
+    Figure(_RIG, "cameras with their uncertainty, and the person, from above and from the side"),
+)
 _FIGURES = {"rig.png": FigureCanvasAgg, "rig.svg": FigureCanvasSVG}
 
 
@@ -127,28 +135,27 @@ def write_poses(
         )
 
 
-def write_rig_figure(
+def write_result(
     output: Path,
     result: CalibrationResult,
     rig: DrawnRig,
     calibrated: Bool[Tensor, " V"],
     reference: Cameras | None,
 ) -> None:
-    """Write rig.png and rig.svg of the calibrated cameras, and of a reference's brought onto them
-    by `align_robustly`; remove them where no camera is calibrated.
+    """Write calibration.json, report.md, report.html, and the figure as rig.png and rig.svg.
+
+    The figure shows the calibrated cameras, and a reference's brought onto them by
+    `align_robustly`; where no camera is calibrated there is none, and an earlier one is removed.
     """
+    write_json(output / "calibration.json", result.plain())
+    write_markdown(output / "report.md", calibration_document(result))
     if not bool(calibrated.any()):
         for name in _FIGURES:
             remove(output / name)
+        write_html(output / "report.html", calibration_document(result), {})
         return
-    shown = rig.select(calibrated)
-    heading = f"Calibration of {result.data}\nscale {result.scale.text}"
-    other = None
-    if reference is not None and int(calibrated.sum()) >= 2:
-        own = reference.index(calibrated)
-        other = align_robustly(own, shown.cameras).cameras(own)
-    up = upright(shown.points, shown.estimated, shown.cameras)
-    figure = rig_figure(heading, shown, up, other, f"{result.reference}, at this scale")
+    figure = _draw_rig(result, rig.select(calibrated), calibrated, reference)
+    write_html(output / "report.html", calibration_document(result, _PICTURES), {_RIG: figure})
     for name, canvas in _FIGURES.items():
         data = io.BytesIO()
         canvas(figure).print_figure(data, dpi=150, format=name.rpartition(".")[2])
@@ -157,7 +164,17 @@ def write_rig_figure(
             handle.write(data.getvalue())
 
 
-def write_result(output: Path, result: CalibrationResult) -> None:
-    """Write calibration.json and report.md."""
-    write_json(output / "calibration.json", result.plain())
-    write_markdown(output / "report.md", calibration_document(result))
+def _draw_rig(
+    result: CalibrationResult,
+    shown: DrawnRig,
+    calibrated: Bool[Tensor, " V"],
+    reference: Cameras | None,
+) -> DrawnFigure:
+    heading = f"Calibration of {result.data}\nscale {result.scale.text}"
+    other = None
+    if reference is not None and int(calibrated.sum()) >= 2:
+        own = reference.index(calibrated)
+        other = align_robustly(own, shown.cameras).cameras(own)
+    (person,) = shown.people
+    up = upright(person.points, person.estimated, shown.cameras)
+    return rig_figure(heading, shown, up, other, f"{result.reference}, at this scale")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.paper.published import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 from ghpt.report.document import (
@@ -19,6 +18,7 @@ from ghpt.report.document import (
     Table,
     Text,
 )
+from ghpt.skeleton import SYMMETRIC_BONES
 
 NAMES = {
     "h36m": "Human3.6M",
@@ -26,7 +26,8 @@ NAMES = {
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
     "view_weights": "view weights",
     "trajectory": "trajectory",
-    "frame_learned": "key-point weights",
+    "online": "trajectory, online",
+    "frame_learned": "learned frames",
     "weighted_linear": "weighted linear",
     "ransac": "RANSAC",
     "adaptive_ransac": "adaptive RANSAC",
@@ -203,7 +204,7 @@ def prior_table(metrics: Metrics, subject: str) -> Table:
     selections = [name for name in metrics["selections"] if name in AGGREGATIONS]
     priors = [metrics["selections"][name]["pose_prior"][subject] for name in selections]
     rows = []
-    for part in PARTS:
+    for part in SYMMETRIC_BONES:
         rows.append([part.replace("_", " "), *(_thousandfold(prior[part]) for prior in priors)])
     return Table(["part", *selections], rows)
 

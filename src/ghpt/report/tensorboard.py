@@ -15,13 +15,15 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.utils.tensorboard import SummaryWriter
-from torch.utils.tensorboard.summary import hparams
 
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.models.aggregation import WeightSummary
 from ghpt.models.pose.schema import PoseChunk, PosePredictions
 from ghpt.observations import PoseEstimate
+from ghpt.report.document import Document
 from ghpt.report.figures import image, pose_prior_bars, skeletons, up_axis
+from ghpt.report.hyperparameters import flatten, write_row
+from ghpt.report.markdown import render_markdown
 from ghpt.report.report import Report
 from ghpt.report.tables import (
     Metrics,
@@ -33,7 +35,8 @@ from ghpt.report.tables import (
 
 SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
-_SCALARS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints", "coverage")
+_FINAL = ("weight", "average", "view_weights", "trajectory", "rig")
+"""The estimates whose errors stand beside the hyper-parameters, where there are such."""
 _SAMPLE = 50
 """Blocks of `_BLOCK` frames, evenly over the run, that histograms and the figure are made of."""
 _BLOCK = 1000
@@ -41,13 +44,13 @@ _log = logging.getLogger(__name__)
 
 
 def write_events(folder: str | Path, predictions: PosePredictions, metrics: Metrics) -> int:
-    """Write scalars, histograms, figures and hyper-parameters, as ``write_parts`` does."""
+    """Write the tables, histograms, figures and hyper-parameters, as ``write_parts`` does."""
 
     def hyperparameters(writer: SummaryWriter) -> None:
         write_hyperparameters(writer, predictions.meta, metrics, "mpjpe_relative")
 
     parts = {
-        "scalars": lambda writer: _write_scalars(writer, metrics),
+        "the tables": lambda writer: write_text(writer, report_document(metrics)),
         "the weights": lambda writer: _write_weights(writer, predictions),
         "the skeletons": lambda writer: _write_skeletons(writer, predictions, metrics),
         "the pose prior": lambda writer: _write_pose_prior(writer, metrics),
@@ -83,22 +86,14 @@ def write_parts(folder: str | Path, parts: Mapping[str, Callable[[SummaryWriter]
     return len(failures)
 
 
-def _write_scalars(writer: SummaryWriter, metrics: Metrics) -> None:
-    for name, numbers in metrics["selections"].items():
-        for scalar in _SCALARS:
-            if numbers[scalar] is not None:
-                writer.add_scalar(f"{scalar}/{name}", numbers[scalar], 0)
-
-
 def _write_weights(writer: SummaryWriter, predictions: PosePredictions) -> None:
     write_weights(writer, [chunk.weights for _, chunk in _sample_blocks(predictions)])
 
 
 def write_weights(writer: SummaryWriter, weights: Sequence[WeightSummary]) -> None:
-    """Write mean and histogram of each summary of the weights, over all chunks."""
+    """Write the histogram of each summary of the weights, over all chunks."""
     for summary in fields(WeightSummary):
         values = torch.cat([getattr(chunk, summary.name) for chunk in weights])
-        writer.add_scalar(f"weights/{summary.name}", values.mean().item(), 0)
         writer.add_histogram(f"weights/{summary.name}", values.numpy(), 0)
 
 
@@ -135,22 +130,26 @@ def _write_pose_prior(writer: SummaryWriter, metrics: Metrics) -> None:
         writer.add_image(f"pose_prior/{subject}", image(figure), 0, dataformats="HWC")
 
 
+def write_text(writer: SummaryWriter, document: Document) -> None:
+    """Write a report as text, which TensorBoard renders."""
+    writer.add_text("report", render_markdown(document), 0)
+
+
 def write_hyperparameters(
     writer: SummaryWriter, meta: Mapping[str, Any], metrics: Metrics, error: str
 ) -> None:
-    """Write the settings of a test run beside each selection's ``error``."""
+    """Write the settings of the test and of its model beside the main estimates' ``error``."""
     trained, source = training_data(metrics)
     values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
     values |= {"trained_on": trained, "trained_on_source": source}
-    values |= {"hypotheses": meta.get("hypotheses")}
-    known = {key: value for key, value in values.items() if value is not None}
+    values |= dict(flatten(meta.get("model") or {}, "model"))
+    values |= {"model.hypotheses": meta.get("hypotheses")}
     errors = {}
-    for name, numbers in metrics["selections"].items():
-        if numbers[error] is not None:
-            errors[f"final/{name}"] = numbers[error]
-    # writer.add_hparams would write them to a second event file.
-    for summary in hparams(known, errors):
-        writer._get_file_writer().add_summary(summary)
+    for name in _FINAL:
+        numbers = metrics["selections"].get(name)
+        if numbers and numbers[error] is not None:
+            errors[f"test/{name}"] = numbers[error]
+    write_row(writer, values, errors)
     for name, number in errors.items():
         writer.add_scalar(name, number, 0)
 

@@ -14,14 +14,19 @@ from ghpt.report.document import (
     Emphasis,
     Figure,
     Heading,
+    Notice,
     Paragraph,
+    Player,
     Span,
     Strong,
     Table,
     Text,
+    Tone,
     printable,
     spans,
 )
+
+_TONES = {Tone.GOOD: "green", Tone.LOOK: "yellow", Tone.BAD: "red"}
 
 
 def print_document(document: Document, console: Console | None = None) -> None:
@@ -61,10 +66,12 @@ def _print_block(block: Block, console: Console) -> None:
             console.print(style_text(text, "bold"), soft_wrap=True)
         case Paragraph(text):
             console.print(style_text(text), soft_wrap=True)
+        case Notice(text, tone):
+            console.print(style_text(text, _TONES[tone]), soft_wrap=True)
         case Bullets(items):
             for item in items:
                 console.print(style_text(("- ", *spans(item))), soft_wrap=True)
-        case Figure(path, caption):
+        case Figure(path, caption) | Player(path, caption):
             console.print(style_text(f"{caption}: {path}"), soft_wrap=True)
         case CodeBlock(code, _, summary):
             if summary:

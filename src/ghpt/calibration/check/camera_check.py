@@ -8,10 +8,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.calibration.check.agreement import Agreement, triangulated
+from ghpt.calibration.check.agreement import Agreement, triangulate_choices
 from ghpt.calibration.check.evidence import Evidence
 from ghpt.calibration.check.search import Search, Thresholds
 from ghpt.calibration.check.setup import RayCache, Setup
@@ -47,8 +47,11 @@ class CameraCheckResult:
     """The same as the files have it."""
     stature: float
     """Of the person, mm; 0 where it was not measured."""
-    unit_mm: float | None = None
+    unit_mm: float | None
     """The unit of the file, mm, where the file does not say it and the person tells."""
+    points: Float[Tensor, "F J 3"]
+    """The person before the cameras of ``setup``, mm."""
+    estimated: Bool[Tensor, "F J"]
 
 
 @dataclass(frozen=True)
@@ -114,10 +117,10 @@ class CameraCheck:
             search = search.after(candidate, after)
         partly = self._partly_repaired(search, findings)
         if partly:
-            given_back = _given_back(search.setup, setup, partly)
+            given_back = _restore_given(search.setup, setup, partly)
             search = Search(cache, given_back, self.thresholds)
-            findings = [_unmended(found, partly, evidence.names) for found in findings]
-        findings += self._left(search)
+            findings = [_as_unrepaired(found, partly, evidence.names) for found in findings]
+        findings += self._unrepaired_views(search)
         height = self._stature(search)
         setup, height, unit_mm = _file_unit(search.setup, height)
         wrong_size = size_finding(height) if height else None
@@ -129,7 +132,19 @@ class CameraCheck:
                 setup = replace(setup, t=wrong_size.value * setup.t)
                 height *= wrong_size.value
         error_px = pixels_of(cache, setup, search.now.error)
-        return CameraCheckResult(tuple(result), setup, error_px, given_px, height, unit_mm)
+        agrees = search.now.error < self.thresholds.level
+        used = search.now.core if bool(agrees.any()) else torch.ones_like(agrees)
+        points, known = triangulate_choices(cache.all(setup), setup, used[None], self.consensus)
+        return CameraCheckResult(
+            findings=tuple(result),
+            setup=setup,
+            error_px=error_px,
+            given_px=given_px,
+            stature=height,
+            unit_mm=unit_mm,
+            points=points[0],
+            estimated=known[0],
+        )
 
     def _partly_repaired(self, search: Search, findings: list[Finding]) -> set[int]:
         """Return the views that were repaired and are still worse than the others.
@@ -152,7 +167,7 @@ class CameraCheck:
                 partly |= views
         return partly
 
-    def _left(self, search: Search) -> list[Finding]:
+    def _unrepaired_views(self, search: Search) -> list[Finding]:
         """Return the views that nothing that was tried brings to the others."""
         error = search.now.error
         pixels = pixels_of(search.cache, search.setup, error)
@@ -178,7 +193,7 @@ class CameraCheck:
             return 0.0
         rays = search.cache.all(search.setup)
         core = search.now.core[None]
-        points, known = triangulated(rays, search.setup, core, self.consensus)
+        points, known = triangulate_choices(rays, search.setup, core, self.consensus)
         return float(stature(points[0], known[0]))
 
 
@@ -211,15 +226,15 @@ def merge_steps(findings: list[Finding]) -> list[Finding]:
     return result
 
 
-def _given_back(setup: Setup, given: Setup, views: set[int]) -> Setup:
+def _restore_given(setup: Setup, given: Setup, views: set[int]) -> Setup:
     """Return the setup with some views as the files have them."""
     names = [field.name for field in fields(Setup) if field.name != "unit_mm"]
     for view in views:
-        setup = setup.changed(view, **{name: getattr(given, name)[view] for name in names})
+        setup = setup.replace_camera(view, **{name: getattr(given, name)[view] for name in names})
     return setup
 
 
-def _unmended(found: Finding, views: set[int], names: tuple[str, ...]) -> Finding:
+def _as_unrepaired(found: Finding, views: set[int], names: tuple[str, ...]) -> Finding:
     """Return the finding as of a mistake that was not undone, if it is about one of the views."""
     if not any(names.index(name) in views for name in found.cameras):
         return found

@@ -21,6 +21,32 @@ def commands_on(inputs: InputSettings, own: Mapping[str, object], output: Path) 
 
     ``own``: the settings of predict.py alone that are to stay as they are.
     """
+    given = given_settings(inputs)
+    shown = display_path(output)
+
+    def predict(**more: Any) -> str:
+        return command_line("predict.py", {**given, **own, **more}, f"{shown}_again")
+
+    scaled = given | {"scale.height": _HEIGHT}
+    return Commands(
+        cameras=command_line("cameras.py", given, f"{shown}_checked"),
+        calibrate=command_line("calibrate.py", scaled, f"{shown}_calibrated"),
+        predict=predict,
+    )
+
+
+def prediction_by(inputs: InputSettings, output: Path, **files: Path) -> str:
+    """Return the command that predicts the same input by other ``files``, and writes beside
+    ``output``. A recording of a data set keeps its own.
+    """
+    used = files if inputs.keypoints else {}
+    shown = {name: display_path(path) for name, path in used.items()}
+    given = given_settings(inputs) | shown
+    return command_line("predict.py", given, f"{display_path(output)}_poses")
+
+
+def given_settings(inputs: InputSettings) -> dict[str, Any]:
+    """Return what was given of the settings that all three commands have."""
     keys = [key for key in InputSettings.__annotations__ if key != "data"]
     values = {key: getattr(inputs, key) for key in keys}
     given = {key: value for key, value in values.items() if value is not None}
@@ -30,20 +56,13 @@ def commands_on(inputs: InputSettings, own: Mapping[str, object], output: Path) 
         del given["least_confidence"]
     if not inputs.keypoints:
         given |= {"data": inputs.data["name"]}
+    return given
 
-    def command(script: str, suffix: str, values: Mapping[str, Any]) -> str:
-        words = [setting(key, value) for key, value in values.items()]
-        beside = shell_override("output", display_path(output) + suffix)
-        return " ".join([as_started(f"python {script}"), *words, beside])
 
-    def predict(**more: Any) -> str:
-        return command("predict.py", "_again", {**given, **own, **more})
-
-    return Commands(
-        cameras=command("cameras.py", "_checked", given),
-        calibrate=command("calibrate.py", "_calibrated", given | {"scale.height": _HEIGHT}),
-        predict=predict,
-    )
+def command_line(script: str, values: Mapping[str, object], output: str) -> str:
+    """Return a command with these settings that writes into ``output``."""
+    words = [setting(key, value) for key, value in values.items()]
+    return " ".join([as_started(f"python {script}"), *words, shell_override("output", output)])
 
 
 def setting(key: str, value: object) -> str:

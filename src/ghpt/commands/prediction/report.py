@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from ghpt.calibration.comparison import Quantiles
 from ghpt.commands.prediction.result import PredictionResult
 from ghpt.commands.prediction.statistics import EstimatorErrors
-from ghpt.commands.prediction.verdict import verdict_lines
+from ghpt.commands.prediction.verdict import Level, verdict_lines
 from ghpt.report.document import (
     Block,
     Bullets,
     Code,
     Document,
     Heading,
+    Notice,
     Paragraph,
     Strong,
     Table,
     Text,
+    Tone,
     prose,
 )
 from ghpt.report.tables import NAMES, NONE
@@ -112,26 +115,25 @@ def summary_document(result: PredictionResult) -> Document:
     return Document("", blocks)
 
 
-def verdict_document(result: PredictionResult) -> Document:
-    """Return the last words in the terminal."""
+def verdict_document(result: PredictionResult, page: str) -> Document:
+    """Return the last words in the terminal. ``page``: the path of report.html."""
     if result.verdict is None:
         return Document("", [])
-    lines = verdict_lines(result.verdict.numbers())
+    lines = [*verdict_lines(result.verdict.numbers()), f"Look at {page} in a browser."]
     return Document("", [Paragraph(line) for line in lines])
 
 
-def report_document(result: PredictionResult) -> Document:
-    """Return the report of a prediction."""
+def report_document(result: PredictionResult, pictures: Sequence[Block] = ()) -> Document:
+    """Return the report of a prediction, with the pictures below the verdict."""
     frames = result.evaluation.frames
-    verdict = result.verdict.numbers() if result.verdict else None
     return Document(
         f"Prediction of {result.data}",
         [
-            Paragraph(_origin(result.provenance)),
+            *_verdict_blocks(result),
             Bullets(summary_lines(result)),
             *_people_blocks(result),
-            *(_verdict_blocks(verdict) if verdict else []),
-            Heading("Errors by view"),
+            *pictures,
+            Heading("View by view"),
             Paragraph(
                 prose(
                     "On {} frames, evenly spread; median and 90 %, pixels. *Reprojection* is the "
@@ -140,7 +142,7 @@ def report_document(result: PredictionResult) -> Document:
                     str(frames),
                 )
             ),
-            error_table(result),
+            _view_table(result),
             Heading("Estimators"),
             Paragraph(
                 prose(
@@ -159,8 +161,27 @@ def report_document(result: PredictionResult) -> Document:
                 "median)."
             ),
             _segment_table(result),
+            Heading("How this was made"),
+            Paragraph(_origin(result.provenance)),
         ],
     )
+
+
+def _view_table(result: PredictionResult) -> Table:
+    """Return the errors of each view, and what is off in it."""
+    table = error_table(result)
+    rows = [[*row, _remark(result, str(row[0]))] for row in table.rows]
+    return replace(table, header=[*table.header, "what is off"], rows=rows, left_columns=(0, 5))
+
+
+def _remark(result: PredictionResult, view: str) -> Text:
+    """Return what is off in a view."""
+    found = result.verdict.findings if result.verdict else ()
+    remarks = [finding.text for finding in found if view in finding.cameras]
+    flipped = result.coverage.swapped.get(view, 0)
+    if flipped:
+        remarks.append(f"left and right exchanged in {flipped} frames, undone")
+    return "; ".join(remarks)
 
 
 def _people_blocks(result: PredictionResult) -> list[Block]:
@@ -201,8 +222,15 @@ def _segment_table(result: PredictionResult) -> Table:
     return Table(["segment", *map(_display_name, estimators)], rows)
 
 
-def _verdict_blocks(verdict: Mapping[str, Any]) -> list[Block]:
-    blocks: list[Block] = [Heading("Verdict"), Paragraph(Strong(verdict["level"]))]
+_TONES = {Level.GOOD: Tone.GOOD, Level.LOOK: Tone.LOOK, Level.DO_NOT_USE: Tone.BAD}
+
+
+def _verdict_blocks(result: PredictionResult) -> list[Block]:
+    if result.verdict is None:
+        return []
+    verdict = result.verdict.numbers()
+    level = Strong(verdict["level"])
+    blocks: list[Block] = [Notice(("Verdict: ", level, "."), _TONES[result.verdict.level])]
     findings = [_finding_text(finding) for finding in verdict["findings"]]
     if findings:
         blocks.append(Bullets(findings))

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Sequence as Items
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -24,6 +25,7 @@ from ghpt.models.estimators.trajectory.windows import RUN, spread_runs
 from ghpt.models.relative_pose.scale import MEASURED_FRAMES, stature
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import FILE_STATES, Reconstruction, State
+from ghpt.report.course_figure import ViewCourse
 from ghpt.skeleton import JOINTS, Skeleton
 
 _LEAST = 20
@@ -126,8 +128,9 @@ def evaluate(
     estimates: Mapping[str, Estimate],
     most: int,
     test_halves: Callable[[Observations], DisjointTest] | None = None,
-) -> Evaluation:
-    """Return the errors of each estimator on about so many frames: runs, evenly spread.
+) -> tuple[Evaluation, ViewCourse]:
+    """Return the errors of each estimator on about so many frames: runs, evenly spread; and those
+    of the first one in held-out views over time.
 
     ``flips``, which are of the sequence's skeleton, are undone for all estimators. ``test_halves``:
     how the covariances of the first one are tested.
@@ -149,7 +152,10 @@ def evaluate(
     if test_halves is not None:
         test = DisjointTest(torch.cat([test_halves(batch).square for batch in batches]))
         ellipsoids = test.coverage() if test.is_decidable else None
-    return Evaluation(len(rows), errors, ellipsoids)
+    first = next(iter(held_out.values()))
+    shown = torch.where(common, first.error.double(), torch.nan).nanmedian(-1).values
+    course = ViewCourse(names, sequence.frame[rows].astype(np.float64), shown.numpy())
+    return Evaluation(len(rows), errors, ellipsoids), course
 
 
 @dataclass(frozen=True)

@@ -127,6 +127,8 @@ class KeyPointDataModule(L.LightningDataModule):
         return recordings
 
     def train_dataloader(self) -> FrameLoader:
+        if getattr(self.trainer, "overfit_batches", 0) > 0:
+            return self._loader("train")  # the first batches, in every epoch
         return self._loader("train", seed=self.seed, done=self._batches_done)
 
     def _batches_done(self) -> int:

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 from jaxtyping import Bool, Int
-from torch.utils.data import DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, SequentialSampler
 
 from ghpt import randomness
 from ghpt.errors import GhptDataError
@@ -165,8 +165,11 @@ def _random(
     return chosen[:count]
 
 
-class BatchOrder(Sampler[list[int]]):
+class BatchOrder(SequentialSampler):
     """The samples of each batch for one process.
+
+    To Lightning, which puts a sampler of its own in the place of others when it overfits, it is
+    sequential.
 
     The order is a pure function of the seed (None: as the samples are) and the batches already
     done. A global batch is ``batch_size`` samples in the same order on any number of processes;
@@ -194,7 +197,7 @@ class BatchOrder(Sampler[list[int]]):
     def __len__(self) -> int:
         return -(-self.count // self.batch_size)
 
-    def __iter__(self) -> Iterator[list[int]]:
+    def __iter__(self) -> Iterator[list[int]]:  # type: ignore[override]  # of batches
         epoch, first = divmod(self.done(), len(self))
         order = torch.arange(self.count)
         if self.seed is not None:

@@ -40,6 +40,12 @@ class JointMeans:
         means = self._average(part)
         return part.with_joints(means).select_joints(self._places)
 
+    @property
+    def key_point_joints(self) -> tuple[tuple[int, int], ...]:
+        """Pairs of a key point and the joint that it is."""
+        joints, key_points = torch.nonzero(self._matrix == 1, as_tuple=True)
+        return tuple(zip(key_points.tolist(), joints.tolist(), strict=True))
+
     @cached_property
     def _matrix(self) -> Float[Tensor, "J K"]:
         return torch.tensor(self.weights, dtype=torch.float64)

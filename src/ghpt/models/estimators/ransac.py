@@ -31,7 +31,8 @@ from ghpt.randomness import key, uniform
 class Ransac(ConfidenceWeighted):
     """For each joint the pair of views whose point has the most inliers, then the inliers together.
 
-    Among equals the pair with the least residuals is taken.
+    Among equals the pair is taken whose inliers have the most confidence and the least residuals: a
+    detector that gives every joint guesses those that it does not see, with little confidence.
 
     ``threshold``: an inlier's largest reprojection error, as a fraction of the person's scale in
     that view. ``pairs``: where the views make more pairs than this, so many random ones are tried
@@ -60,6 +61,7 @@ class Ransac(ConfidenceWeighted):
             candidates = _Candidates(
                 cameras=select_frames(rig, rows),
                 key_points=batch.key_points[rows],
+                confidence=batch.confidence[rows],
                 valid=batch.valid[rows],
                 scale=scale[rows],
                 pairs=pairs[rows],
@@ -168,6 +170,7 @@ class _Candidates:
         self,
         cameras: Cameras,
         key_points: Float[Tensor, "B V J 2"],
+        confidence: Float[Tensor, "B V J"],
         valid: Bool[Tensor, "B V J"],
         scale: Float[Tensor, "B V"],
         pairs: Bool[Tensor, "B P J V"],
@@ -180,6 +183,7 @@ class _Candidates:
         )
         points, ok = triangulate_subsets(each, key_points, valid, pairs)
         self.valid = valid.permute(1, 2, 0)
+        self.confidence = _relative_confidence(confidence, valid).permute(1, 2, 0)
         self.system = System(cameras, key_points, self.valid)
         scale = scale.double().clamp(min=1e-12)
         square = scale.mT[:, None] ** 2
@@ -208,16 +212,18 @@ class _Candidates:
     ) -> Bool[Tensor, "V J B"]:
         """Return the views within the frame's threshold of each joint's best point.
 
-        The best point has the most of them, and among equals the least sum of residuals. ``rows``:
-        of some of the frames.
+        The best point has the most of them, and among equals the greatest sum of confidence times
+        what is left of the threshold. ``rows``: of some of the frames.
         """
         residual = self.residual if rows is None else self.residual[..., rows]
-        # the residuals sum up to less than one more inlier
-        slope = 1 / (thresholds * (len(residual) + 1))
+        confidence = self.confidence if rows is None else self.confidence[..., rows]
+        # what divides equals sums up to less than one more inlier
+        share = 1 / (len(residual) + 1)
+        slope = share / thresholds
         score = torch.zeros_like(residual[0])
-        for of_view in residual:
-            merit = 1 - of_view * slope
-            score = score + torch.where(of_view <= thresholds, merit, 0.0)
+        for of_view, trust in zip(residual, confidence, strict=True):
+            loss = share * (1 - trust) + trust * (of_view * slope)
+            score = score + torch.where(of_view <= thresholds, 1 - loss, 0.0)
         best = score.argmax(0).expand(len(residual), 1, -1, -1)
         own = residual.gather(1, best)[:, 0]
         return own <= thresholds
@@ -247,3 +253,11 @@ class _Candidates:
         rejected = (self.valid & ~system.used).any(0)
         linear = system.assess(point, cond, system.used, rejected)
         return robust.with_fallback(robust.ok, linear)
+
+
+def _relative_confidence(
+    confidence: Float[Tensor, "B V J"], valid: Bool[Tensor, "B V J"]
+) -> Float[Tensor, "B V J"]:
+    """Return each view's confidence as a share of the most confident view's of the joint."""
+    known = torch.where(valid, confidence.nan_to_num(0.0).clamp(min=0), 0.0)
+    return known / known.amax(1, keepdim=True).clamp(min=1e-12)

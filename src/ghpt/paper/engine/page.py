@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
-import logging
 import statistics
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from io import BytesIO
 from pathlib import Path
 from typing import Any
-
-import matplotlib
-from matplotlib.figure import Figure
 
 from ghpt.files import atomic_write, write_json
 from ghpt.paper.engine.artefact import (
@@ -39,6 +34,7 @@ from ghpt.report.document import (
     prose,
     spans,
 )
+from ghpt.report.drawing import draw
 from ghpt.report.html import render_html
 from ghpt.report.markdown import write_markdown
 from ghpt.report.tables import NONE
@@ -48,9 +44,6 @@ PREFIX = {"table": "tab:", "figure": "fig:"}
 SYNTHETIC = "synthetic"
 EVIDENCE = "by (the paper's in brackets)"
 HOLDS: Mapping[bool | None, Text] = {True: "yes", False: Strong("no"), None: NONE}
-
-# fontTools logs every glyph that goes into a PDF
-logging.getLogger("fontTools").setLevel(logging.WARNING)
 
 
 @dataclass(frozen=True)
@@ -242,20 +235,6 @@ def write_page(page: Page, folder: Path) -> None:
     with atomic_write(folder / "report.html", "w") as handle:
         handle.write(render_html(report, pictures))
     write_json(folder / "report.json", content(page))
-
-
-def draw(figure: Figure, kind: str) -> bytes:
-    """Return the figure as a file; the same bytes for the same figure.
-
-    It has no date and no random names. Letters are outlines, so that no font is needed.
-    """
-    drawn = BytesIO()
-    date = "Date" if kind == "svg" else "CreationDate"
-    with matplotlib.rc_context(
-        {"svg.hashsalt": "ghpt", "svg.fonttype": "path", "pdf.fonttype": 42}
-    ):
-        figure.savefig(drawn, format=kind, metadata={date: None})
-    return drawn.getvalue()
 
 
 def content(page: Page) -> dict[str, Any]:

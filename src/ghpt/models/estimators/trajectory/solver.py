@@ -184,7 +184,7 @@ class _Rounds:
         if self.given is None:
             self.body = self._measure(self.points, residual)
         if adapt:
-            self.deviation = solver.motion.adapted(self.points, frames.axis)
+            self.deviation = solver.motion.adapt(self.points, frames.axis)
         scale = self.body.scale[:, None]
         relative = residual / scale
         robust = (1 + (relative / kernel).square()).square().reciprocal()
@@ -265,7 +265,8 @@ class _Rounds:
         """Return the directions and the lengths of the bones."""
         start, end = self.ends
         across = points[:, start] - points[:, end]
-        length = torch.linalg.vector_norm(across, dim=0)
+        x, y, z = across
+        length = torch.addcmul(torch.addcmul(x * x, y, y), z, z).sqrt_()
         return across / length.clamp(min=1e-9), length
 
     def _measure(
@@ -276,19 +277,42 @@ class _Rounds:
             residual = self.rows.residuals(points)
         _, lengths = self._directions(points)
         length, precision = self.solver.bones.measure(lengths, self.both_placed)
-        return Body(self._noise(residual), length, precision)
-
-    def _noise(self, residual: Float[Tensor, "V J T"]) -> Float[Tensor, " J"]:
-        """Return the deviation of each joint's key points, mm.
-
-        That of a joint that nobody sees is the median joint's.
-        """
-        measured = torch.where(self.rows.used, residual, torch.nan)
-        median = measured.transpose(0, 1).flatten(1).nanmedian(-1).values
-        typical = median.nanmedian()
-        median = torch.where(median.isnan(), typical, median).nan_to_num(1.0)
-        return self.solver.noise * (median / _MEDIAN_LENGTH).clamp(min=_LEAST_NOISE)
+        noise = joint_noise(residual, self.rows.used, self.weight, self.solver.noise)
+        return Body(noise, length, precision)
 
 
 _LEAST_NOISE = 1.0
 """mm. No detector is better; key points without any error would leave time and bones no say."""
+
+
+def joint_noise(
+    residual: Float[Tensor, "V J T"],
+    used: Bool[Tensor, "V J T"],
+    weight: Float[Tensor, "V J T"],
+    factor: float,
+) -> Float[Tensor, " J"]:
+    """Return the deviation of each joint's key points, mm: so many times what the median says.
+
+    It is told by the median that the weights make: what a detector guesses, with little confidence,
+    says nothing of the others. That of a joint that nobody sees is the median joint's.
+    """
+    measured = used & residual.isfinite()
+    median = _weighted_median(
+        torch.where(measured, residual, torch.inf).transpose(0, 1).flatten(1),
+        torch.where(measured, weight, 0.0).transpose(0, 1).flatten(1),
+    )
+    typical = median.nanmedian()
+    median = torch.where(median.isnan(), typical, median).nan_to_num(1.0)
+    return factor * (median / _MEDIAN_LENGTH).clamp(min=_LEAST_NOISE)
+
+
+def _weighted_median(
+    values: Float[Tensor, "J N"], weights: Float[Tensor, "J N"]
+) -> Float[Tensor, " J"]:
+    """Return the least value up to which lies half of the weight; NaN where there is none."""
+    ordered, order = values.sort(dim=-1)
+    below = weights.gather(-1, order).cumsum(-1)
+    total = below[:, -1:]
+    at = (below < total / 2).sum(-1, keepdim=True)
+    median = ordered.gather(-1, at)
+    return torch.where(total > 0, median, torch.nan)[:, 0]
