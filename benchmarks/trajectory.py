@@ -4,7 +4,8 @@
 
 Synthetic Human3.6M, 320 successive frames of each take. ``w``: what is spoilt is drawn anew for
 every frame; ``p``: it lasts. Prints a Markdown table: pelvis-relative MPJPE (mm), the share of the
-joints that are estimated and the error of velocities; then coverage of the covariances against the
+joints that are estimated and the error of velocities, the last for the online form, which knows
+nothing of a take when it begins (``--lag``, seconds); then coverage of the covariances against the
 detector's own definition of the joints, and frames per second of processor time. ``--motion``: real
 motion instead, [N 17 3] in mm with ``clip_start``, before Human3.6M's rig of the validation person.
 """
@@ -34,6 +35,8 @@ from ghpt.models.estimators.classical import Estimator, person_scale
 from ghpt.models.estimators.predictors import remove_outliers
 from ghpt.models.estimators.trajectory.disjoint import observed_by_two, square_distances
 from ghpt.models.estimators.trajectory.estimator import Trajectory
+from ghpt.models.estimators.trajectory.online_predictor import OnlinePredictor
+from ghpt.models.estimators.trajectory.windows import Clock
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.skeleton import HUMAN36M, JOINTS, MIRROR, PELVIS
 
@@ -245,6 +248,7 @@ def main() -> None:
     parser.add_argument("--split", default="test")
     parser.add_argument("--motion", type=Path)
     parser.add_argument("--conditions", default="")
+    parser.add_argument("--lag", type=float, default=0.1)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     everything = (
@@ -258,18 +262,23 @@ def main() -> None:
     recordings = [recorded(everything[number], detector) for number in chosen]
     settings = default_settings()
     trajectory: Trajectory = build_estimator(settings).predictor.trajectory
+    live = default_settings(estimator="online", lag=arguments.lag)
+    online: OnlinePredictor = build_estimator(live).predictor
     frame: Estimator = build(settings.baselines["adaptive_ransac"], "baselines")
     header = ["mm (median)", "placed %", "velocity, mm/frame"]
     columns = [
-        f"{name}, {column}" for name in ("adaptive RANSAC", "trajectory") for column in header
+        f"{name}, {column}"
+        for name in ("adaptive RANSAC", "trajectory", "online")
+        for column in header
     ]
-    print("|", " | ".join(["condition", *columns]), "|\n|" + "---|" * 7)
+    print("|", " | ".join(["condition", *columns]), "|\n|" + "---|" * 10)
     names = [name for name in CONDITIONS if arguments.conditions in name]
-    rows: dict[str, tuple[Row, Row]] = {}
+    rows: dict[str, tuple[Row, Row, Row]] = {}
     distances = []
     for condition in names:
         alone = Row([], [], [])
         whole = Row([], [], [])
+        live_row = Row([], [], [])
         for number, one in enumerate(recordings):
             generator = np.random.default_rng([number, 1])
             other = recordings[(number + 7) % len(recordings)]
@@ -277,22 +286,28 @@ def main() -> None:
             start = time.process_time()
             first = frame(batch)
             alone.add(first, one, time.process_time() - start)
-            fitted = trajectory.at_rate(batch, one.rate_hz).fitted(batch)
+            fitted = trajectory.at_rate(batch, one.rate_hz).fit_to(batch)
             if condition == "as it is":
-                fitted = fitted.calibrated(batch)
+                fitted = fitted.calibrate(batch)
             start = time.process_time()
             found = fitted.complete(batch)
             whole.add(found, one, time.process_time() - start)
+            clock = Clock.of_frames(batch.index.numpy(), one.rate_hz, trajectory.longest_gap_s)
+            start = time.process_time()
+            found = replace(online, clock=clock).estimate(batch)
+            live_row.add(found, one, time.process_time() - start)
             if condition == "as it is":
                 part = fitted.solve(batch, first, with_covariance=True)
                 agreed = observed_by_two(part.views)
                 offset = (part.points - one.apparent)[agreed]
                 distances.append(square_distances(offset, part.covariance[agreed]))
-        rows[condition] = (alone, whole)
-        print(f"| {condition} | {alone.text()} | {whole.text()} |", flush=True)
-    alone, whole = rows[names[0]]
+        rows[condition] = (alone, whole, live_row)
+        texts = " | ".join(row.text() for row in rows[condition])
+        print(f"| {condition} | {texts} |", flush=True)
+    alone, whole, live_row = rows[names[0]]
     print(f"\nframes/s of processor time: {alone.frames / alone.seconds:.0f} adaptive RANSAC,")
     print(f"{whole.frames / whole.seconds:.0f} trajectory with its start ({len(HUMAN36M)} joints)")
+    print(f"{live_row.frames / live_row.seconds:.0f} online, its beginning and all")
     if distances:
         square = torch.cat(distances)
         shares = [float((square <= limit).double().mean()) for limit in (2.366, 6.251, 7.815)]

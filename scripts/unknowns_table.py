@@ -151,7 +151,7 @@ def focal_rows(
                 began = time.process_time()
                 found = estimation(
                     calibration,
-                    estimation.guessed(RIG.names[:views], size),
+                    estimation.guess_cameras(RIG.names[:views], size),
                     torch.from_numpy(own.pixels).double(),
                     torch.from_numpy(own.confidence).double(),
                     torch.from_numpy(own.valid),

@@ -5,12 +5,20 @@ seeded: the ordinary ones are always the same.
 """
 
 import os
+from collections.abc import Sequence
+from typing import TypeVar
 
+T = TypeVar("T")
 NIGHTLY = os.environ.get("GHPT_NIGHTLY") == "1"
 
 
 def _size(ordinary: int, nightly: int) -> int:
     return nightly if NIGHTLY else ordinary
+
+
+def representatives(ordinary: Sequence[T], others: Sequence[T]) -> list[T]:
+    """Return the parameters of a test: one of each sort, and at night the others of its sort."""
+    return [*ordinary, *(others if NIGHTLY else ())]
 
 
 MUTATED_FILES = _size(100, 20_000)
@@ -23,17 +31,17 @@ FLIPPED_BITS = _size(300, 1500)
 """A2: flipped bits of a checkpoint, beside those of its end."""
 DAMAGED_CHECKPOINTS = _size(25, 100)
 """B6: damaged checkpoints that a training is to go on after."""
-KILLED_SAVES = _size(8, 300)
+KILLED_SAVES = _size(4, 300)
 """B1: kills while a checkpoint is saved."""
 KILLED_TRAININGS = _size(1, 10)
 """B2: trainings that are killed and resumed."""
-KILLED_PREDICTIONS = _size(6, 200)
+KILLED_PREDICTIONS = _size(4, 200)
 """B3: kills of a prediction."""
-PREDICTED_FRAMES = _size(1_000, 100_000)
+PREDICTED_FRAMES = _size(500, 100_000)
 """B3: frames of that prediction."""
-TRAINING_STEPS = _size(240, 20_000)
+TRAINING_STEPS = _size(120, 20_000)
 """E3: steps of a long training."""
-STREAMED_FRAMES = _size(18_000, 1_000_000)
+STREAMED_FRAMES = _size(12_000, 1_000_000)
 """E2: frames of a prediction whose memory stays flat."""
 LENSES = _size(200, 10_000)
 """D1: rigs whose lenses are undone."""

@@ -10,7 +10,7 @@ import torch
 import sizes
 from ghpt.calibration.baseline import RigBaseline
 from ghpt.calibration.normal_matrix import linearise
-from ghpt.calibration.observations import choose_frames, observe, reweighted
+from ghpt.calibration.observations import choose_frames, observe, reweight
 from ghpt.calibration.resection import PlacedRig
 from ghpt.calibration.uncertainty import gauge
 from ghpt.errors import GhptConfigError, GhptDataError
@@ -215,7 +215,7 @@ def test_noise_of_views_and_joints_is_found():
         sigma[..., None] * torch.randn(*sigma.shape, 2, generator=generator, dtype=torch.float64)
     ).norm(dim=-1)
     # of 2 x 4 numbers a point takes 3
-    found = reweighted(observed, error * (5 / 8) ** 0.5, observed.valid).noise / observed.noise
+    found = reweight(observed, error * (5 / 8) ** 0.5, observed.valid).noise / observed.noise
     assert (found / sigma - 1).abs().max() < 0.12
 
 
@@ -309,7 +309,7 @@ def test_arrays_that_do_not_belong_together_are_refused():
     with pytest.raises(GhptDataError, match="two or more"):
         scene.views([0]).calibrate(CALIBRATE)
     with pytest.raises(GhptDataError, match="scale"):
-        people(frames=20).calibrate(CALIBRATE).scaled(0.0)
+        people(frames=20).calibrate(CALIBRATE).scale_by(0.0)
     with pytest.raises(GhptConfigError, match="frames"):
         calibration(frames=0)
 
@@ -320,7 +320,7 @@ def test_scaled_scales_lengths_alone():
     factor = float(
         relative(scene.cameras, 0, 1)[1].norm() / relative(estimate.cameras, 0, 1)[1].norm()
     )
-    scaled = estimate.scaled(factor)
+    scaled = estimate.scale_by(factor)
     torch.testing.assert_close(scaled.cameras.R, estimate.cameras.R)
     torch.testing.assert_close(scaled.centre_std, factor * estimate.centre_std)
     torch.testing.assert_close(scaled.rotation_std_deg, estimate.rotation_std_deg)

@@ -28,7 +28,7 @@ CHANGES = {
     "a figure": ("report/figures.py", "\nONE = 1\n"),
 }
 PROGRAM = """
-import ast, functools, json, sys
+import functools, json, sys
 from pathlib import Path
 from ghpt.paper.engine import code
 names = frozenset({
@@ -36,13 +36,14 @@ names = frozenset({
     "ghpt.models.relative_pose.baselines.PoseLib",
     "ghpt.data.datasets.arrangements.Human36M",
 })
-@functools.cache
-def parsed(content):
-    return ast.parse(content)
-code._parse = lambda file: parsed(file.read_bytes())
+def by_content(function):
+    cached = functools.cache(lambda content, *given: function(*given))
+    return lambda *given: cached(given[-1].read_bytes(), *given)
+code.source_meaning = by_content(code.source_meaning.__wrapped__)
+code.imported_names = by_content(code.imported_names)
+code.data_files = by_content(code.data_files)
 def digest():
     code.code_digest.cache_clear()
-    code.source_meaning.cache_clear()
     return code.code_digest(names)
 before = digest()
 changed = {}

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import sizes
 from composed import calibrate_settings, cameras_settings
 from ghpt.calibration.findings import Finding
 from ghpt.commands.calibrate import check_reference, open_case
@@ -19,7 +20,6 @@ from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.rotations import vector_to_matrix
 from ghpt.skeleton import MIRROR
 from predicting import config
-from sizes import NIGHTLY
 from test_verdict import NAMES, RIG, late, pixels, points_file
 
 OF_THE_RESULT = ("left_out_error", "few_views_agree", "rejected")
@@ -104,7 +104,7 @@ MISTAKES = {
 }
 
 
-TRIED = tuple(MISTAKES) if NIGHTLY else ("none", "exchanged")
+TRIED = tuple(MISTAKES) if sizes.NIGHTLY else ("none", "exchanged")
 """Of the mistakes; the others are tried at night. A real recording below has a moved camera."""
 
 
@@ -118,12 +118,13 @@ def test_the_commands_name_the_same_mistake_of_the_same_cameras(name, tmp_path):
     assert said_by_predict(words, tmp_path / "out") == expected
 
 
+POSE2SIM = ("pose2sim_single/pose", "pose2sim_single/Calib_qualisys.toml")
+CALISCOPE = ("caliscope/xy_HOLISTIC.csv", "caliscope/camera_array.toml")
+
+
 @pytest.mark.parametrize(
     ("points", "cameras", "expected"),
-    [
-        ("pose2sim_single/pose", "pose2sim_single/Calib_qualisys.toml", {("moved", ("cam03",))}),
-        ("caliscope/xy_HOLISTIC.csv", "caliscope/camera_array.toml", set()),
-    ],
+    sizes.representatives([(*POSE2SIM, {("moved", ("cam03",))})], [(*CALISCOPE, set())]),
 )
 def test_the_commands_agree_on_real_recordings(points, cameras, expected, shared_data, tmp_path):
     words = (f"keypoints={shared_data / points}", f"cameras={shared_data / cameras}", "rate_hz=30")

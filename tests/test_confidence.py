@@ -33,7 +33,7 @@ def observed(exponent, frames=60, views=5, seed=0):
 
 
 def exponent_of(batch, name="adaptive_ransac"):
-    return ESTIMATORS[name].fitted(batch).confidence_exponent
+    return ESTIMATORS[name].fit_to(batch).confidence_exponent
 
 
 @pytest.mark.parametrize("exponent", [1.0, 1.5])
@@ -70,7 +70,7 @@ def test_a_nan_among_the_confidences_changes_nothing():
     confidence[0, 0, 0] = torch.nan
     spoilt = replace(batch, confidence=confidence)
     assert exponent_of(spoilt) == pytest.approx(exponent_of(batch), rel=0.01)
-    fitted = ESTIMATORS["adaptive_ransac"].fitted(spoilt)
+    fitted = ESTIMATORS["adaptive_ransac"].fit_to(spoilt)
     assert fitted(spoilt).points.isfinite().all()
 
 
@@ -78,6 +78,6 @@ def test_a_nan_among_the_confidences_changes_nothing():
 def test_weights_by_the_fitted_exponent_lessen_the_error(name):
     batch, truth = observed(2.0)
     estimator = ESTIMATORS[name]
-    fitted = estimator.fitted(batch)
+    fitted = estimator.fit_to(batch)
     errors = [(e(batch).points - truth).norm(dim=-1).mean().item() for e in (estimator, fitted)]
     assert errors[1] < 0.9 * errors[0]

@@ -128,7 +128,7 @@ def estimated(pixels: torch.Tensor, views: int, **changes: object):
     settings = calibrate_settings("calibration.frames=30")
     estimation: IntrinsicsEstimation = build({**settings.intrinsics, **changes}, "intrinsics")
     calibration: RigCalibration = build(settings.calibration, "calibration")
-    guess = estimation.guessed(("a", "b", "c", "d")[:views], SIZE)
+    guess = estimation.guess_cameras(("a", "b", "c", "d")[:views], SIZE)
     own = pixels[:, :views]
     valid = torch.ones(own.shape[:3], dtype=torch.bool)
     return estimation(calibration, guess, own, valid.double(), valid, 0)

@@ -221,6 +221,7 @@ def test_trainings_of_a_local_pool_are_those_of_one_process(typed, conf, tmp_pat
         "model.hypotheses=5",
         "model.scorer.layers=[4]",
         "trainer.accelerator=cpu",
+        "trainer.max_epochs=2",
         "seed=1",
     )
     said = {}

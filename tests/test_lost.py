@@ -168,7 +168,7 @@ def trainer_of(*commands: str) -> Mock:
 )
 def test_the_others_name_the_process_that_ended(command, says):
     trainer = trainer_of(command)
-    with pytest.raises(GhptConfigError, match=says), lost.told(trainer):
+    with pytest.raises(GhptConfigError, match=says), lost.report_end(trainer):
         raise RuntimeError(
             "[gloo/transport/tcp/pair.cc:534] Connection closed by peer [127.0.1.1]:21345"
         )
@@ -179,7 +179,7 @@ def test_a_process_that_others_started_is_none_of_ours(monkeypatch):
     started_by_slurm = trainer_of()
     with (
         pytest.raises(GhptConfigError, match="one of the run's 2 processes has ended"),
-        lost.told(started_by_slurm),
+        lost.report_end(started_by_slurm),
     ):
         raise RuntimeError("NCCL communicator was aborted")
 

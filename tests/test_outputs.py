@@ -214,7 +214,7 @@ def test_a_finished_run_is_known_until_its_settings_inputs_or_files_change(tmp_p
 
     def said(**changed):
         with OutputFolder(output, Files((source,), ("a.txt",))) as folder:
-            return folder.finished(settings | changed)
+            return folder.read_summary(settings | changed)
 
     assert said() is None
     with OutputFolder(output, Files((source,), ("a.txt",))) as folder:

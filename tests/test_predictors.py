@@ -224,7 +224,7 @@ def test_a_joint_of_two_noisy_views_stays_observed_though_little_else_is_seen():
     valid[0, :2, :10] = False
     valid[0, :2, 12:] = False
     batch = replace(scene, key_points=key_points).batch(valid)
-    result = classical(reject=Rejection(0.1)).fitted(batch)(batch)
+    result = classical(reject=Rejection(0.1)).fit_to(batch)(batch)
     assert result.state[0, 10] == State.OBSERVED
 
 
@@ -238,7 +238,7 @@ def test_two_views_that_disagree_by_much_make_no_joint():
         moved = key_points.clone()
         moved[0, 0, 5] += sign * 0.9 * size[0, 0] * across
         batch = replace(scene, key_points=moved).batch()
-        result = classical(Linear(), Rejection(0.1)).fitted(batch)(batch)
+        result = classical(Linear(), Rejection(0.1)).fit_to(batch)(batch)
         assert result.state[0, 5] != State.OBSERVED
 
 
@@ -297,7 +297,7 @@ def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
         build(config["learned"], "predictor.learned")(view_weights=learned().view_weights),
     ):
         assert made(batch).has_position.all()
-        assert made.fitted(batch).uncertainty.noise == pytest.approx(float(2 / size), rel=0.3)
+        assert made.fit_to(batch).uncertainty.noise == pytest.approx(float(2 / size), rel=0.3)
 
 
 MIXED = make_skeleton("x", "mixed", ("left_eye", *reversed(JOINTS)))

@@ -22,7 +22,7 @@ from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.data.people.sequence import Sequence
 from ghpt.models.estimators.classical import Linear
 from ghpt.signals import stop as handler
-from ghpt.signals import stopped_by_signals
+from ghpt.signals import stop_on_signals
 from predicting import config, sequence_of
 from toys import train
 
@@ -67,7 +67,7 @@ def test_a_signal_ends_a_command_with_its_status_and_no_word(typed, tmp_path, na
 @pytest.mark.parametrize("name", STATUS)
 @pytest.mark.parametrize("error", [ValueError, SystemExit, OSError])
 def test_the_status_is_the_signal_s_whatever_the_interrupted_code_makes_of_it(name, error):
-    with pytest.raises(SystemExit) as stop, stopped_by_signals():
+    with pytest.raises(SystemExit) as stop, stop_on_signals():
         try:
             send(name)
         finally:
@@ -80,7 +80,7 @@ def test_an_ignored_signal_stays_ignored(name):
     """So `nohup` has it, and a script's background job."""
     before = signal.signal(getattr(signal, name), signal.SIG_IGN)
     try:
-        with stopped_by_signals():
+        with stop_on_signals():
             send(name)
             assert signal.getsignal(getattr(signal, name)) is signal.SIG_IGN
     finally:
@@ -88,9 +88,9 @@ def test_an_ignored_signal_stays_ignored(name):
 
 
 def test_an_error_after_a_command_that_was_stopped_is_an_error():
-    with pytest.raises(SystemExit), stopped_by_signals():
+    with pytest.raises(SystemExit), stop_on_signals():
         send("SIGTERM")
-    with pytest.raises(ValueError, match="own"), stopped_by_signals():
+    with pytest.raises(ValueError, match="own"), stop_on_signals():
         raise ValueError("own")
 
 
@@ -107,7 +107,7 @@ def test_a_second_signal_ends_the_process_at_once(first, second, ended):
     child = os.fork()
     if child == 0:
         try:
-            with stopped_by_signals():
+            with stop_on_signals():
                 try:
                     send(first)
                 finally:
@@ -194,7 +194,7 @@ def test_a_stopped_prediction_goes_on_to_the_same_bytes(
 
     with monkeypatch.context() as patch, pytest.raises(SystemExit) as stop:
         patch.setattr(owner, function, interrupted)
-        with stopped_by_signals():
+        with stop_on_signals():
             predict("stopped")
     assert (stop.value.code, len(calls)) == (143, at)
     manifest = tmp_path / "stopped" / prediction.SHARDS / MANIFEST

@@ -36,18 +36,23 @@ NOISE = 4.0
 
 @pytest.fixture(scope="module")
 def truth():
-    motion = draw_motion(0, "S8", "S8/Walking-1", "Walking", FRAMES, 50.0)
-    return torch.from_numpy(motion)
+    return walk(FRAMES)[0]
 
 
 @pytest.fixture(scope="module")
-def batch(truth):
-    """A person who walks before Human3.6M's four cameras, with Gaussian noise."""
+def batch():
+    return walk(FRAMES)[1]
+
+
+def walk(frames):
+    """Return a person who walks before Human3.6M's four cameras, and what they see with noise."""
+    motion = draw_motion(0, "S8", "S8/Walking-1", "Walking", FRAMES, 50.0)
+    truth = torch.from_numpy(motion)[:frames]
     rig = human36m_rig("S8").cameras.to(torch.float64)
-    pixels, _ = project(rig.expand(FRAMES), truth)
+    pixels, _ = project(rig.expand(FRAMES), torch.from_numpy(motion))
     noise = torch.randn(pixels.shape, generator=torch.Generator().manual_seed(0))
     valid = torch.ones(pixels.shape[:-1], dtype=torch.bool)
-    return Observations(
+    batch = Observations(
         index=torch.arange(FRAMES),
         recording=torch.zeros(FRAMES, dtype=torch.int64),
         cameras=rig.expand(FRAMES),
@@ -55,6 +60,7 @@ def batch(truth):
         confidence=torch.ones(valid.shape),
         valid=valid,
     )
+    return truth, batch.rows(slice(0, frames))
 
 
 @pytest.fixture(scope="module")

@@ -70,7 +70,7 @@ def test_gaussian_noise_is_found_and_the_truth_is_inside_as_often_as_said(views)
     ).batch()
     depth = project(scene.cameras, scene.points)[1]
     points = triangulate(scene.cameras, batch.key_points, (depth * size[..., None]) ** -2).points
-    quality = UncertaintyModel(noise=None, prior=30.0, shared=0.0).fitted(
+    quality = UncertaintyModel(noise=None, prior=30.0, shared=0.0).fit_to(
         batch, points, batch.valid
     )
     assert quality.noise == pytest.approx(0.005, rel=0.35 if views == 2 else 0.1)
@@ -137,7 +137,7 @@ def test_calibration_on_embedded_people_known_to_the_detector_and_not(split, ban
     frames = Frames(takes, np.arange(0, sum(map(len, takes)), 16))
     labelled = frames[range(len(frames))]
     batch = labelled.observations
-    result = predictor.fitted(batch)(batch)
+    result = predictor.fit_to(batch)(batch)
     offset = (result.points - labelled.truth.points).double()[result.has_position][..., None]
     distance = (
         offset.mT

@@ -344,7 +344,7 @@ def test_commands_hold_what_was_given(tmp_path):
         "person=1",
         "skeleton=coco_17",
     )
-    commands = commands_on(given, given.changed(), tmp_path / "out")
+    commands = commands_on(given, given.non_defaults(), tmp_path / "out")
     assert shlex.split(commands.predict(unit_mm=1.0))[2:] == [
         "keypoints='/my data/pose'",
         "cameras=Calib.toml",

@@ -9,7 +9,7 @@ configuration: nothing here has numbers of its own.
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -33,7 +33,7 @@ from ghpt.config import CONF, build, plain, settings
 from ghpt.data.people.detections import Detections
 from ghpt.data.people.persons import detector_sequence, person_sequence
 from ghpt.data.points import KeyPoints
-from ghpt.errors import GhptDataError, check
+from ghpt.errors import GhptConfigError, GhptDataError, check
 from ghpt.geometry.cameras import CameraSet
 from ghpt.geometry.lens import undistort
 from ghpt.metrics.pose_error import Kind, joint_errors
@@ -186,6 +186,41 @@ class Predictor:
         x, y, z = sequence.origin.tolist()
         about = replace(about, origin=(x, y, z), bones=joints.bones)
         return Poses(about, joints(sequence.to_world(part)), sequence.cameras)
+
+    def stream(
+        self, frames: Iterable[Array], cameras: CamerasLike, rate_hz: int | float | None = None
+    ) -> Iterator[Poses]:
+        """Yield the pose of each frame as soon as its lag is over, while ``frames`` come.
+
+        It takes ``estimator="online"``; ``lag=0.1`` is in seconds. Each of ``frames`` has the key
+        points of one person's 17 joints in a frame, [V 17 2], or of a few frames, [T V 17 2]; NaN
+        is missing, and a third coordinate is the confidence. The poses are those of `__call__` on
+        all frames, in millimetres, in the world of the cameras. Raises GhptConfigError for another
+        estimator, GhptDataError for wrong shapes.
+        """
+        from ghpt.models.estimators.trajectory.online import as_reconstruction
+        from ghpt.models.estimators.trajectory.online_predictor import OnlinePredictor
+        from ghpt.models.estimators.trajectory.sightings import frames_of
+
+        predictor = self.estimator.predictor
+        if not isinstance(predictor, OnlinePredictor):
+            problem = f"is {self.estimator.name!r}, which needs all frames"
+            raise GhptConfigError("estimator", problem, 'Use Predictor(estimator="online").')
+        rig = as_camera_set(cameras)
+        rig.check_calibrated("cameras")
+        about = _about(self.estimator.name, JOINTS, rig.names, rate_hz and float(rate_hz))
+        online = predictor.stream(rate_hz)
+        number = 0
+        for values in frames:
+            points = _frames_of_joints(values, len(rig))
+            batch = _observe(points, rig)
+            batch = replace(batch, index=batch.index + number)
+            number += len(points)
+            for frame in frames_of(batch):
+                for found in online.push(frame):
+                    yield Poses(about, as_reconstruction([found]), rig)
+        for found in online.finish():
+            yield Poses(about, as_reconstruction([found]), rig)
 
 
 def calibrate_rig(
@@ -349,6 +384,18 @@ def _observe(points: KeyPoints, rig: CameraSet) -> Observations:
         confidence=torch.from_numpy(points.confidence),
         valid=torch.from_numpy(points.valid) & possible.reshape(shape).transpose(0, 1),
     )
+
+
+def _frames_of_joints(values: Array, views: int) -> KeyPoints:
+    """Return the key points of one frame or a few; a third coordinate is the confidence."""
+    numbers = as_tensor(values)
+    frames = numbers[None] if numbers.ndim == 3 else numbers
+    if frames.ndim != 4 or frames.shape[2] != len(JOINTS) or frames.shape[3] not in (2, 3):
+        problem = f"has the shape {list(numbers.shape)}"
+        hint = f"Give [{views} {len(JOINTS)} 2], or [T {views} {len(JOINTS)} 2]."
+        raise GhptDataError("frames", "", problem, hint)
+    confidence = frames[..., 2] if frames.shape[3] == 3 else None
+    return as_key_points(frames[..., :2], confidence, views)
 
 
 def _poses_of(points: Array) -> Poses:

@@ -92,20 +92,20 @@ def settings(cls: type[S], values: Mapping[str, Any], path: str = "") -> S:
     for name in values:
         if name not in annotations:
             hint = suggest(name, annotations)
-            raise GhptConfigError(_dotted(path, name), "no such setting", hint)
+            raise GhptConfigError(_join_key(path, name), "no such setting", hint)
     arguments = {}
     for name, wanted in annotations.items():
-        key = _dotted(path, name)
+        key = _join_key(path, name)
         if name in values:
-            arguments[name] = _typed(values[name], wanted, key)
-        elif name in _required(cls):
+            arguments[name] = _convert(values[name], wanted, key)
+        elif name in _required_fields(cls):
             raise GhptConfigError(key, "is missing", "Set it in the yaml.")
     try:
         return cls(**arguments)
     except GhptConfigError as error:
         if error.key not in arguments:
             raise
-        key = _dotted(path, error.key)
+        key = _join_key(path, error.key)
         raise GhptConfigError(key, error.problem, error.hint) from error
 
 
@@ -115,18 +115,18 @@ def _annotations(cls: type[Any]) -> dict[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(cls)}
 
 
-def _required(cls: type[Any]) -> set[str]:
+def _required_fields(cls: type[Any]) -> set[str]:
     """Return the names of the fields of a dataclass that have no default."""
     missing = dataclasses.MISSING
     fields = dataclasses.fields(cls)
     return {f.name for f in fields if f.default is missing and f.default_factory is missing}
 
 
-def _dotted(path: str, name: str) -> str:
+def _join_key(path: str, name: str) -> str:
     return f"{path}.{name}" if path else name
 
 
-def _typed(value: Any, wanted: Any, key: str) -> Any:
+def _convert(value: Any, wanted: Any, key: str) -> Any:
     """Return a plain value as the annotation ``wanted`` has it; see `settings`."""
     kind = _alternative(value, wanted)
     if isinstance(kind, type) and dataclasses.is_dataclass(kind) and isinstance(value, Mapping):
@@ -137,10 +137,10 @@ def _typed(value: Any, wanted: Any, key: str) -> Any:
     if origin in (list, tuple, Sequence) and inner:
         kinds = _kinds_of_items(kind, len(value))
         items = zip(value, kinds, strict=True)
-        typed = [_typed(item, of_item, f"{key}[{i}]") for i, (item, of_item) in enumerate(items)]
+        typed = [_convert(item, of_item, f"{key}[{i}]") for i, (item, of_item) in enumerate(items)]
         return typed if origin is list else tuple(typed)
     if origin in (dict, Mapping) and inner:
-        return {name: _typed(item, inner[1], f"{key}.{name}") for name, item in value.items()}
+        return {name: _convert(item, inner[1], f"{key}.{name}") for name, item in value.items()}
     return float(value) if kind is float else value
 
 

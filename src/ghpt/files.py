@@ -53,7 +53,7 @@ _guards: dict[Path, Guard] = {}
 
 
 @contextmanager
-def guarded(folder: Path, guard: Guard) -> Iterator[None]:
+def guard_folder(folder: Path, guard: Guard) -> Iterator[None]:
     """Within the block, ``guard`` is asked before a file in or below ``folder`` is touched."""
     key = folder.resolve()
     previous = _guards.get(key)
@@ -259,7 +259,7 @@ def allocate(handle: IO[bytes], size: int, name: str | Path) -> None:
     What the file holds stays, and new bytes are 0.
     """
     try:
-        if not _reserved(handle, size):
+        if not _reserve(handle, size):
             # Past the handle's buffer, which would try, and fail, once more when it is closed.
             missing = size - os.lseek(handle.fileno(), 0, os.SEEK_END)
             while missing > 0:
@@ -270,7 +270,7 @@ def allocate(handle: IO[bytes], size: int, name: str | Path) -> None:
         raise
 
 
-def _reserved(handle: IO[bytes], size: int) -> bool:
+def _reserve(handle: IO[bytes], size: int) -> bool:
     """Whether the operating system takes the bytes itself; Windows, macOS and some disks do not."""
     if not hasattr(os, "posix_fallocate"):
         return False
@@ -290,7 +290,7 @@ def sweep_temporaries(folder: str | Path) -> list[Path]:
     swept = []
     for path in Path(folder).iterdir() if Path(folder).is_dir() else ():
         match = _TEMPORARY.match(path.name)
-        if match and _abandoned(path, int(match["pid"])):
+        if match and _is_abandoned(path, int(match["pid"])):
             shutil.rmtree(path, ignore_errors=True) if path.is_dir() else path.unlink(
                 missing_ok=True
             )
@@ -298,7 +298,7 @@ def sweep_temporaries(folder: str | Path) -> list[Path]:
     return swept
 
 
-def _abandoned(path: Path, pid: int) -> bool:
+def _is_abandoned(path: Path, pid: int) -> bool:
     """Whether the process that was writing ``path`` is gone."""
     if _WINDOWS:  # os.kill(pid, 0) would send it Ctrl-C
         return time.time() - path.stat().st_mtime > _ABANDONED

@@ -216,7 +216,7 @@ class Estimate(Batch, ABC):
     def valid(self) -> Bool[Tensor, "*B"]:
         """Return where the estimate means something: estimated, and finite."""
 
-    def masked(self: EstimateT) -> EstimateT:
+    def mask_invalid(self: EstimateT) -> EstimateT:
         """Return the estimate with zeros where it is not valid, and not ``estimated`` there."""
         valid = self.valid()
         values = {field.name: getattr(self, field.name) for field in fields(self)}
@@ -258,7 +258,7 @@ class RelativePoseEstimate(Estimate):
         finite = self.R.isfinite().flatten(-2).all(-1) & self.t.isfinite().all(-1)
         return self.estimated & finite & (self.t != 0).any(-1)
 
-    def masked(self) -> RelativePoseEstimate:
+    def mask_invalid(self) -> RelativePoseEstimate:
         """Return the poses with the identity and t = 0 where they are not valid."""
         valid = self.valid()
         eye = torch.eye(3, dtype=self.R.dtype, device=self.R.device)

@@ -19,7 +19,7 @@ class Terminated(KeyboardInterrupt):
 
 
 @contextmanager
-def stopped_by_signals() -> Iterator[None]:
+def stop_on_signals() -> Iterator[None]:
     """Within the block a signal stops the program where it is, and the block ends in SystemExit.
 
     The status is what shells expect: 130 after SIGINT, 143 after SIGTERM and SIGHUP. Files are

@@ -175,7 +175,7 @@ def test_d6_a_wrong_unit_of_the_scale_is_warned_of():
     estimate = people().calibrate(CALIBRATE)
     lengths = torch.tensor(BodyHeight(1750.0).lengths, dtype=torch.float64)
     right = float(body_scale(estimate.points, estimate.estimated, lengths))
-    found = {off: estimate.scaled(off * right).findings for off in (0.001, 0.1, 0.5, 1.0)}
+    found = {off: estimate.scale_by(off * right).findings for off in (0.001, 0.1, 0.5, 1.0)}
     severities = {
         off: [d.severity for d in findings if d.code in ("unit", "scale")]
         for off, findings in found.items()
@@ -213,7 +213,7 @@ def test_d6_no_success_with_a_wrong_scale(record_row):
         ratio = [factor * a / b for a, b in zip(*lengths, strict=True)]
         if max(abs(r - 1) for r in ratio) > 0.05:
             off += 1
-            if estimate.succeeded and not estimate.scaled(factor).findings:
+            if estimate.succeeded and not estimate.scale_by(factor).findings:
                 silent.append((seed, ratio))
     record_row(
         "D6",

@@ -12,6 +12,7 @@ import pytest
 from tensorboard.summary.writer.record_writer import RecordWriter
 
 import ghpt.commands.test as testing
+import sizes
 from ghpt.commands import predict as prediction
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.commands.train import COMMAND
@@ -83,16 +84,12 @@ def predict_command(typed, tmp_path, monkeypatch):
     return lambda *more: typed(ROOT / "conf", prediction.COMMAND, [*words, *quiet, *more])
 
 
-LIMITS = {
-    "train_command": (12_000,),
-    "test_command": (12_000,),
-    "predict_command": (12_000, 60_000),
-}
-"""Bytes: the first file of each command is too long for the first, another for the second."""
-
-
 @pytest.mark.parametrize(
-    ("name", "size"), [(name, size) for name, sizes in LIMITS.items() for size in sizes]
+    ("name", "size"),  # bytes: another file than the first is too long for 60,000
+    sizes.representatives(
+        [("train_command", 12_000), ("test_command", 12_000), ("predict_command", 60_000)],
+        [("predict_command", 12_000)],
+    ),
 )
 def test_a_command_names_the_file_and_keeps_what_was_there(request, tmp_path, name, size):
     command = request.getfixturevalue(name)

@@ -23,12 +23,12 @@ class Place:
 
 
 PLACES = {
-    "C.UTF-8": Place(".", {"LC_ALL": "C.UTF-8"}),
-    "de_DE.UTF-8": Place(",", {"LC_ALL": "de_DE.UTF-8", "TZ": "Asia/Kathmandu"}),
-    "tr_TR.UTF-8": Place(",", {"LC_ALL": "tr_TR.UTF-8"}),
+    "tr_TR.UTF-8": Place(",", {"LC_ALL": "tr_TR.UTF-8", "TZ": "Asia/Kathmandu"}),
 }
 if sizes.NIGHTLY:  # Python settles when it starts how it encodes, and to start takes seconds
     plain_c = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+    PLACES["C.UTF-8"] = Place(".", {"LC_ALL": "C.UTF-8"})
+    PLACES["de_DE.UTF-8"] = Place(",", {"LC_ALL": "de_DE.UTF-8"})
     PLACES["C"] = Place(".", plain_c, is_forked=False)
 
 

@@ -72,7 +72,7 @@ def test_b1_kill_while_saving(tmp_path, monkeypatch, record_row):
 
 def test_b1_and_b2_kill_training_and_resume(tmp_path, record_row):
     """A real training run, killed, resumed by the same command, ends with the same weights."""
-    changes = {"trainer": {"max_epochs": 20}, "train": {"save_every": 2}}
+    changes = {"trainer": {"max_epochs": 10}, "train": {"save_every": 2}}
     rng = random.Random(1)
 
     def start(folder, resume):

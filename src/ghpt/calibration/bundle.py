@@ -111,7 +111,7 @@ class BundleAdjustment:
         while steps < self.iterations and time.monotonic() < until:
             steps += 1
             reduced = equations.reduce(damping)
-            tried = _moved(now, *reduced.step())
+            tried = _move(now, *reduced.step())
             then = self._residuals(observed, tried)
             if not then.cost < state.cost:
                 damping *= _DAMPING_CHANGE
@@ -137,7 +137,7 @@ class BundleAdjustment:
         return residuals(observed, rig, rig.inlier, self.loss_scale)
 
 
-def _moved(rig: PlacedRig, views: Float[Tensor, "V 6"], points: Float[Tensor, "N 3"]) -> PlacedRig:
+def _move(rig: PlacedRig, views: Float[Tensor, "V 6"], points: Float[Tensor, "N 3"]) -> PlacedRig:
     """Return the rig after a step of the views' and the points' parameters."""
     R = rig.R @ vector_to_matrix(views[:, :3]).mT
     centre = rig.centre + views[:, 3:]

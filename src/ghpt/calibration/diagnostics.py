@@ -153,7 +153,7 @@ class Diagnostics:
             findings += self._geometry(case, case.rig)
             findings += self._proportions(case)
             findings += self._evidence(case)
-            findings += self._determined(case, case.rig, uncertainty)
+            findings += self._check_determined(case, case.rig, uncertainty)
         return (*findings, *self._repairs(case, findings))
 
     def _repairs(self, case: Case, findings: list[Finding]) -> Iterator[Finding]:
@@ -282,7 +282,7 @@ class Diagnostics:
                 needed=_needed(evidence, self.rotation_wanted),
             )
 
-    def _determined(
+    def _check_determined(
         self, case: Case, rig: PlacedRig, uncertainty: Uncertainty
     ) -> Iterator[Finding]:
         """Yield what says that another rig would do as well."""

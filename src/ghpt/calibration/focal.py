@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.calibration.normal_matrix import preconditioned
+from ghpt.calibration.normal_matrix import precondition
 from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import camera_centre
 from ghpt.geometry.epipolar import cross_matrix, normalise
@@ -148,13 +148,13 @@ class FocalAdjustment:
         cost = self._cost(seen, state, noise)
         for _ in range(self.iterations):
             system = _linearise(seen, state, noise, self.loss_scale)
-            matrix, gradient = system.reduced(torch.ones_like(seen.frame, dtype=torch.bool))
+            matrix, gradient = system.reduce(torch.ones_like(seen.frame, dtype=torch.bool))
             matrix = chosen.mT @ matrix @ chosen
             gradient = chosen.mT @ gradient
             while damping < _DAMPING[1]:
                 damped = matrix + damping * torch.diag(matrix.diagonal().clamp(min=_LEAST))
                 change = chosen @ torch.linalg.solve(damped, -gradient)
-                tried = system.stepped(state, change)
+                tried = system.step(state, change)
                 new_cost = self._cost(seen, tried, noise)
                 if new_cost < cost:
                     break
@@ -188,12 +188,12 @@ class FocalAdjustment:
         by_time = seen.frame * self.blocks // frames
         by_joint = seen.joint * self.joint_groups // joints
         variance = torch.zeros(views, dtype=torch.float64)
-        full, _ = system.reduced(torch.ones_like(seen.frame, dtype=torch.bool))
+        full, _ = system.reduce(torch.ones_like(seen.frame, dtype=torch.bool))
         matrix = chosen.mT @ full @ chosen
         for group in (by_time, by_joint):
             steps = []
             for number in group.unique().tolist():
-                own, gradient = system.reduced(group == number)
+                own, gradient = system.reduce(group == number)
                 rest = matrix - chosen.mT @ own @ chosen
                 steps.append((chosen @ _solve(rest, chosen.mT @ gradient))[focal])
             sample = torch.stack(steps)
@@ -256,7 +256,7 @@ class _System:
     """Of the points' own matrices; 0 where a point is not fixed."""
     point_gradient: Float[Tensor, "N 3"]
 
-    def reduced(
+    def reduce(
         self, points: Bool[Tensor, " N"]
     ) -> tuple[Float[Tensor, "P P"], Float[Tensor, " P"]]:
         """Return the matrix and the gradient of some points, which are eliminated."""
@@ -271,7 +271,7 @@ class _System:
         eliminated = torch.einsum("npk,nk->p", solved, self.point_gradient[points])
         return (matrix + matrix.mT) / 2, gradient - eliminated
 
-    def stepped(self, state: Lenses, change: Float[Tensor, " P"]) -> Lenses:
+    def step(self, state: Lenses, change: Float[Tensor, " P"]) -> Lenses:
         """Return the state after a step of the views' parameters, with the points that go with
         it.
         """
@@ -342,7 +342,7 @@ def _inverse(matrix: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3 3"]:
 
 def _solve(matrix: Float[Tensor, "Q Q"], right: Float[Tensor, " Q"]) -> Float[Tensor, " Q"]:
     """Return the least solution of a system that is singular along the gauge."""
-    scale, values, vectors = preconditioned(matrix)
+    scale, values, vectors = precondition(matrix)
     along = vectors.mT @ (scale * right)
     known = values > 1e-10 * values[-1].clamp_min(1e-300)
     solved = torch.where(known, along / torch.where(known, values, 1.0), 0.0)

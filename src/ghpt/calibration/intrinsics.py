@@ -66,7 +66,7 @@ class IntrinsicsEstimation:
         problem = f"is {self.focal!r}"
         check(self.focal in list(FocalLengths), "intrinsics.focal", problem, f"Give {known}.")
 
-    def guessed(self, names: Sequence[str], size: Int[Tensor, " 2"]) -> CameraSet:
+    def guess_cameras(self, names: Sequence[str], size: Int[Tensor, " 2"]) -> CameraSet:
         """Return cameras of one image size with the first guess of the focal length."""
         width, height = size.tolist()
         focal = self.guess * max(width, height)
@@ -93,7 +93,10 @@ class IntrinsicsEstimation:
         valid: Bool[Tensor, "T V J"],
         seed: int,
     ) -> EstimatedIntrinsics:
-        """Return the intrinsics of cameras as `guessed`; ``key_points`` are pixels as detected."""
+        """Return the intrinsics of cameras as `guess_cameras`.
+
+        ``key_points`` are pixels as detected.
+        """
         K = cameras.K
         rig = calibration(cameras.names, K, key_points, confidence, valid, cameras.size, seed)
         views = int(rig.calibrated.sum())

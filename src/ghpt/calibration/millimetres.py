@@ -251,7 +251,7 @@ def in_millimetres(
     if not factor > 0:
         text = f"unknown: the recording does not show it ({source.text})"
         return estimate, RigScale(source.origin, text, None)
-    return estimate.scaled(factor), RigScale(source.origin, source.text, factor)
+    return estimate.scale_by(factor), RigScale(source.origin, source.text, factor)
 
 
 def _body_factor(estimate: RigEstimate, lengths: Sequence[float], measure: Measure) -> float:

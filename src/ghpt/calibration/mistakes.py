@@ -134,22 +134,22 @@ def without_extrinsics(setup: Setup, view: int) -> Iterator[Candidate]:
             yield candidate
 
 
-def shifted(setup: Setup, view: int, by: int) -> Candidate:
+def shift_view(setup: Setup, view: int, by: int) -> Candidate:
     """Return the setup in which a view is taken ``by`` frames later than now."""
     total = setup.shift[view] + by
-    return Candidate(OUT_OF_SYNC, (view,), setup.changed(view, shift=total), float(total))
+    return Candidate(OUT_OF_SYNC, (view,), setup.replace_camera(view, shift=total), float(total))
 
 
 def at_rate(setup: Setup, view: int, ratio: float) -> Candidate:
     """Return the setup in which a view has ``ratio`` times the frame rate of the others."""
-    return Candidate(FRAME_RATE, (view,), setup.changed(view, rate=ratio), ratio)
+    return Candidate(FRAME_RATE, (view,), setup.replace_camera(view, rate=ratio), ratio)
 
 
-def exchanged(setup: Setup, one: int, other: int) -> Candidate:
+def exchange_views(setup: Setup, one: int, other: int) -> Candidate:
     """Return the setup in which two cameras have each other's key points."""
     new = setup
     for view, source in ((one, other), (other, one)):
-        new = new.changed(
+        new = new.replace_camera(
             view,
             source=setup.source[source],
             shift=setup.shift[source],
@@ -251,7 +251,7 @@ def _mirror(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
 
 
 def _turn(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:
-    return setup.turned(views, round(value))
+    return setup.turn_images(views, round(value))
 
 
 def _mirror_and_exchange_sides(setup: Setup, views: tuple[int, ...], value: int | float) -> Setup:

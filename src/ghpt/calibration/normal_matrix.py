@@ -284,7 +284,7 @@ def _inverse(
     return factor[:, None, None] * rows.unflatten(-1, (3, 3)), solvable
 
 
-def preconditioned(
+def precondition(
     matrix: Float[Tensor, "P P"],
 ) -> tuple[Float[Tensor, " P"], Float[Tensor, " P"], Float[Tensor, "P P"]]:
     """Return 1 / sqrt of the diagonal (0 where it is 0), and eigenvalues and -vectors of the matrix
@@ -299,7 +299,7 @@ def preconditioned(
 def _gain(matrix: Float[Tensor, "P P"], gradient: Float[Tensor, " P"]) -> float:
     if not (torch.isfinite(matrix).all() and torch.isfinite(gradient).all()):
         return float("inf")
-    scale, values, vectors = preconditioned(matrix)
+    scale, values, vectors = precondition(matrix)
     along = vectors.T @ (scale * gradient)
     known = values > 1e-10 * values[-1].clamp_min(1e-300)
     return float((along[known] ** 2 / values[known]).sum() / 2)

@@ -232,7 +232,7 @@ LARGEST = 1e6
 """A normalised coordinate beyond this is no key point."""
 
 
-def reweighted(
+def reweight(
     observed: Correspondences, error: Float[Tensor, "V N"], used: Bool[Tensor, "V N"]
 ) -> Correspondences:
     """The same with the noise of each view, then of each joint, that the errors (in units of the

@@ -92,7 +92,7 @@ class Repair:
         """Return the correspondences with the candidate's key points in its view."""
         pixels = self.key_points.clone()
         valid = self.valid.clone()
-        own = candidate.setup.given_to(view, pixels[:, view], valid[:, view])
+        own = candidate.setup.transform_as(view, pixels[:, view], valid[:, view])
         pixels[:, view], valid[:, view] = own
         tried = observe(candidate.setup.K, pixels, valid, self.noise)
         return observed.with_view(view, tried)

@@ -80,7 +80,8 @@ class Resection:
         R = torch.eye(3, dtype=torch.float64).repeat(views, 1, 1)
         t = torch.zeros(views, 3, dtype=torch.float64)
         placed = torch.zeros(views, dtype=torch.bool)
-        R[b], t[b] = table.R[edge], table.t[edge]
+        R[b] = table.R[edge]
+        t[b] = table.t[edge]
         placed[[a, b]] = True
         nothing = (
             torch.zeros(len(observed.frame), 3, dtype=torch.float64),
@@ -117,7 +118,7 @@ class Resection:
                 placed[view] = True
         return replace(rig, R=R, t=t, placed=placed)
 
-    def supported(self, rig: PlacedRig) -> PlacedRig:
+    def keep_supported(self, rig: PlacedRig) -> PlacedRig:
         """Return the rig without the views that fewer than ``least`` inliers hold, or a pair."""
         held = rig.placed & (rig.inlier.sum(1) >= self.least)
         return (

@@ -22,7 +22,7 @@ from ghpt.calibration.observations import (
     choose_frames,
     joints_of,
     observe,
-    reweighted,
+    reweight,
     spread_key_points,
     usable,
 )
@@ -92,7 +92,7 @@ class RigEstimate:
             and all(found.severity != Severity.ERROR for found in self.findings)
         )
 
-    def scaled(self, factor: float) -> RigEstimate:
+    def scale_by(self, factor: float) -> RigEstimate:
         """The rig in millimetres: lengths times ``factor``. Warns of a person who is not of human
         size.
         """
@@ -279,11 +279,11 @@ class RigCalibration:
         adjusted = (self.bundle if self.rounds == 1 else rough)(observed, rig)
         for left in range(self.rounds - 1, 0, -1):
             error = observed.error(adjusted.rig.R, adjusted.rig.t, adjusted.rig.points)
-            observed = reweighted(observed, error, adjusted.rig.inlier)
-            rig = self.resection.triangulate(observed, unitised(adjusted.rig), seed)
-            rig = self.resection.grow(observed, table, self.resection.supported(rig), seed)
+            observed = reweight(observed, error, adjusted.rig.inlier)
+            rig = self.resection.triangulate(observed, unitise(adjusted.rig), seed)
+            rig = self.resection.grow(observed, table, self.resection.keep_supported(rig), seed)
             adjusted = (self.bundle if left == 1 else rough)(observed, rig)
-        adjusted = replace(adjusted, rig=unitised(adjusted.rig))
+        adjusted = replace(adjusted, rig=unitise(adjusted.rig))
         final = self.bundle.state(observed, adjusted.rig)
         return observed, replace(adjusted, final=final)
 
@@ -328,7 +328,7 @@ def _rotation_std_deg(covariance: Float64[Tensor, "V 6 6"]) -> Float64[Tensor, "
     return torch.rad2deg(covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(-1).sqrt())
 
 
-def unitised(rig: PlacedRig) -> PlacedRig:
+def unitise(rig: PlacedRig) -> PlacedRig:
     """The rig in the frame of its first placed view, with the size 1."""
     views = torch.nonzero(rig.placed)[:, 0]
     centre = rig.centre

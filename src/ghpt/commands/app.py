@@ -30,12 +30,12 @@ from ghpt.commands.display import as_started, until_reader_leaves
 from ghpt.commands.jobs import (
     Job,
     Program,
-    awaited,
     check_search,
     chosen_launcher,
     first_of_several_ends,
     is_first_process,
     own_command,
+    record_jobs,
     take_signals,
 )
 from ghpt.commands.outputs import Files, OutputFolder, SweepFolder
@@ -53,7 +53,7 @@ from ghpt.config import plain
 from ghpt.config import settings as typed_settings
 from ghpt.errors import GhptConfigError, GhptError, one_line, out_of_memory
 from ghpt.files import atomic_write
-from ghpt.signals import stopped_by_signals
+from ghpt.signals import stop_on_signals
 
 S = TypeVar("S")
 R = TypeVar("R")
@@ -100,7 +100,7 @@ class Command(Generic[S, R]):
     """The number that a search over settings makes small or great."""
 
 
-@stopped_by_signals()
+@stop_on_signals()
 def run(conf: Path, command: Command[Any, Any] | str) -> None:
     """Compose ``<conf>/<command.name>.yaml`` with ``sys.argv`` and call ``command.task``.
 
@@ -162,16 +162,16 @@ def _run(
     launcher = chosen_launcher(overrides, compose_only=bool(arguments.cfg))
     if sweep:
         sys.argv += _folder_names(overrides)
-    with SweepFolder.released():
+    with SweepFolder.release_after():
         try:
-            with awaited(ended) if launcher != "basic" else nullcontext():
+            with record_jobs(ended) if launcher != "basic" else nullcontext():
                 start()
         finally:
             if sweep and ended:
                 lines = [f"  {job.name}: {job.said}" for job in ended]
                 print("\n".join(["", "Jobs of the sweep:", *lines]))
         if sweep and ended:
-            after = job.loaded().after
+            after = job.load().after
             if after is not None:
                 after(ended)
 
@@ -268,7 +268,7 @@ class _Job:
     trace: bool
     ended: list[Job[Any, Any]]
 
-    def loaded(self) -> Command[Any, Any]:
+    def load(self) -> Command[Any, Any]:
         """Return the command, imported if it is given by its name."""
         return load(self.command, self.conf) if isinstance(self.command, str) else self.command
 
@@ -286,19 +286,19 @@ class _Job:
                 values = plain(config)
                 if self.sweep and values.get("resume") is False and not values.get("overwrite"):
                     values["resume"] = "auto"
-                command = self.loaded()
+                command = self.load()
                 quieten()  # not before: the import of Lightning sets its levels anew
                 settings = typed_settings(command.settings, values)
                 files = command.files(settings)
                 folder = stack.enter_context(_output_folder(output, files, values))
-                before = folder.finished(values) if folder is not None and self.sweep else None
+                before = folder.read_summary(values) if folder is not None and self.sweep else None
                 if before is not None and not values.get("overwrite"):
                     said = f"{before} (finished before)"
                     failed = False
                 else:
                     stack.enter_context(_records(config, output))
                     stack.enter_context(self._as_command(values))
-                    with stopped_by_signals():
+                    with stop_on_signals():
                         result = command.task(settings, output)
                     said = command.summary(result) if self.sweep else ""
                     failed = False
@@ -325,7 +325,7 @@ class _Job:
 
     def _objective(self, settings: Any, result: Any) -> float | None:
         """Return what a search over settings looks at; None of a job that had finished before."""
-        measure = self.loaded().objective
+        measure = self.load().objective
         return None if measure is None or result is None else measure(settings, result)
 
     def _as_command(self, values: dict[str, Any]) -> AbstractContextManager[None]:

@@ -446,7 +446,7 @@ def _given_cameras(settings: CalibrateSettings, people: Detections) -> CameraSet
         cameras = own_cameras(settings, "intrinsics.toml, or image_size=[1920,1080]")
         return cameras.without_extrinsics() if cameras.unposed else cameras
     estimation: IntrinsicsEstimation = build(settings.intrinsics, "intrinsics")
-    return estimation.guessed(people.views, torch.tensor(settings.image_size))
+    return estimation.guess_cameras(people.views, torch.tensor(settings.image_size))
 
 
 def with_intrinsics(settings: CalibrateSettings, case: Case, calibration: RigCalibration) -> Case:

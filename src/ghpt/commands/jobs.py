@@ -110,7 +110,7 @@ def check_search(words: Sequence[str], sweep: bool) -> None:
 
 
 @contextmanager
-def awaited(ended: list[Job[Any, Any]]) -> Iterator[None]:
+def record_jobs(ended: list[Job[Any, Any]]) -> Iterator[None]:
     """Within the block, every job that submitit's launchers start is added to ``ended`` when it
     ends, however it does.
 
@@ -208,8 +208,9 @@ def _stop(jobs: list[Any]) -> None:
 
 
 def take_signals() -> None:
-    """Within a job of a local pool: an interrupt, or SIGTERM, stops it (`awaited` and submitit have
-    them ignored).
+    """Within a job of a local pool: have an interrupt, or SIGTERM, stop it.
+
+    `record_jobs` and submitit have them ignored.
     """
     if os.environ.get("SUBMITIT_EXECUTOR") == "local":
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -18,7 +18,7 @@ from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.utilities.exceptions import SIGTERMException
 
 from ghpt.errors import GhptConfigError
-from ghpt.signals import stop, stopped_by_signals
+from ghpt.signals import stop, stop_on_signals
 
 _WAIT = 30.0
 """Seconds in which a process that others wait for is seen to have ended, on a slow machine."""
@@ -46,7 +46,7 @@ class OwnSignals(Callback):
 
 
 @contextmanager
-def told(trainer: L.Trainer) -> Iterator[None]:
+def report_end(trainer: L.Trainer) -> Iterator[None]:
     """Run the trainer within the block: however it ends, the shell and the user are told in the way
     of all commands.
 
@@ -54,7 +54,7 @@ def told(trainer: L.Trainer) -> Iterator[None]:
     Raises GhptConfigError where a process that loads data, or another process of the same run, was
     killed.
     """
-    with stopped_by_signals():
+    with stop_on_signals():
         try:
             yield
         except SIGTERMException as stopped:
@@ -75,9 +75,9 @@ def _lost(trainer: L.Trainer, text: str) -> GhptConfigError | None:
         problem = f"a process that loads batches was killed; {_WHY}"
         return GhptConfigError("data.workers", problem, "Give fewer (data.workers=0 needs none).")
     processes = getattr(trainer.strategy.launcher, "procs", None) or []
-    if trainer.world_size == 1 or not (_DEAD_PEER.search(text) or _ended(processes, 0.0)):
+    if trainer.world_size == 1 or not (_DEAD_PEER.search(text) or _first_failure(processes, 0.0)):
         return None
-    return _lost_process(_ended(processes, _WAIT), trainer.world_size)
+    return _lost_process(_first_failure(processes, _WAIT), trainer.world_size)
 
 
 def _lost_process(ended: tuple[int, int] | None, count: int) -> GhptConfigError:
@@ -92,7 +92,7 @@ def _lost_process(ended: tuple[int, int] | None, count: int) -> GhptConfigError:
     return GhptConfigError("trainer.devices", problem, "Its train_ddp_process log may say why.")
 
 
-def _ended(processes: Sequence[Popen[Any]], patience: float) -> tuple[int, int] | None:
+def _first_failure(processes: Sequence[Popen[Any]], patience: float) -> tuple[int, int] | None:
     """Number and exit status of a process beside the first that failed, within ``patience``
     seconds.
     """
@@ -114,7 +114,7 @@ def _say_and_end(observer: Any) -> None:
         _WAIT
     )  # the main thread may be about to say it, and ends this thread with the process
     processes = observer._child_processes
-    error = _lost_process(_ended(processes, 0.0), len(processes) + 1)
+    error = _lost_process(_first_failure(processes, 0.0), len(processes) + 1)
     for process in processes:
         process.kill()
     print(f"error: {error}", file=sys.stderr, flush=True)

@@ -20,7 +20,7 @@ from filelock import BaseFileLock
 from hydra.experimental.callback import Callback
 
 from ghpt.errors import GhptConfigError, GhptDataError, GhptError, one_line
-from ghpt.files import acquire, digest, guarded, sweep_temporaries, write_json
+from ghpt.files import acquire, digest, guard_folder, sweep_temporaries, write_json
 
 STATE = ".ghpt"
 """The folder, within the output folder, of the manifest, the lock and the record of a finished run.
@@ -95,7 +95,7 @@ class OutputFolder:
                 self._discard_state()
             raise
         sweep_temporaries(self.path)
-        self._stack.enter_context(guarded(self.path, self))
+        self._stack.enter_context(guard_folder(self.path, self))
         return self
 
     def __exit__(
@@ -134,7 +134,7 @@ class OutputFolder:
             self._stats[name] = _signature(path)
             self._write()
 
-    def finished(self, settings: Mapping[str, Any]) -> str | None:
+    def read_summary(self, settings: Mapping[str, Any]) -> str | None:
         """Return what a finished run with these settings and inputs said; None without one."""
         try:
             record = json.loads((self.path / STATE / _FINISHED).read_text(encoding="utf-8"))
@@ -260,7 +260,7 @@ class SweepFolder(Callback):
 
     @classmethod
     @contextmanager
-    def released(cls) -> Iterator[None]:
+    def release_after(cls) -> Iterator[None]:
         """After the block, the sweep's folder is free for others."""
         try:
             yield

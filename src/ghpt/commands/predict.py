@@ -95,6 +95,8 @@ _log = logging.getLogger(__name__)
 
 TRAJECTORY = "trajectory"
 """The estimator of all frames together."""
+ONLINE = "online"
+"""The same while they are recorded."""
 _ALIASES = {"frame": "adaptive_ransac"}
 """Other names of baselines."""
 
@@ -106,6 +108,7 @@ class PredictorSettings:
     classical: Target
     learned: Target
     trajectory: Target
+    online: Target
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -118,6 +121,7 @@ class PredictSettings(InputSettings):
     trust: list[str]
     hypotheses: int | None
     estimator: str
+    lag: float
     fill: int | str | None
     interpolation: str | None
     smooth: float | None
@@ -142,7 +146,7 @@ class PredictSettings(InputSettings):
     strict: bool
     seed: int
 
-    def changed(self) -> dict[str, object]:
+    def non_defaults(self) -> dict[str, object]:
         """Return what says whose joints are written how, where it is not the default."""
         values = {name: getattr(self, name) for name in _DEFAULTS}
         return {name: value for name, value in values.items() if value != _DEFAULTS[name]}
@@ -152,7 +156,7 @@ class PredictSettings(InputSettings):
             count = getattr(self, name)
             check(count >= 1, name, f"is {count}", "Give 1 or more.")
         if not self.ckpt:
-            names = (TRAJECTORY, *_ALIASES, *self.baselines)
+            names = (TRAJECTORY, ONLINE, *_ALIASES, *self.baselines)
             _check_exists("estimator", self.estimator, dict.fromkeys(names))
         for name in self.compare:
             _check_exists("compare", name, self.baselines)
@@ -213,7 +217,7 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         found = _predict_person(settings, setup, sequence, world, folder, shards)
         if found is not None:
             world = found.world
-            results.append(_judged(settings, setup, sequence, found.result, person, output))
+            results.append(_judge(settings, setup, sequence, found.result, person, output))
             pictured.append(found.pictured)
     if world is None:
         return None
@@ -306,7 +310,7 @@ def _predict_person(
         cut_off_hz=settings.smooth,
         rate_hz=sequence.rate_hz,
     )
-    if settings.smooth and estimator.name == TRAJECTORY:
+    if settings.smooth and estimator.name in (TRAJECTORY, ONLINE):
         _log.info("smooth: a trajectory is smooth already; it is filtered once more.")
     joints = joints_of(settings, sequence.skeleton)
     about = _about(sequence, joints, estimator, gaps, setup.origin)
@@ -321,7 +325,7 @@ def _predict_person(
         len(about.camera_names),
         estimator.text,
     )
-    predictor = _fitted(estimator, sequence, settings)
+    predictor = _fit(estimator, sequence, settings)
     key = _shard_key(sequence, estimator, setup.origin)
     how = RunSettings(
         settings.shard_frames, settings.batch, settings.progress_bar, settings.trainer
@@ -331,9 +335,9 @@ def _predict_person(
         if shards is None:
             return None
         with apply_gaps(gaps, shards, len(sequence.skeleton), output) as key_points:
-            own = _mapped(key_points, joints)
+            own = _map_chunks(key_points, joints)
             world = world or _choose_world(settings, sequence, about, own)
-            chunks = _mapped(own, world.reconstruction)
+            chunks = _map_chunks(own, world.reconstruction)
             _write_formats(settings, output, world, about, chunks, formats, sequence, shards)
             views = about.camera_names
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
@@ -359,7 +363,7 @@ def _predict_person(
     return _Predicted(result, world, PicturedPerson(about, view_course, course))
 
 
-def _judged(
+def _judge(
     settings: PredictSettings,
     setup: _Setup,
     sequence: Sequence,
@@ -371,7 +375,7 @@ def _judged(
     measures = _measures(result)
     asked = not person and setup.camera_check.is_worthwhile(measures.view_errors)
     mistakes = check_cameras(sequence.as_joints(), setup.camera_check) if asked else ()
-    own = settings.changed() | ({"person": person} if person else {})
+    own = settings.non_defaults() | ({"person": person} if person else {})
     commands = commands_on(settings, own, output)
     verdict = setup.judge(measures, mistakes, result.unit_mm, commands)
     return replace(result, verdict=verdict)
@@ -413,7 +417,14 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
         return _learned_estimator(settings, settings.ckpt)
     name = _ALIASES.get(settings.estimator, settings.estimator)
     if name == TRAJECTORY:
-        return _trajectory(settings)
+        text = "the trajectory of the whole recording (no ckpt was given)"
+        group = _with_exchange(settings, settings.predictor.trajectory)
+        return _trajectory(settings, TRAJECTORY, text, group)
+    if name == ONLINE:
+        text = f"the trajectory with a lag of {settings.lag:g} s (no ckpt was given)"
+        online = dict(settings.predictor.online)
+        own = _with_exchange(settings, online["settings"]) | {"lag_s": settings.lag}
+        return _trajectory(settings, ONLINE, text, online | {"settings": own})
     group = _with_flips(settings, settings.predictor.classical)
     baseline = settings.baselines[name]
     factory = build(group, "predictor.classical")
@@ -430,18 +441,23 @@ def build_estimator(settings: PredictSettings) -> PoseEstimator:
     )
 
 
-def _trajectory(settings: PredictSettings) -> PoseEstimator:
-    group = dict(settings.predictor.trajectory)
-    if not settings.flips:
-        trajectory = dict(group["trajectory"])
-        group["trajectory"] = trajectory | {
-            "solver": dict(trajectory["solver"]) | {"exchange": None}
-        }
+def _with_exchange(settings: PredictSettings, group: Target) -> dict[str, Any]:
+    """Return what holds a trajectory, without exchanged sides if none are looked for."""
+    if settings.flips:
+        return dict(group)
+    trajectory = dict(group["trajectory"])
+    solver = dict(trajectory["solver"]) | {"exchange": None}
+    return dict(group) | {"trajectory": trajectory | {"solver": solver}}
+
+
+def _trajectory(
+    settings: PredictSettings, name: str, text: str, group: dict[str, Any]
+) -> PoseEstimator:
     flips: LeftRightFlips | None = build(settings.predictor.classical["flips"], "flips")
     return PoseEstimator(
-        name=TRAJECTORY,
-        text="the trajectory of the whole recording (no ckpt was given)",
-        predictor=build(group, "predictor.trajectory"),
+        name=name,
+        text=text,
+        predictor=build(group, f"predictor.{name}"),
         flips=flips if settings.flips else None,
         weights=None,
         identity=group,
@@ -552,7 +568,7 @@ def _interpolation(estimator: PoseEstimator) -> str:
     return OWN if estimator.name == TRAJECTORY else "pchip"
 
 
-def _mapped(chunks: Chunks, function: Callable[[Reconstruction], Reconstruction]) -> Chunks:
+def _map_chunks(chunks: Chunks, function: Callable[[Reconstruction], Reconstruction]) -> Chunks:
     return lambda: map(function, chunks())
 
 
@@ -569,7 +585,7 @@ def joints_of(settings: PredictSettings, skeleton: Skeleton) -> JointMeans:
     return human_joints(skeleton) if settings.joints == "human36m" else all_joints(skeleton)
 
 
-def _fitted(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:
+def _fit(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:
     """Return the predictor for a sequence's key points, with what they tell of the recording."""
     predictor = estimator.predictor.for_skeleton(sequence.skeleton)
     return predictor.fit(sequence, settings.fitted_frames)
@@ -586,10 +602,10 @@ def _evaluate(
     """
     judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
     sample = judged.read(judged.spread(settings.fitted_frames))
-    own = _fitted(estimator, judged, settings)
+    own = _fit(estimator, judged, settings)
     estimates: dict[str, Estimate] = {estimator.name: own.estimate}
     for name, other in compared.items():
-        estimates.setdefault(name, other.fitted(sample))
+        estimates.setdefault(name, other.fit_to(sample))
     flips = estimator.flips and estimator.flips.for_skeleton(judged.skeleton)
     test_halves = None
     if isinstance(own, TrajectoryPredictor):

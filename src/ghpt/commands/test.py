@@ -9,7 +9,7 @@ from typing import Any
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
-from ghpt.commands.lost import told
+from ghpt.commands.lost import report_end
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
 from ghpt.commands.people import PeopleResult, is_of_people, test_people
 from ghpt.commands.trainer import make_trainer, progress
@@ -156,7 +156,7 @@ def measure(settings: TestSettings, output: Path) -> TestResult | None:
     )
     sweep_temporaries(output)
     shutil.rmtree(output / ".predictions", ignore_errors=True)  # what a killed test left
-    with told(trainer):
+    with report_end(trainer):
         trainer.test(model, datamodule=data, verbose=False)
     if not trainer.is_global_zero:
         return None

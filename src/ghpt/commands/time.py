@@ -108,7 +108,7 @@ def time_of_rig(
     """
     views = len(sequence.cameras)
     timeline = timeline_of_sequence(sequence, estimation.frames)
-    whole = starts(timeline.smoothed(_SMOOTH), seed)
+    whole = starts(timeline.smooth(_SMOOTH), seed)
     begun = Clock((1.0,) * views, tuple(whole.shift.double().tolist()))
     rig = calibrate_sequence(calibration, retime(sequence, begun), seed)
     placed = [view for view, is_placed in enumerate(rig.calibrated.tolist()) if is_placed]

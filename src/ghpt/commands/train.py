@@ -12,7 +12,7 @@ import torch
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import as_started, display_path, shell_override
-from ghpt.commands.lost import told
+from ghpt.commands.lost import report_end
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
 from ghpt.commands.resume import Start, resumable
 from ghpt.commands.trainer import in_our_words, make_loggers, make_trainer, progress
@@ -111,7 +111,7 @@ def train(settings: TrainSettings, output: Path) -> dict[str, float]:
         _begin(start, last)
     ckpt_path = start.checkpoint and str(start.checkpoint)
     try:
-        with told(trainer), in_our_words():
+        with report_end(trainer), in_our_words():
             trainer.fit(model, datamodule=data, ckpt_path=ckpt_path, weights_only=True)
     except (SystemExit, Exception) as stop:
         if trainer.is_global_zero and (saver.saved is not None or isinstance(stop, SystemExit)):

@@ -28,7 +28,7 @@ class KeyPoints:
         """Index the leading dimensions."""
         return KeyPoints(self.pixels[index], self.confidence[index], self.valid[index])
 
-    def masked(self) -> KeyPoints:
+    def mask_invalid(self) -> KeyPoints:
         """Return the key points as float32, with zeros where they are not valid."""
         pixels = np.where(self.valid[..., None], self.pixels, 0).astype(np.float32)
         confidence = np.where(self.valid, self.confidence, 0).astype(np.float32)

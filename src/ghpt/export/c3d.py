@@ -130,7 +130,7 @@ def _groups(
     data_start: int,
 ) -> Groups:
     names = plain_names(path, "joints", about.joints)
-    cameras = [_cut(plain(name)) for name in about.camera_names]
+    cameras = [_truncate(plain(name)) for name in about.camera_names]
     point = {
         "USED": _words([len(names)]),
         "SCALE": _floats([-RESIDUAL_STEP]),
@@ -199,11 +199,11 @@ def _texts(texts: Sequence[str]) -> bytes:
 
 
 def _text(text: str) -> bytes:
-    encoded = _cut(plain(text)).encode()
+    encoded = _truncate(plain(text)).encode()
     return struct.pack("<bBB", -1, 1, len(encoded)) + encoded
 
 
-def _cut(text: str) -> str:
+def _truncate(text: str) -> str:
     """Return at most 255 bytes of UTF-8."""
     return text.encode()[:_LONGEST].decode(errors="ignore")
 

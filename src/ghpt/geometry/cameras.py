@@ -159,7 +159,7 @@ class CameraSet:
     def cameras(self) -> Cameras:
         """The calibrated cameras. Raises GhptDataError where not all have extrinsics."""
         if self.R is None or self.t is None or self.unposed:
-            raise self._uncalibrated()
+            raise self._uncalibrated_error()
         return Cameras(self.K, self.R, self.t)
 
     def is_posed(self, camera: int) -> bool:
@@ -170,7 +170,7 @@ class CameraSet:
         """Return the same cameras with intrinsics alone."""
         return replace(self, R=None, t=None)
 
-    def _uncalibrated(self) -> GhptDataError:
+    def _uncalibrated_error(self) -> GhptDataError:
         problem = f"are not there for {', '.join(self.unposed or self.names)}"
         return GhptDataError(self.path, "rotation, translation", problem, _CALIBRATE)
 
@@ -184,7 +184,7 @@ class CameraSet:
             hint = "A place in space takes two views or more of the same moment."
             raise GhptDataError(where, "views", problem, hint)
         if self.R is None:
-            raise self._uncalibrated()
+            raise self._uncalibrated_error()
 
     @property
     def image_size(self) -> Int[Tensor, "V 2"]:

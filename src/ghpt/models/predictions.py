@@ -219,7 +219,7 @@ class Predictions(Generic[EstimateT, SampleT, TablesT]):
         estimates = {}
         for name in self.names:
             estimate = self._read(self.schema.estimate, "{field}_" + name, start, stop)
-            estimates[name] = estimate.masked()
+            estimates[name] = estimate.mask_invalid()
         return Chunk(estimates, sample, self._read(_SUMMARY, "weights_{field}", start, stop))
 
     def chunks(self, size: int) -> Iterator[Chunk[EstimateT, SampleT]]:

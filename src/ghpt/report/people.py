@@ -27,7 +27,7 @@ def people_document(
     )
     blocks: list[Block] = [Paragraph(text), *_tables(scenes, scores, headline)]
     for scene in scenes:
-        rows = [[_shown(name), *_cells(each)] for name, each in scene.scores.items()]
+        rows = [[_display_name(name), *_cells(each)] for name, each in scene.scores.items()]
         blocks += [Heading(scene.name), Table(("estimator", *_SCORES), rows)]
     return Document("Several people", blocks)
 
@@ -47,9 +47,9 @@ def _tables(
     for scene in scenes:
         found = f"{scene.found} of {scene.people}"
         rows.append([scene.name, str(scene.views), found, *_cells(scene.scores[headline])])
-    title = f"Several people, triangulated by {_shown(headline)}"
+    title = f"Several people, triangulated by {_display_name(headline)}"
     by_scene = Table(header, rows, title, _CAPTION)
-    rows = [[_shown(name), *_cells(each)] for name, each in scores.items()]
+    rows = [[_display_name(name), *_cells(each)] for name, each in scores.items()]
     by_estimator = Table(("all scenes by", *_SCORES), rows, "All scenes")
     return [by_scene, by_estimator]
 
@@ -67,5 +67,5 @@ def _cells(scores: PeopleScores) -> list[str]:
     return [*(f"{number:.1f}" for number in numbers), str(scores.switches)]
 
 
-def _shown(estimator: str) -> str:
+def _display_name(estimator: str) -> str:
     return NAMES.get(estimator, estimator)

@@ -123,7 +123,7 @@ def agreement(
     step = max(1, rays.xy.shape[1] // 32)
     pair_error = pair_errors(rays, setup, all_pairs(views, most_pairs), step)
     core = core_of(pair_error, level)
-    points, known = triangulated(rays, setup, _without_each(core), estimator)
+    points, known = triangulate_choices(rays, setup, _without_each(core), estimator)
     each = [
         errors(_rays_of_view(rays, v), setup.R[v], setup.t[v], points[v], known[v])
         for v in range(views)
@@ -131,7 +131,7 @@ def agreement(
     return Agreement(core, median(torch.stack(each)), points, known)
 
 
-def triangulated(
+def triangulate_choices(
     rays: Rays, setup: Setup, used: Bool[Tensor, "G V"], estimator: Estimator
 ) -> tuple[Float[Tensor, "G F J 3"], Bool[Tensor, "G F J"]]:
     """Return the points of G choices of views by an estimator, in the cameras' unit."""

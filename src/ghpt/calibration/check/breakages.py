@@ -106,7 +106,7 @@ def _move(case: Case, views: Views, degrees: float, millimetres: float) -> Case:
     for view in views:
         centre = camera_centre(setup.R[view], setup.t[view]) + displacement
         R = rotation @ setup.R[view]
-        setup = setup.changed(view, R=R, t=-R @ centre)
+        setup = setup.replace_camera(view, R=R, t=-R @ centre)
     return replace(case, setup=setup)
 
 
@@ -137,12 +137,10 @@ def _turn(case: Case, views: Views, quarters: int) -> Case:
     """Return images that are turned clockwise."""
     pixels = case.evidence.pixels.clone()
     for view in views:
-        width = case.setup.width[view]
-        height = case.setup.height[view]
-        for _ in range(quarters):
+        sides = (case.setup.height[view], case.setup.width[view])
+        for quarter in range(quarters):
             u, v = pixels[view].unbind(-1)
-            pixels[view] = torch.stack((height - 1 - v, u), dim=-1)
-            width, height = height, width
+            pixels[view] = torch.stack((sides[quarter % 2] - 1 - v, u), dim=-1)
     return replace(case, evidence=replace(case.evidence, pixels=pixels))
 
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from ghpt.calibration.check.agreement import Agreement, triangulated
+from ghpt.calibration.check.agreement import Agreement, triangulate_choices
 from ghpt.calibration.check.evidence import Evidence
 from ghpt.calibration.check.search import Search, Thresholds
 from ghpt.calibration.check.setup import RayCache, Setup
@@ -117,10 +117,10 @@ class CameraCheck:
             search = search.after(candidate, after)
         partly = self._partly_repaired(search, findings)
         if partly:
-            given_back = _given_back(search.setup, setup, partly)
+            given_back = _restore_given(search.setup, setup, partly)
             search = Search(cache, given_back, self.thresholds)
-            findings = [_unmended(found, partly, evidence.names) for found in findings]
-        findings += self._left(search)
+            findings = [_as_unrepaired(found, partly, evidence.names) for found in findings]
+        findings += self._unrepaired_views(search)
         height = self._stature(search)
         setup, height, unit_mm = _file_unit(search.setup, height)
         wrong_size = size_finding(height) if height else None
@@ -134,7 +134,7 @@ class CameraCheck:
         error_px = pixels_of(cache, setup, search.now.error)
         agrees = search.now.error < self.thresholds.level
         used = search.now.core if bool(agrees.any()) else torch.ones_like(agrees)
-        points, known = triangulated(cache.all(setup), setup, used[None], self.consensus)
+        points, known = triangulate_choices(cache.all(setup), setup, used[None], self.consensus)
         return CameraCheckResult(
             findings=tuple(result),
             setup=setup,
@@ -167,7 +167,7 @@ class CameraCheck:
                 partly |= views
         return partly
 
-    def _left(self, search: Search) -> list[Finding]:
+    def _unrepaired_views(self, search: Search) -> list[Finding]:
         """Return the views that nothing that was tried brings to the others."""
         error = search.now.error
         pixels = pixels_of(search.cache, search.setup, error)
@@ -193,7 +193,7 @@ class CameraCheck:
             return 0.0
         rays = search.cache.all(search.setup)
         core = search.now.core[None]
-        points, known = triangulated(rays, search.setup, core, self.consensus)
+        points, known = triangulate_choices(rays, search.setup, core, self.consensus)
         return float(stature(points[0], known[0]))
 
 
@@ -226,15 +226,15 @@ def merge_steps(findings: list[Finding]) -> list[Finding]:
     return result
 
 
-def _given_back(setup: Setup, given: Setup, views: set[int]) -> Setup:
+def _restore_given(setup: Setup, given: Setup, views: set[int]) -> Setup:
     """Return the setup with some views as the files have them."""
     names = [field.name for field in fields(Setup) if field.name != "unit_mm"]
     for view in views:
-        setup = setup.changed(view, **{name: getattr(given, name)[view] for name in names})
+        setup = setup.replace_camera(view, **{name: getattr(given, name)[view] for name in names})
     return setup
 
 
-def _unmended(found: Finding, views: set[int], names: tuple[str, ...]) -> Finding:
+def _as_unrepaired(found: Finding, views: set[int], names: tuple[str, ...]) -> Finding:
     """Return the finding as of a mistake that was not undone, if it is about one of the views."""
     if not any(names.index(name) in views for name in found.cameras):
         return found

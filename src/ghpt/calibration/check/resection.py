@@ -30,7 +30,7 @@ def resect(
 
     An inlier's error is at most ``threshold`` sizes of the person.
     """
-    used = _used(rays, known)
+    used = _select_used(rays, known)
     if int(used.sum()) < _LEAST:
         return None
     typical = float(rays.size[rays.size > 0].median())
@@ -58,7 +58,7 @@ def equivalent_rotation(
     """Return the angle (degrees) by which a camera would have to be rotated where it stands for its
     rays to meet the points: a robust fit, of the least sum of distances.
     """
-    used = _used(rays, known)
+    used = _select_used(rays, known)
     in_camera = points[used] @ R.mT + t
     predicted = torch.nn.functional.normalize(in_camera, dim=-1)
     homogeneous = torch.nn.functional.pad(rays.xy[used], (0, 1), value=1.0)
@@ -72,5 +72,5 @@ def equivalent_rotation(
     return float(torch.rad2deg(matrix_to_vector(rotation).norm()))
 
 
-def _used(rays: Rays, known: Bool[Tensor, "F J"]) -> Bool[Tensor, "F J"]:
+def _select_used(rays: Rays, known: Bool[Tensor, "F J"]) -> Bool[Tensor, "F J"]:
     return rays.valid & known & (rays.size > 0)[:, None]

@@ -25,10 +25,10 @@ from ghpt.calibration.mistakes import (
     RATES,
     Candidate,
     at_rate,
-    exchanged,
+    exchange_views,
     of_all_views,
     of_one_view,
-    shifted,
+    shift_view,
 )
 from ghpt.errors import check, check_positive
 from ghpt.models.estimators.classical import MEstimator
@@ -184,12 +184,12 @@ class Search:
         return found
 
     def _of_view(self, view: int) -> list[Candidate]:
-        shifts = [shifted(self.setup, view, by) for by in self._shifts(view)]
+        shifts = [shift_view(self.setup, view, by) for by in self._shifts(view)]
         return [
             *of_one_view(self.setup, view),
             *shifts,
             *self._rates(view),
-            *self._moved(view),
+            *self._move(view),
         ]
 
     def _passes_now(self, candidate: Candidate) -> bool:
@@ -215,7 +215,7 @@ class Search:
             return []
         return [at_rate(self.setup, view, ratio) for ratio in RATES]
 
-    def _moved(self, view: int) -> list[Candidate]:
+    def _move(self, view: int) -> list[Candidate]:
         """Return the camera where its key points fit the people that the others see.
 
         Its value is the rotation in place that would show the same: how much of a camera's new
@@ -230,14 +230,14 @@ class Search:
         R, t = found
         setup = self.setup
         degrees = equivalent_rotation(rays, points, known, setup.R[view], setup.t[view])
-        return [Candidate(MOVED, (view,), setup.changed(view, R=R, t=t), degrees)]
+        return [Candidate(MOVED, (view,), setup.replace_camera(view, R=R, t=t), degrees)]
 
     def _exchanges(self) -> list[Scored]:
         """Return the three best exchanges of two views' key points."""
         views = len(self.setup)
         found = []
         for one, other in all_pairs(views, 1 << 20).tolist():
-            candidate = exchanged(self.setup, one, other)
+            candidate = exchange_views(self.setup, one, other)
             new = self._error(candidate.setup, one) + self._error(candidate.setup, other)
             old = float(self.now.error[[one, other]].sum())
             if views <= 3 or self.thresholds.passes(candidate, old / 2, new / 2):

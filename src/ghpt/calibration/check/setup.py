@@ -49,7 +49,7 @@ class Setup:
     def __len__(self) -> int:
         return len(self.shift)
 
-    def changed(self, view: int, **values: Any) -> Setup:
+    def replace_camera(self, view: int, **values: Any) -> Setup:
         """Return the setup with other values for one camera."""
         new: dict[str, Any] = {}
         for name, value in values.items():
@@ -61,17 +61,17 @@ class Setup:
                 new[name] = (*old[:view], value, *old[view + 1 :])
         return replace(self, **new)
 
-    def turned(self, views: tuple[int, ...], degrees: int) -> Setup:
+    def turn_images(self, views: tuple[int, ...], degrees: int) -> Setup:
         """Return the cameras whose images are those of ``views`` turned clockwise by a multiple of
         90 degrees. A K with skew stays as it is.
         """
         setup = self
         for _ in range(degrees // 90):
             for view in views:
-                setup = setup._turned_once(view)
+                setup = setup._turn_once(view)
         return setup
 
-    def _turned_once(self, view: int) -> Setup:
+    def _turn_once(self, view: int) -> Setup:
         """Return one camera with an image turned by 90 degrees: (u, v) is at (height - 1 - v, u)
         then, and (x, y) at (-y, x).
         """
@@ -88,7 +88,7 @@ class Setup:
         if not bool(is_fisheye(lens)):  # (p2, p1) is a vector of the image
             lens[3] = -self.lens[view, 2]
             lens[2] = self.lens[view, 3]
-        return self.changed(
+        return self.replace_camera(
             view,
             K=turned_K,
             R=turn @ self.R[view],
@@ -98,7 +98,7 @@ class Setup:
             height=self.width[view],
         )
 
-    def given_to(
+    def transform_as(
         self,
         view: int,
         pixels: Float[Tensor, "*B J 2"],
@@ -223,7 +223,7 @@ class RayCache:
             valid = evidence.valid[source]
         else:
             pixels, valid = evidence.at_rate(source, setup.rate[view])
-        return setup.given_to(view, pixels[at], valid[at])
+        return setup.transform_as(view, pixels[at], valid[at])
 
 
 def rays_of(

@@ -53,7 +53,7 @@ def decide_unit(
     if cameras.unit_known or cameras.t is None:
         return cameras
     found = estimator.triangulate(batch)
-    explained = _EXPLAINS.explained(batch, found.points, found.has_position)
+    explained = _EXPLAINS.find_explained(batch, found.points, found.has_position)
     if float(explained.sum()) < _AGREE * float(found.has_position.sum()):
         return cameras
     height = float(stature(found.points, explained)) / cameras.unit_mm

@@ -134,7 +134,7 @@ class TimeEstimation:
         if not any(slow):
             return self._of_one_rate(timeline, E, costs)
         fast = [not is_slow for is_slow in slow]
-        thinned = timeline.thinned(fast, 2)
+        thinned = timeline.thin(fast, 2)
         found = self._of_one_rate(thinned, E, self._costs(thinned, E, views))
         return at_rates(found, slow, timeline.first)
 
@@ -160,7 +160,7 @@ class TimeEstimation:
             if float(least[pair]) < self.rated:
                 continue
             for column, fast in ((0, b), (2, a)):
-                thinned = timeline.thinned([view == fast for view in range(count)], 2)
+                thinned = timeline.thin([view == fast for view in range(count)], 2)
                 own = self._costs(thinned, E[pair : pair + 1], costs.views[pair : pair + 1])
                 by_rate[pair, column] = own.least()[0]
         choices = {nobody, *(_levels(costs.views, by_rate, view, count) for view in range(count))}
@@ -173,7 +173,7 @@ class TimeEstimation:
     ) -> TimeEstimate:
         count = len(timeline.valid)
         whole = best_shifts(costs, count, self.apart, _ROUNDS)
-        smoothed = timeline.smoothed(self.smooth)
+        smoothed = timeline.smooth(self.smooth)
         pairs = PairResiduals(smoothed, E, costs.views, self.blocks, self.centred)
         is_whole = float(pairs.disagreement(whole.double()).mean()) > self.rough
         determined = torch.tensor([bool((costs.views == view).any()) for view in range(count)])
@@ -197,7 +197,7 @@ class TimeEstimation:
             determined[:] = False
         shift = shift - shift[_reference(shift, determined, self.least)]
         least = self.rough_least if is_whole else self.least
-        told = self._told(pairs, shift, determined, least)
+        told = self._decidable_shifts(pairs, shift, determined, least)
         ones = (1.0,) * count
         return TimeEstimate(
             clock=Clock(ones, tuple(told.tolist())),
@@ -248,7 +248,7 @@ class TimeEstimation:
         error = known.std().clamp(min=1e-12) / len(known) ** 0.5
         return float(known.mean() / error)
 
-    def _told(
+    def _decidable_shifts(
         self,
         pairs: PairResiduals,
         shift: Float[Tensor, " V"],

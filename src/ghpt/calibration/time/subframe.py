@@ -56,8 +56,8 @@ class PairResiduals:
         self, shift: Float[Tensor, " V"], extra: float
     ) -> tuple[Float[Tensor, "P N J"], Bool[Tensor, "P N J"]]:
         """Return the signed Sampson errors in sizes of the person, and which exist."""
-        xy, valid = taken_at(self.timeline, shift)
-        later, later_valid = taken_at(self.timeline, shift + extra) if extra else (xy, valid)
+        xy, valid = interpolate_at(self.timeline, shift)
+        later, later_valid = interpolate_at(self.timeline, shift + extra) if extra else (xy, valid)
         a, b = self.views.T
         scaled = torch.stack(
             [
@@ -132,7 +132,7 @@ def _median(residual: Float[Tensor, "P N J"], both: Bool[Tensor, "P N J"]) -> Fl
     return masked.nanmedian(-1).values.nan_to_num(TRUNCATION)
 
 
-def taken_at(
+def interpolate_at(
     timeline: Timeline, shift: Float[Tensor, " V"]
 ) -> tuple[Float[Tensor, "V N J 2"], Bool[Tensor, "V N J"]]:
     """Return the views' key points at their frames n + shift, linearly interpolated, and which

@@ -36,7 +36,7 @@ class Timeline:
         at = list(views)
         return replace(self, xy=self.xy[at], valid=self.valid[at], size=self.size[at])
 
-    def thinned(self, views: Sequence[bool], step: int) -> Timeline:
+    def thin(self, views: Sequence[bool], step: int) -> Timeline:
         """Return every ``step``-th frame of some views, and as many of the first of the others."""
         count = -(-self.frames // step)
         xy = self.xy[:, :count].clone()
@@ -47,7 +47,7 @@ class Timeline:
                 valid[view] = self.valid[view, ::step]
         return replace(self, xy=xy, valid=valid)
 
-    def smoothed(self, width: int) -> Timeline:
+    def smooth(self, width: int) -> Timeline:
         """Return running means over ``width`` frames (odd) of what is valid among them; what was
         not valid is not.
         """

@@ -17,7 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from torch.utils.data import DataLoader
 
 from ghpt.commands.display import display_path
-from ghpt.commands.lost import told
+from ghpt.commands.lost import report_end
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.trainer import make_trainer
 from ghpt.data.people.sequence import Sequence
@@ -115,7 +115,7 @@ def predict_shards(
     )
     with closing(shards), _report_stop(shards, first):
         if module.pending:
-            with module.bar, told(trainer):
+            with module.bar, report_end(trainer):
                 trainer.predict(module, return_predictions=False)
                 trainer.strategy.barrier()
             shards.refresh()

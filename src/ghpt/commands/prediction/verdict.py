@@ -123,7 +123,7 @@ class Judge:
             *_mistakes(mistakes, tuple(measures.view_errors), commands),
             *self._error(measures, commands),
             *self._agreement(measures, commands),
-            *self._rejected(measures.rejected, commands),
+            *self._check_rejected(measures.rejected, commands),
         ]
         findings.sort(key=lambda finding: -_LEVELS[finding.severity])
         return Verdict(tuple(findings), tuple(_undecidable(measures)))
@@ -152,7 +152,7 @@ class Judge:
             found = FEW_VIEWS_AGREE.finding((), share, self.views, agree=agree, views=len(known))
             yield replace(found, command=commands.cameras)
 
-    def _rejected(self, share: float, commands: Commands) -> Iterator[Finding]:
+    def _check_rejected(self, share: float, commands: Commands) -> Iterator[Finding]:
         if share > self.rejected:
             severity, limit = _grade(share, self.rejected, self.lost)
             found = REJECTED.finding((), share, limit, severity)

@@ -48,7 +48,7 @@ def read_labels(path: Path) -> Labels:
     subjects = _names(path, "subject_names", content)
     actions = _names(path, "action_names", content)
     rigs = _cameras(path, content, len(subjects))
-    table = _structured(path, "table", content, (None,))
+    table = _read_structure(path, "table", content, (None,))
     subject = _column(table, "subject_idx", (None,), "iu")
     action = _column(table, "action_idx", (None,), "iu")
     _check_range(subject, table, "subject_idx", "subject_names", len(subjects))
@@ -91,7 +91,7 @@ def read_label_cameras(path: Path) -> LabelCameras:
 def _cameras(path: Path, content: dict[str, Any], count: int | None) -> LabelCameras:
     """Return the cameras of so many subjects or, where that is None, of any number of actions."""
     names = _names(path, "camera_names", content)
-    rigs = _structured(path, "cameras", content, (count, len(names)))
+    rigs = _read_structure(path, "cameras", content, (count, len(names)))
     if not len(rigs.array):
         raise GhptDataError(path, "cameras", "is empty", _HINT)
     return LabelCameras(
@@ -137,7 +137,7 @@ class _Table:
     array: np.ndarray
 
 
-def _structured(
+def _read_structure(
     path: Path,
     key: str,
     content: dict[str, Any],

@@ -56,7 +56,8 @@ def _read_view(
     for number in sorted(files):
         people = read(files[number])
         for person in people:
-            count, expected = len(person.joints), len((found[0] if found else person).joints)
+            count = len(person.joints)
+            expected = len((found[0] if found else person).joints)
             if count != expected:
                 problem = f"has people of {count} joints, the files before of {expected}"
                 hint = "Detect all frames with one model."

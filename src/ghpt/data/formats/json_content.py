@@ -38,6 +38,8 @@ _HANDS = ("hand_left_keypoints_2d", "hand_right_keypoints_2d")
 HAND_POINTS = 21
 _SCORES = ("keypoint_scores", "scores")
 _NUMBERS = ("frame_id", "frame_index", "frame_idx", "frame")
+_IDENTITIES = ("person_id", "track_id", "personID", "idx")
+"""Of OpenPose, MMPose, EasyMocap, AlphaPose."""
 _KNOWN = (
     "Known are the files of OpenPose, AlphaPose, MMPose, rtmlib and EasyMocap, and COCO results "
     "(docs/calibration.md)."
@@ -128,7 +130,7 @@ def _of_dict(path: Path, content: dict[str, Any]) -> JsonContent | None:
             return JsonContent(owner, (frame,), False)
     if "instance_info" in content:
         joints = _joint_names(path, content.get("meta_info"))
-        frames = _numbered(path, "instance_info", content["instance_info"])
+        frames = _number_frames(path, "instance_info", content["instance_info"])
         return JsonContent("mmpose", frames, True, joints)
     if "annotations" in content or "images" in content:
         return JsonContent("coco", _coco(path, content), True)
@@ -154,9 +156,9 @@ def _of_list(path: Path, content: Any) -> JsonContent | None:
     if "image_id" in first:
         return JsonContent("coco", _coco(path, {"annotations": content}), True)
     if any(name in first for name in (*_NUMBERS, *_PEOPLE, "predictions")):
-        return JsonContent("mmpose", _numbered(path, "", content), True)
+        return JsonContent("mmpose", _number_frames(path, "", content), True)
     if _depth(first.get("keypoints")) == 3:
-        return JsonContent("rtmlib", _numbered(path, "", content), True)
+        return JsonContent("rtmlib", _number_frames(path, "", content), True)
     if any(name in first for name in _POINTS):
         frame = JsonFrame(None, _people(path, "", content), "")
         return JsonContent("mmpose", (frame,), False)
@@ -170,7 +172,7 @@ def _people(path: Path, field: str, listed: Any) -> tuple[dict[str, Any], ...]:
     return tuple(listed)
 
 
-def _numbered(path: Path, field: str, listed: Any) -> tuple[JsonFrame, ...]:
+def _number_frames(path: Path, field: str, listed: Any) -> tuple[JsonFrame, ...]:
     """Return a list of frames; one without a number has its place in the list as its number."""
     if not isinstance(listed, list) or not all(isinstance(item, dict) for item in listed):
         hint = "It must be a file that MMPose wrote for a video (save_predictions, pred_out_dir)."
@@ -340,9 +342,12 @@ def _flat(path: Path, field: str, points: list[Any], each: int) -> list[Any]:
 
 
 def _identity(person: dict[str, Any]) -> int:
-    value = person.get("person_id", person.get("track_id"))
-    if isinstance(value, list) and len(value) == 1:
+    """Return what a tracker calls a person, -1 where none does; AlphaPose may write 1.0 or [1]."""
+    value = next((person[name] for name in _IDENTITIES if name in person), None)
+    while isinstance(value, list) and len(value) == 1:
         value = value[0]
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     return value if type(value) is int and 0 <= value < 1 << 31 else -1
 
 

@@ -40,10 +40,10 @@ def read_names(data: bytes) -> list[tuple[str, ...]]:
             _MAKERS[code.name](stack)
         elif code.name not in _NOTHING:
             raise ValueError(f"{code.name} makes more than names")
-    return _checked(stack)
+    return _check_names(stack)
 
 
-def _checked(stack: list[Any]) -> list[tuple[str, ...]]:
+def _check_names(stack: list[Any]) -> list[tuple[str, ...]]:
     names = stack[-1] if len(stack) == 1 else None
     if not isinstance(names, list) or not all(isinstance(name, tuple) for name in names):
         raise ValueError("it is no list of names")
@@ -52,7 +52,7 @@ def _checked(stack: list[Any]) -> list[tuple[str, ...]]:
     return names
 
 
-def _marked(stack: list[Any]) -> list[Any]:
+def _pop_marked(stack: list[Any]) -> list[Any]:
     """Take what lies above the last mark, and the mark, from the stack."""
     items: list[Any] = []
     while stack[-1] is not _MARK:
@@ -77,11 +77,11 @@ def _tuple_of(count: int) -> Callable[[list[Any]], None]:
 
 _MAKERS: dict[str, Callable[[list[Any]], None]] = {
     "MARK": lambda stack: stack.append(_MARK),
-    "LIST": lambda stack: stack.append(_marked(stack)),
+    "LIST": lambda stack: stack.append(_pop_marked(stack)),
     "EMPTY_LIST": lambda stack: stack.append([]),
     "APPEND": lambda stack: _append(stack, [stack.pop()]),
-    "APPENDS": lambda stack: _append(stack, _marked(stack)),
-    "TUPLE": lambda stack: stack.append(tuple(_marked(stack))),
+    "APPENDS": lambda stack: _append(stack, _pop_marked(stack)),
+    "TUPLE": lambda stack: stack.append(tuple(_pop_marked(stack))),
     "EMPTY_TUPLE": lambda stack: stack.append(()),
     "TUPLE1": _tuple_of(1),
     "TUPLE2": _tuple_of(2),

@@ -232,7 +232,8 @@ def _bone_lengths(
     """Return each bone's full length in the images, pixels; NaN if it is never valid."""
     lengths = []
     for start, end in bones:
-        a, b = joints.index(start), joints.index(end)
+        a = joints.index(start)
+        b = joints.index(end)
         both = valid[:, a] & valid[:, b]
         found = np.linalg.norm(pixels[both, a] - pixels[both, b], axis=-1)
         lengths.append(np.quantile(found, _FULL_LENGTH).clip(1e-6) if len(found) else np.nan)

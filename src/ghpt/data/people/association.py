@@ -384,7 +384,7 @@ def _settle(
     ok = torch.zeros(shape, dtype=torch.bool)
     points[frame, place] = found.points
     ok[frame, place] = found.ok
-    ok &= ~_repeated(points, ok)[..., None]
+    ok &= ~_find_repeated(points, ok)[..., None]
     support = _support(cameras, points, ok, candidates)
     support = torch.where(candidates.index[:, None] < 0, 0.0, support)
     strongest = torch.where(support >= support.amax(1, keepdim=True), support, 0.0)
@@ -395,7 +395,9 @@ def _settle(
     return settled[kept].numpy(), frame[kept].numpy()
 
 
-def _repeated(points: Float[Tensor, "T B J 3"], ok: Bool[Tensor, "T B J"]) -> Bool[Tensor, "T B"]:
+def _find_repeated(
+    points: Float[Tensor, "T B J 3"], ok: Bool[Tensor, "T B J"]
+) -> Bool[Tensor, "T B"]:
     """Return which bodies are an earlier one of their frame again, listed twice by a detector."""
     both = ok[:, :, None] & ok[:, None]
     distance = torch.linalg.vector_norm(points[:, :, None] - points[:, None], dim=-1)

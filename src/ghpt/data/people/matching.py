@@ -126,7 +126,7 @@ def _match_names(views: Sequence[str], cameras: Sequence[str]) -> list[tuple[int
     What all share is taken off only where more views find one camera without it.
     """
     best = _equal(views, cameras, _whole, _whole)
-    for of_view, of_camera in product(_without_shared(views), _without_shared(cameras)):
+    for of_view, of_camera in product(_strip_shared(views), _strip_shared(cameras)):
         found = _equal(views, cameras, of_view, of_camera)
         if _view_count(found) > _view_count(best):
             best = found
@@ -164,18 +164,18 @@ def _whole(name: str) -> str:
     return name
 
 
-def _without_shared(names: Sequence[str]) -> Iterator[_Key]:
+def _strip_shared(names: Sequence[str]) -> Iterator[_Key]:
     """Yield functions that take off more and more of the words that all names begin or end with."""
     parts = [[part.lower() for part in _PARTS.findall(name)] for name in names]
     shortest = min(map(len, parts), default=0)
-    ahead = _shared(parts) if len(names) > 1 else 0
-    behind = _shared([each[::-1] for each in parts]) if len(names) > 1 else 0
+    ahead = _count_shared(parts) if len(names) > 1 else 0
+    behind = _count_shared([each[::-1] for each in parts]) if len(names) > 1 else 0
     for start, end in product(range(ahead + 1), range(behind + 1)):
         if start + end < max(shortest, 1):
             yield _cutter(start, end)
 
 
-def _shared(parts: Sequence[Sequence[str]]) -> int:
+def _count_shared(parts: Sequence[Sequence[str]]) -> int:
     """Return with how many equal words all lists begin, at most ``_MOST_PARTS``."""
     count = 0
     for same in zip(*parts, strict=False):
@@ -188,12 +188,12 @@ def _shared(parts: Sequence[Sequence[str]]) -> int:
 def _cutter(start: int, end: int) -> _Key:
     """Return what takes so many words off the begin and the end of a name."""
 
-    def cut(name: str) -> str:
+    def strip(name: str) -> str:
         found = list(_PARTS.finditer(name))
         kept = found[start : len(found) - end]
         return name[kept[0].start() : kept[-1].end()] if kept and start + end else name
 
-    return cut
+    return strip
 
 
 def _select(

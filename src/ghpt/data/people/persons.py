@@ -117,7 +117,7 @@ def _sequence(
         cameras=cameras,
         frame=people.frame.astype(np.int64),
         rate_hz=people.rate_hz,
-        points=KeyPointArrays(ideal.take(chosen[:, at]), raw.masked()),
+        points=KeyPointArrays(ideal.take(chosen[:, at]), raw.mask_invalid()),
         skeleton=people.skeleton,
     )
 
@@ -172,7 +172,7 @@ def undistort_detections(people: Detections, cameras: CameraSet, at: Items[int])
         points = undistort_view(people.points[indices], cameras, camera)
         pixels[indices] = points.pixels
         valid[indices] = points.valid
-    return KeyPoints(pixels, people.points.confidence, valid).masked()
+    return KeyPoints(pixels, people.points.confidence, valid).mask_invalid()
 
 
 def with_lenses(sequence: Sequence, cameras: CameraSet) -> Sequence:

@@ -101,7 +101,7 @@ class StoredKeyPoints:
             undistort_view(points[:, view], self.cameras, camera)
             for camera, view in enumerate(self.views)
         ]
-        return KeyPoints.stack(views).masked()
+        return KeyPoints.stack(views).mask_invalid()
 
     def detected(self, rows: Rows) -> KeyPoints:
         return self.file.read(rows)[:, list(self.views)]

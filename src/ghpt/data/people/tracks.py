@@ -228,7 +228,7 @@ class _Person:
     def add(self, track: _Track, at: int) -> None:
         self.starts.insert(at, track.first)
         self.tracks.insert(at, track)
-        self.bones = self.bones.merged(track.bones)
+        self.bones = self.bones.merge(track.bones)
 
 
 @dataclass(frozen=True)
@@ -238,7 +238,7 @@ class _Bones:
     length: Float[np.ndarray, " B"]
     precision: Float[np.ndarray, " B"]
 
-    def merged(self, other: _Bones) -> _Bones:
+    def merge(self, other: _Bones) -> _Bones:
         total = self.precision + other.precision
         summed = self.precision * self.length + other.precision * other.length
         return _Bones(summed / np.maximum(total, 1e-12), total)

@@ -448,7 +448,8 @@ class Detector:
             rate = self.swap_rate * (0.2 + 2.0 * from_side + 0.6 * (facing < 0))
             now = ndtr(processes.flip[:, group]) > 1.0 - rate
             for a, b in pairs:
-                pixels[now, a], pixels[now, b] = pixels[now, b], pixels[now, a]
+                pixels[now, a] = projection.raw[now, b]
+                pixels[now, b] = projection.raw[now, a]
         return pixels
 
     def _confidence(

@@ -255,7 +255,7 @@ def _hide(
             key_points[person, :, view] = np.where(taken[..., None], other, displaced)
             confidence[person, :, view] *= np.where(hidden, 0.6, 1.0)
             valid[person, :, view] &= ~missed
-    valid &= _listed(key_points, valid, truth, rig)[..., None]
+    valid &= _lists(key_points, valid, truth, rig)[..., None]
     return key_points, confidence, valid
 
 
@@ -292,14 +292,14 @@ def _nearest_hider(
     for other in range(people):
         if other == person:
             continue
-        covered, at = _covered(images, other, point)
+        covered, at = _covers(images, other, point)
         hides = covered & present[:, other, None] & (at < depth - 100.0) & (at < nearest)
         hider = np.where(hides, other, hider)
         nearest = np.where(hides, at, nearest)
     return hider
 
 
-def _covered(
+def _covers(
     images: _Images, other: int, point: Float[np.ndarray, "T J 2"]
 ) -> tuple[Bool[np.ndarray, "T J"], Float[np.ndarray, "T J"]]:
     """Return whether a person's body covers points of the image, and its depth there."""
@@ -319,7 +319,7 @@ def _covered(
     return inside.any(-1), at.min(-1)
 
 
-def _listed(
+def _lists(
     key_points: Float[np.ndarray, "P T V J 2"],
     valid: Bool[np.ndarray, "P T V J"],
     truth: Float[np.ndarray, "T P J 3"],

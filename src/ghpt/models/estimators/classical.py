@@ -70,7 +70,7 @@ class Estimator(ABC):
     def triangulate(self, batch: Observations) -> Triangulation:
         """Return the batch's joints with their states."""
 
-    def fitted(self, batch: Observations) -> Self:
+    def fit_to(self, batch: Observations) -> Self:
         """Return the same estimator with what it takes from these frames of a recording."""
         return self
 
@@ -117,12 +117,12 @@ class Estimator(ABC):
 class ConfidenceWeighted(Estimator):
     """An estimator that weights the views that it takes by their confidence to a power.
 
-    ``confidence_exponent``: the power; 0 counts them alike. ``fitted`` measures it on a recording.
+    ``confidence_exponent``: the power; 0 counts them alike. ``fit_to`` measures it on a recording.
     """
 
     confidence_exponent: float = field(default=0.0, kw_only=True)
 
-    def fitted(self, batch: Observations) -> Self:
+    def fit_to(self, batch: Observations) -> Self:
         result = self.triangulate(batch)
         scale = person_scale(batch.key_points, batch.valid).clamp(min=1e-12)
         error = reprojection_error(batch.cameras, batch.key_points, result.points)

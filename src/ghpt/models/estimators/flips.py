@@ -57,15 +57,15 @@ class LeftRightFlips:
     @cached_property
     def limbs(self) -> tuple[tuple[int, ...], ...]:
         """The joints of the legs and of the arms, without feet and hands."""
-        return tuple(self._sided(words) for words in _LIMB_PARTS)
+        return tuple(self._key_points_of_side(words) for words in _LIMB_PARTS)
 
     @cached_property
     def flipped_together(self) -> tuple[tuple[int, ...], ...]:
         """What is exchanged with the legs and with the arms: all of their key points."""
-        ends = [self._sided(words) for words in _FOOT_AND_HAND]
+        ends = [self._key_points_of_side(words) for words in _FOOT_AND_HAND]
         return tuple((*limb, *end) for limb, end in zip(self.limbs, ends, strict=True))
 
-    def _sided(self, words: tuple[str, ...]) -> tuple[int, ...]:
+    def _key_points_of_side(self, words: tuple[str, ...]) -> tuple[int, ...]:
         """Return the key points of a side with one of these words in their name."""
         names = self.skeleton.key_points
         sided = sorted(joint for pair in self.skeleton.pairs for joint in pair)

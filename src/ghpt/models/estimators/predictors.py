@@ -88,7 +88,7 @@ class FramePredictor(ABC):
     """A predictor whose frames are independent of each other."""
 
     @abstractmethod
-    def fitted(self, batch: Observations) -> Self:
+    def fit_to(self, batch: Observations) -> Self:
         """Return the same with the noise of these frames: a few hundred of a recording."""
 
     @abstractmethod
@@ -100,7 +100,7 @@ class FramePredictor(ABC):
         """Return the batch's frames, with ``frame`` = ``batch.index``; on the CPU."""
 
     def fit(self, source: FrameSource, frames: int) -> Self:
-        return self.fitted(source.read(spread(len(source.frame), frames)))
+        return self.fit_to(source.read(spread(len(source.frame), frames)))
 
     def predict(
         self,
@@ -149,13 +149,13 @@ class Classical(FramePredictor):
         estimator = self.estimator.for_skeleton(skeleton)
         return Classical(estimator, self.uncertainty, flips, self.reject)
 
-    def fitted(self, batch: Observations) -> Classical:
+    def fit_to(self, batch: Observations) -> Classical:
         clean = prepare(batch, self.flips, self.estimator).batch
-        estimator = self.estimator.fitted(clean)
+        estimator = self.estimator.fit_to(clean)
         result = estimator.triangulate(clean)
         views, _ = estimator.inlier_views(clean, result.points, result.has_position)
-        uncertainty = self.uncertainty.fitted(clean, result.points, views)
-        reject = self.reject and self.reject.fitted(clean, result.points, result.has_position)
+        uncertainty = self.uncertainty.fit_to(clean, result.points, views)
+        reject = self.reject and self.reject.fit_to(clean, result.points, result.has_position)
         flips = self.flips
         if flips is not None and flips.estimator == self.estimator:
             flips = replace(flips, estimator=estimator)
@@ -214,13 +214,13 @@ class Learned(FramePredictor):
         flips = self.flips and self.flips.for_skeleton(skeleton)
         return Learned(self.view_weights, self.uncertainty, flips, self.reject, skeleton)
 
-    def fitted(self, batch: Observations) -> Learned:
+    def fit_to(self, batch: Observations) -> Learned:
         prepared = prepare(batch, self.flips, self.view_weights.consensus)
         clean = prepared.batch
         weighted = self._weigh(prepared)
         result = weighted.triangulation
-        uncertainty = self.uncertainty.fitted(clean, result.points, weighted.views)
-        reject = self.reject and self.reject.fitted(clean, result.points, result.has_position)
+        uncertainty = self.uncertainty.fit_to(clean, result.points, weighted.views)
+        reject = self.reject and self.reject.fit_to(clean, result.points, result.has_position)
         return Learned(self.view_weights, uncertainty, self.flips, reject, self.skeleton)
 
     def rejecting_nothing(self) -> Learned:
@@ -343,7 +343,7 @@ def final_states(
     state = torch.where(bad, int(State.BAD_INPUT), state)
     if reject is not None:
         observed = state == State.OBSERVED
-        explained = reject.explained(prepared.batch, result.points, observed)
+        explained = reject.find_explained(prepared.batch, result.points, observed)
         state = torch.where(observed & ~explained, int(State.REJECTED), state)
     return state.to(torch.int8)
 

@@ -37,7 +37,7 @@ class Rejection:
     def __post_init__(self) -> None:
         check_positive(limit=self.limit)
 
-    def fitted(
+    def fit_to(
         self,
         batch: Observations,
         points: Float[Tensor, "B J 3"],
@@ -48,7 +48,7 @@ class Rejection:
         return replace(self, extent=float(_person_extent(batch, distance)))
 
     @torch.no_grad()
-    def explained(
+    def find_explained(
         self,
         batch: Observations,
         points: Float[Tensor, "B J 3"],

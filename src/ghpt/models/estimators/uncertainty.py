@@ -60,7 +60,7 @@ class UncertaintyModel:
         check(self.prior > 0, "prior", f"is {self.prior}", "It must be > 0.")
         check(self.shared >= 0, "shared", f"is {self.shared}", "It must be >= 0.")
 
-    def fitted(
+    def fit_to(
         self, batch: Observations, points: Float[Tensor, "B J 3"], views: Bool[Tensor, "B V J"]
     ) -> UncertaintyModel:
         """Return the same model with the noise of these frames."""

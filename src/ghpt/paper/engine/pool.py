@@ -30,7 +30,7 @@ from rich.progress import (
 from ghpt.errors import GhptConfigError, GhptError
 from ghpt.files import sweep_temporaries
 from ghpt.paper.engine.tasks import Task, perform, with_dependencies
-from ghpt.signals import stopped_by_signals
+from ghpt.signals import stop_on_signals
 
 _LOUD = ("ghpt", "lightning.pytorch", "lightning.fabric")
 """The loggers of the commands."""
@@ -59,7 +59,7 @@ def perform_all(wanted: Iterable[Task], tasks: Path, jobs: int, show: bool) -> i
     count = len(queue.missing)
     running: dict[Future[None], Task] = {}
     with (
-        stopped_by_signals(),
+        stop_on_signals(),
         _progress(list(queue.missing.values()), show) as report,
         _executor(min(jobs, count)) as submit,
     ):

@@ -34,7 +34,7 @@ _PERSON = (0.25, 2.0)
 """Sizes that a person may have, who sits or is a child."""
 _LEAST_PLACED = 5
 """Joints of a frame, of which fewer tell no size."""
-_LEAST_EXPONENT = 0.0
+LEAST_EXPONENT = 0.0
 """Of the confidences: any that is surely positive counts, since many frames are averaged."""
 
 
@@ -123,28 +123,28 @@ class Trajectory:
         clock = Clock.of_frames(batch.index.numpy(), rate_hz, self.longest_gap_s)
         return replace(self, clock=clock)
 
-    def fitted(self, batch: Observations) -> Trajectory:
+    def fit_to(self, batch: Observations) -> Trajectory:
         """Return the same with the body that these frames show, and the worth of confidences.
 
         They are of one recording, in the order of time; there may be gaps between them.
         """
         first = self.start(batch)
-        size = _size(first)
+        size = body_size(first)
         if size != self.size:
-            return replace(self, size=size).fitted(batch)
+            return replace(self, size=size).fit_to(batch)
         plain = replace(self, exponent=0.0)
         found = plain.solve(batch, first)
         exchanged = found.exchanged
         error = reprojection_error(batch.cameras, exchanged.key_points, found.points)
         relative = error / person_scale(batch.key_points, batch.valid)[..., None]
         exponent = confidence_exponent(
-            relative, exchanged.confidence, exchanged.valid, _LEAST_EXPONENT
+            relative, exchanged.confidence, exchanged.valid, LEAST_EXPONENT
         )
         weighted = replace(self, exponent=min(exponent, self.largest_exponent))
         frames, _ = weighted._frames(_resize(batch, 1 / size), _resize_poses(first, 1 / size))
         return replace(weighted, body=self.solver(frames, self.skeleton).body)
 
-    def calibrated(self, batch: Observations) -> Trajectory:
+    def calibrate(self, batch: Observations) -> Trajectory:
         """Return the same with the inflation of the covariances that these frames show."""
         views = int(batch.valid.any(-1).any(0).sum())
         prior = replace(self, inflation=self.inflation * LEAST_VIEWS / max(views, 2))
@@ -226,7 +226,7 @@ class Trajectory:
         return (number - before <= reach) | (-after - number <= reach)
 
 
-def _size(first: PoseEstimate) -> float:
+def body_size(first: PoseEstimate) -> float:
     """Return the size of the body in that of an adult; 1 where it may be a person's."""
     placed = (first.estimated & first.points.isfinite().all(-1))[..., None]
     largest = torch.where(placed, first.points.double(), -torch.inf).amax(1)

@@ -47,13 +47,13 @@ class TrajectoryPredictor:
         batch = source.read(spread_runs(len(source.frame), frames))
         clean = prepare(batch, None, self.trajectory.start).batch
         clock = self._clock(source)
-        start = self.trajectory.start.fitted(clean)
-        trajectory = replace(self.trajectory, start=start, clock=clock).fitted(clean)
-        trajectory = trajectory.calibrated(clean)
+        start = self.trajectory.start.fit_to(clean)
+        trajectory = replace(self.trajectory, start=start, clock=clock).fit_to(clean)
+        trajectory = trajectory.calibrate(clean)
         reject = self.reject
         if reject is not None:
             first = start.triangulate(clean)
-            reject = reject.fitted(clean, first.points, first.has_position)
+            reject = reject.fit_to(clean, first.points, first.has_position)
         return replace(self, trajectory=trajectory, reject=reject)
 
     @torch.no_grad()

@@ -64,7 +64,7 @@ class MotionPrior:
         shape = (joints, len(axis.joined))
         return torch.full(shape, self.first * axis.scale**2, dtype=torch.float64)
 
-    def adapted(self, points: Float[Tensor, "3 J T"], axis: TimeAxis) -> Float[Tensor, "J T"]:
+    def adapt(self, points: Float[Tensor, "3 J T"], axis: TimeAxis) -> Float[Tensor, "J T"]:
         """Return the deviation of second differences around each frame of an estimate, mm."""
         square = torch.zeros_like(points[0])
         square[:, 1:-1] = points.diff(n=2, dim=-1).square().mean(0)

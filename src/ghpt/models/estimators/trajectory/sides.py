@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from scipy.ndimage import gaussian_filter1d
@@ -105,5 +106,8 @@ class OtherPeople:
         median = torch.where(used, relative, torch.nan).nanmedian(1).values.nan_to_num(0.0)
         sigma = self.window_s * axis.rate_hz
         smooth = gaussian_filter1d(median.numpy(), sigma, axis=-1, mode="nearest")
-        ratio = torch.from_numpy(smooth) / self.kernel
-        return (1 / (1 + ratio**4))[:, None]
+        return torch.from_numpy(self.view_weight(smooth))[:, None]
+
+    def view_weight(self, median: Float[np.ndarray, "*T V"]) -> Float[np.ndarray, "*T V"]:
+        """Return the weight of views with these medians, averaged over time."""
+        return 1 / (1 + (median / self.kernel) ** 4)

@@ -184,7 +184,7 @@ class _Rounds:
         if self.given is None:
             self.body = self._measure(self.points, residual)
         if adapt:
-            self.deviation = solver.motion.adapted(self.points, frames.axis)
+            self.deviation = solver.motion.adapt(self.points, frames.axis)
         scale = self.body.scale[:, None]
         relative = residual / scale
         robust = (1 + (relative / kernel).square()).square().reciprocal()
@@ -277,27 +277,33 @@ class _Rounds:
             residual = self.rows.residuals(points)
         _, lengths = self._directions(points)
         length, precision = self.solver.bones.measure(lengths, self.both_placed)
-        return Body(self._noise(residual), length, precision)
-
-    def _noise(self, residual: Float[Tensor, "V J T"]) -> Float[Tensor, " J"]:
-        """Return the deviation of each joint's key points, mm.
-
-        It is told by the median that the weights make: what a detector guesses, with little
-        confidence, says nothing of the others. That of a joint that nobody sees is the median
-        joint's.
-        """
-        measured = self.rows.used & residual.isfinite()
-        median = _weighted_median(
-            torch.where(measured, residual, torch.inf).transpose(0, 1).flatten(1),
-            torch.where(measured, self.weight, 0.0).transpose(0, 1).flatten(1),
-        )
-        typical = median.nanmedian()
-        median = torch.where(median.isnan(), typical, median).nan_to_num(1.0)
-        return self.solver.noise * (median / _MEDIAN_LENGTH).clamp(min=_LEAST_NOISE)
+        noise = joint_noise(residual, self.rows.used, self.weight, self.solver.noise)
+        return Body(noise, length, precision)
 
 
 _LEAST_NOISE = 1.0
 """mm. No detector is better; key points without any error would leave time and bones no say."""
+
+
+def joint_noise(
+    residual: Float[Tensor, "V J T"],
+    used: Bool[Tensor, "V J T"],
+    weight: Float[Tensor, "V J T"],
+    factor: float,
+) -> Float[Tensor, " J"]:
+    """Return the deviation of each joint's key points, mm: so many times what the median says.
+
+    It is told by the median that the weights make: what a detector guesses, with little confidence,
+    says nothing of the others. That of a joint that nobody sees is the median joint's.
+    """
+    measured = used & residual.isfinite()
+    median = _weighted_median(
+        torch.where(measured, residual, torch.inf).transpose(0, 1).flatten(1),
+        torch.where(measured, weight, 0.0).transpose(0, 1).flatten(1),
+    )
+    typical = median.nanmedian()
+    median = torch.where(median.isnan(), typical, median).nan_to_num(1.0)
+    return factor * (median / _MEDIAN_LENGTH).clamp(min=_LEAST_NOISE)
 
 
 def _weighted_median(

@@ -52,7 +52,7 @@ class TestedTrajectory:
         """Return the poses of all frames of a recording."""
         frames = self.dataset.recordings[recording]
         sample = _read(frames, spread_runs(len(frames), self.fitted_frames))
-        trajectory = self.trajectory.at_rate(sample, frames.rate_hz).fitted(sample)
+        trajectory = self.trajectory.at_rate(sample, frames.rate_hz).fit_to(sample)
         parts = []
         for start in range(0, len(frames), _PIECE):
             rows = np.arange(start, min(start + _PIECE, len(frames)))
