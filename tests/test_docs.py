@@ -17,6 +17,7 @@ import documented
 import ghpt.commands.test as testing
 import sizes
 from documented import PAGES, ROOT, Block, Command
+from ghpt.calibration.check.breakages import BREAKAGES
 from ghpt.commands import calibrate, predict, train
 from ghpt.commands import cameras as camera_check
 from ghpt.commands.overrides import Source, check_overrides
@@ -136,7 +137,8 @@ class Page:
         status, said, errors = self.typed(self.conf, main, words)
         spoilt = next((word.split("=")[1] for word in words if word.startswith("spoil=")), None)
         if spoilt:
-            assert (status, spoilt in errors) == (1, True), f"{command.where}\n{said}{errors}"
+            code = BREAKAGES[spoilt].code
+            assert (status, code in errors) == (1, True), f"{command.where}\n{said}{errors}"
         else:
             assert status == 0, f"{command.where}\n{said}{errors}"
         if output and "-m" not in words:

@@ -1,5 +1,6 @@
-"""HDF5 of SLEAP, DeepLabCut and anipose as their tools write it, without movement or pandas."""
+"""HDF5 of SLEAP, DeepLabCut and anipose as their tools write it, without their packages."""
 
+import json
 import pickle
 import sys
 
@@ -72,6 +73,61 @@ def pandas_blocks(h5py, path, people=2):
             group[f"block0_items_label{level}"] = np.array(labels, np.int8)
         group["block0_values"] = values
         group["axis1"] = np.arange(len(values)) + 3
+
+
+def sleap_labels(h5py, path):
+    """As SLEAP saves a project: the second person of the last frame was put right by hand."""
+    path = path.with_suffix(".slp")
+    nodes = [{"id": index} for index in reversed(range(len(NAMES)))]
+    names = [{"name": name} for name in reversed(NAMES)]
+    points, sure = POINTS.reshape(10, -1, 2), SURE.reshape(10, -1)
+    predicted = np.zeros(
+        (11, len(NAMES)), [*((n, "f8") for n in "xy"), ("visible", "?"), ("score", "f8")]
+    )
+    predicted["x"][:10], predicted["y"][:10] = points[..., 0], points[..., 1]
+    predicted["score"][:10], predicted["visible"] = sure, True
+    instances = np.zeros(11, [(name, "i8") for name in _INSTANCE])
+    instances["instance_id"] = np.arange(11)
+    instances["instance_type"] = 1
+    instances["frame_id"] = [*np.repeat(np.arange(5), 2), 4]
+    instances["track"] = [*np.tile([0, 1], 5), 1]
+    instances["from_predicted"] = -1
+    instances["point_id_start"] = np.arange(11) * len(NAMES)
+    instances["point_id_end"] = instances["point_id_start"] + len(NAMES)
+    instances[10] = (10, 0, 4, 1, 9, 0, len(NAMES))
+    by_hand = predicted[9].copy()
+    frames = np.zeros(5, [("frame_id", "i8"), ("frame_idx", "i8"), ("video", "i8")])
+    frames["frame_id"], frames["frame_idx"] = np.arange(5), np.arange(5) + 2
+    with h5py.File(path, "w") as file:
+        metadata = {"nodes": names, "skeletons": [{"nodes": nodes}]}
+        file.create_group("metadata").attrs["json"] = np.bytes_(json.dumps(metadata).encode())
+        file["metadata"].attrs["format_id"] = 1.4
+        file["frames"], file["instances"] = frames, instances
+        file["pred_points"] = predicted.reshape(-1)
+        file["points"] = by_hand[["x", "y", "visible"]].copy()
+
+
+_INSTANCE = (
+    "instance_id",
+    "instance_type",
+    "frame_id",
+    "track",
+    "from_predicted",
+    "point_id_start",
+    "point_id_end",
+)
+
+
+def test_what_was_put_right_by_hand_counts_in_place_of_the_prediction(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    sleap_labels(h5py, tmp_path / "cam1.slp")
+    found = read_key_points(tmp_path)
+    assert found.frame.tolist() == [2, 3, 4, 5, 6]
+    assert found.identity.tolist() == [0, 1] * 5
+    np.testing.assert_array_equal(found.points.pixels, POINTS.reshape(10, -1, 2))
+    sure = SURE.reshape(10, -1).copy()
+    sure[9] = 1
+    np.testing.assert_array_equal(found.points.confidence, sure)
 
 
 @pytest.mark.parametrize(

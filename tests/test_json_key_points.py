@@ -273,6 +273,20 @@ def test_a_file_of_each_video_in_every_detector_s_words(recording, form, tmp_pat
     np.testing.assert_array_equal(found.points.pixels, np.broadcast_to(BODY[:, :2], (6, 17, 2)))
 
 
+@pytest.mark.parametrize("name", ["idx", "personID", "track_id"])
+def test_what_a_tracker_calls_people_is_read_from_whole_recordings(name, tmp_path):
+    """AlphaPose writes 3.0 or [3.0]."""
+    called = [[3], [3, 5], [5]]
+    rows = [
+        {"image_id": t, "keypoints": FLAT, name: [float(i)] if name == "idx" else i}
+        for t, ids in enumerate(called)
+        for i in ids
+    ]
+    for view in ("cam1", "cam2"):
+        write(tmp_path / f"{view}.json", rows)
+    assert read_key_points(tmp_path).identity.tolist() == [3, 3, 5, 5] * 2
+
+
 def test_nan_and_null_are_missing_key_points(tmp_path):
     for view in ("a", "b"):
         flat = [*FLAT]

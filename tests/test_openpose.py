@@ -148,11 +148,20 @@ def test_person_ids_are_those_of_the_view(tmp_path):
         (tmp_path / view / "1.json").write_text(json.dumps({"people": people}))
 
     write_ids("a", [1, 0])
-    write_ids("b", [7])
-    assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [1, 0, 7]
-    for other in (-1, True, 1 << 31, "1", 1.0):
-        write_ids("b", [other])
-        assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [1, 0, -1]
+    write_ids("b", [7, 9])
+    assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [1, 0, 7, 9]
+    for other in (-1, True, 1 << 31, "1"):
+        write_ids("b", [7, 9, other])
+        assert read_key_points(tmp_path, **JOINTS).identity.tolist() == [1, 0, 7, 9, -1]
+
+
+@pytest.mark.parametrize("ids", [[4, 4], [0, 0, 1]])
+def test_a_number_that_two_people_of_a_frame_have_is_no_tracker_s(ids, tmp_path):
+    for view in ("a", "b"):
+        (tmp_path / view).mkdir()
+        people = [{"person_id": [i], "pose_keypoints_2d": person().ravel().tolist()} for i in ids]
+        (tmp_path / view / "1.json").write_text(json.dumps({"people": people}))
+    assert set(read_key_points(tmp_path, **JOINTS).identity.tolist()) == {-1}
 
 
 def test_64_people_are_read_and_a_pixel_below_a_million(tmp_path):

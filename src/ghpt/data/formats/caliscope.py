@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import codecs
 import csv
-import io
 import re
-import warnings
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from ghpt.data.formats.csv_tables import open_table, read_header, read_numbers
 from ghpt.data.formats.skeletons import SKELETONS, joints_of, recognise_beginning
 from ghpt.data.formats.source import Source
-from ghpt.data.formats.validate import open_input
 from ghpt.data.people.detections import Detections
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
@@ -25,8 +21,6 @@ _CAMERAS = ("port", "cam_id")
 """What the column of the camera's number is called, until 2025 and since."""
 _FRAME = "sync_index"
 _POINT = ("point_id", "img_loc_x", "img_loc_y")
-_LARGEST = 2 << 30
-_LONGEST_LINE = 1 << 12
 _MOST_PORTS = 1000
 _WRITE = "It must be an xy_*.csv that caliscope wrote."
 _BODY = len(SKELETONS["mediapipe_33"])
@@ -133,18 +127,14 @@ def _number_joints(path: Path, point: Float[np.ndarray, " N"], skeleton: str | N
 
 
 def _table(path: Path) -> Float[np.ndarray, "N 5"]:
-    if path.stat().st_size > _LARGEST:
-        raise GhptDataError(path, "", f"has more than {_LARGEST >> 30} GiB", "Split the recording.")
-    with open_input(path) as raw:
-        utf16 = raw.peek(2)[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
-        encoding = "utf-16" if utf16 else "utf-8-sig"
-        raw.seek(-min(2, path.stat().st_size), 2)
-        if not raw.read().strip(b"\0").endswith((b"\n", b"\r")):
-            problem = "ends in the middle of a line: it is truncated"
-            raise GhptDataError(path, "", problem, "Copy it again.")
-        raw.seek(0)
-        with io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline="") as handle:
-            table = _rows(path, handle)
+    try:
+        with open_table(path) as handle:
+            header = read_header(path, handle)
+            camera = next((name for name in _CAMERAS if name in header), _CAMERAS[0])
+            columns = [header.index(name) for name in (_FRAME, camera, *_POINT)]
+            table = read_numbers(handle, columns)
+    except (ValueError, csv.Error) as error:
+        raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
     index = table[:, :3]
     index = index[np.isfinite(index)]
     whole = (index == np.round(index)).all()
@@ -152,41 +142,3 @@ def _table(path: Path) -> Float[np.ndarray, "N 5"]:
         problem = "holds an index that is not whole, or a number beyond 1e12"
         raise GhptDataError(path, "", problem, _WRITE)
     return table
-
-
-def _lines(handle: io.TextIOBase) -> Iterator[str]:
-    while line := handle.readline(_LONGEST_LINE):
-        if len(line) == _LONGEST_LINE:
-            raise ValueError("a line of it does not end")
-        yield line
-
-
-def _number(cell: str) -> float:
-    """Return a cell's number; an empty one is a point that was not found."""
-    return float(cell) if cell.strip() else np.nan
-
-
-def _rows(path: Path, handle: io.TextIOBase) -> Float[np.ndarray, "N 5"]:
-    line = handle.readline(_LONGEST_LINE)
-    if ";" in line or "\t" in line:
-        hint = (
-            "Save it with commas between the columns and points in the numbers "
-            "(a spreadsheet may have changed it)."
-        )
-        raise GhptDataError(path, "", "has columns that commas do not part", hint)
-    try:
-        header = [name.strip() for name in next(csv.reader([line]))]
-        camera = next((name for name in _CAMERAS if name in header), _CAMERAS[0])
-        columns = [header.index(name) for name in (_FRAME, camera, *_POINT)]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of a table without rows
-            table = np.loadtxt(
-                _lines(handle),
-                delimiter=",",
-                usecols=columns,
-                converters=dict.fromkeys(columns, _number),
-                ndmin=2,
-            )
-    except (ValueError, StopIteration, csv.Error) as error:
-        raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
-    return table.reshape(-1, len(columns))

@@ -1,22 +1,26 @@
-"""HDF5 files of SLEAP (analysis), DeepLabCut and anipose, read by h5py; nothing is unpickled."""
+"""HDF5 files of SLEAP (analysis and .slp), DeepLabCut and anipose, read by h5py.
+
+Nothing is unpickled.
+"""
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from ghpt.data.formats.layout import find_files
 from ghpt.data.formats.pickled_names import read_names
 from ghpt.data.formats.source import Source
-from ghpt.data.formats.tracks import Tracks, read_tracks
+from ghpt.data.formats.tracks import Tracks, grid_of_columns, read_tracks
 from ghpt.data.people.detections import Detections
 from ghpt.errors import GhptDataError
 
-ENDINGS = (".h5", ".hdf5")
+ENDINGS = (".h5", ".hdf5", ".slp")
 _INSTALL = "Install it: pip install h5py"
 _LARGEST = 2 << 30
 """Bytes of an array."""
@@ -24,15 +28,16 @@ _DENSEST = 1000
 """Bytes of an array for each that is stored: a track without anybody compresses well."""
 _SMALL = 16 << 20
 """Bytes of an array that may be asked for whatever is stored."""
-_COORDINATES = ("x", "y", "likelihood")
 _MOST_NAMES = 10_000
+_CENTRES = 1.1
+"""Version from which SLEAP's pixels are counted from the centre of the first one."""
 
 
 def read_hdf5(source: Source) -> Detections:
     """Return everybody in a folder with an HDF5 file of each camera.
 
-    Known are SLEAP's analysis files and the tables of DeepLabCut and anipose, of one person or
-    several. Raises GhptDataError, also where h5py is missing.
+    Known are SLEAP's analysis files and its .slp of one video each, and the tables of DeepLabCut
+    and anipose, of one person or several. Raises GhptDataError, also where h5py is missing.
     """
     if find_files(source.path, ENDINGS):
         _require_h5py(source.path)
@@ -54,6 +59,8 @@ def _read_file(file: Path) -> Tracks:
         with h5py.File(file, "r") as content:
             if "tracks" in content and "node_names" in content:
                 return _sleap(content)
+            if "frames" in content and "instances" in content:
+                return _labels(content)
             tables = [key for key in content if _is_table(content, key)]
             if len(tables) == 1:
                 return _pandas(content[tables[0]])
@@ -63,7 +70,7 @@ def _read_file(file: Path) -> Tracks:
         problem = f"is damaged ({' '.join(str(error).split())[:200]})"
         raise GhptDataError(file, "", problem, "Export it again.") from error
     problem = "is HDF5 of neither SLEAP, DeepLabCut nor anipose"
-    hint = "Export SLEAP's analysis HDF5 (its .slp files need movement), or DeepLabCut's h5 or CSV."
+    hint = "Export SLEAP's analysis HDF5 or DeepLabCut's h5 or CSV."
     raise GhptDataError(file, "", problem, hint)
 
 
@@ -90,7 +97,54 @@ def _sleap(content: Any) -> Tracks:
         scores = np.full(points.shape[:3], np.nan)
     elif as_matlab:
         scores = scores.transpose(2, 0, 1)
-    return Tracks(_join(points, scores), names)
+    return Tracks.of_grid(np.arange(len(points)), _join(points, scores), names)
+
+
+def _labels(content: Any) -> Tracks:
+    """Return a .slp file's instances of one video.
+
+    A hand-made instance is there in place of the prediction that it corrects. Raises ValueError.
+    """
+    frames = _array(content, "frames", "V")
+    instances = _array(content, "instances", "V")
+    if len(np.unique(frames["video"])) > 1:
+        raise ValueError("it holds several videos: export the analysis HDF5 of each")
+    names = _node_names(content)
+    corrected = instances["from_predicted"][instances["from_predicted"] >= 0]
+    instances = instances[~np.isin(instances["instance_id"], corrected)]
+    number = np.full(int(frames["frame_id"].max(initial=-1)) + 1, -1)
+    number[frames["frame_id"]] = frames["frame_idx"]
+    predicted = instances["instance_type"] == 1
+    values = np.full((len(instances), len(names), 3), np.nan)
+    for table, own in (("points", ~predicted), ("pred_points", predicted)):
+        values[own] = _instance_points(_array(content, table, "V"), instances[own], len(names))
+    if float(content["metadata"].attrs.get("format_id", 1.0)) < _CENTRES:
+        values[..., :2] -= 0.5
+    frame = number[instances["frame_id"]].astype(np.int64)
+    track = instances["track"].astype(np.int64)
+    return Tracks(np.unique(frames["frame_idx"]).astype(np.int64), frame, track, values, names)
+
+
+def _instance_points(
+    points: np.ndarray, instances: np.ndarray, count: int
+) -> Float[np.ndarray, "N K 3"]:
+    """Return the points of some instances, which lie one behind the other in a table."""
+    start = instances["point_id_start"].astype(np.int64)
+    if not (instances["point_id_end"].astype(np.int64) - start == count).all():
+        raise ValueError(f"an instance has not the {count} points of the skeleton")
+    own = points[start[:, None] + np.arange(count)]
+    score = own["score"] if "score" in (own.dtype.names or ()) else np.full(own.shape, np.nan)
+    values = np.stack([own["x"], own["y"], score], -1)
+    return np.where(own["visible"][..., None], values, np.nan)
+
+
+def _node_names(content: Any) -> tuple[str, ...]:
+    """Return the names of the skeleton's nodes, in the order of an instance's points."""
+    metadata = json.loads(_text(content["metadata"].attrs["json"]))
+    if len(metadata["skeletons"]) != 1:
+        raise ValueError("it has several skeletons")
+    nodes = [node["name"] for node in metadata["nodes"]]
+    return tuple(_text(nodes[node["id"]]) for node in metadata["skeletons"][0]["nodes"])
 
 
 def _pandas(group: Any) -> Tracks:
@@ -99,23 +153,11 @@ def _pandas(group: Any) -> Tracks:
     pandas stores it in a fixed form, in blocks of columns of a type, or as a table of rows.
     """
     form = _text(group.attrs["pandas_type"])
-    columns, values, first = _of_rows(group) if form == "frame_table" else _of_blocks(group)
-    if not columns or min(map(len, columns)) < 3:
-        raise ValueError("its columns are no joints")
-    people = list(dict.fromkeys(column[:-2] for column in columns))
-    joints = list(dict.fromkeys(column[-2] for column in columns))
-    size = len(values) * len(people) * len(joints)
-    if size > _DENSEST * values.size:
-        raise ValueError("its columns are no table of people and joints")
-    found = np.full((len(values), len(people), len(joints), 3), np.nan)
-    for column, own in zip(columns, values.T, strict=True):
-        if column[-1] in _COORDINATES:
-            coordinate = _COORDINATES.index(column[-1])
-            found[:, people.index(column[:-2]), joints.index(column[-2]), coordinate] = own
-    return Tracks(found, tuple(joints), first)
+    columns, values, index = _of_rows(group) if form == "frame_table" else _of_blocks(group)
+    return Tracks.of_grid(_frames(index, len(values)), *grid_of_columns(columns, values))
 
 
-def _of_rows(group: Any) -> tuple[list[tuple[str, ...]], Float[np.ndarray, "T C"], int]:
+def _of_rows(group: Any) -> tuple[list[tuple[str, ...]], Float[np.ndarray, "T C"], np.ndarray]:
     table = _array(group, "table", "V")
     columns: list[tuple[str, ...]] = []
     values = []
@@ -123,10 +165,10 @@ def _of_rows(group: Any) -> tuple[list[tuple[str, ...]], Float[np.ndarray, "T C"
         if field.startswith("values_block_"):
             columns += read_names(bytes(group["table"].attrs[f"{field}_kind"]))
             values.append(table[field].reshape(len(table), -1))
-    return columns, np.concatenate(values, 1).astype(np.float64), _first(table["index"])
+    return columns, np.concatenate(values, 1).astype(np.float64), table["index"]
 
 
-def _of_blocks(group: Any) -> tuple[list[tuple[str, ...]], Float[np.ndarray, "T C"], int]:
+def _of_blocks(group: Any) -> tuple[list[tuple[str, ...]], Float[np.ndarray, "T C"], np.ndarray]:
     columns: list[tuple[str, ...]] = []
     values = []
     for block in range(int(group.attrs["nblocks"])):
@@ -137,14 +179,14 @@ def _of_blocks(group: Any) -> tuple[list[tuple[str, ...]], Float[np.ndarray, "T 
             levels.append([names[label] for label in labels.tolist()])
         columns += zip(*levels, strict=True)
         values.append(_array(group, f"block{block}_values"))
-    return columns, np.concatenate(values, 1), _first(_array(group, "axis1", "iuS"))
+    return columns, np.concatenate(values, 1), _array(group, "axis1", "iuS")
 
 
-def _first(index: np.ndarray) -> int:
-    """Return the first frame's number, if the rows are numbered one by one; else 0."""
-    if index.dtype.kind not in "iu" or not len(index) or index[0] < 0:
-        return 0
-    return int(index[0]) if (np.diff(index) == 1).all() else 0
+def _frames(index: np.ndarray, count: int) -> Int[np.ndarray, " T"]:
+    """Return the rows' frame numbers, or their places where they are no rising numbers."""
+    if index.dtype.kind in "iu" and len(index) == count and (np.diff(index, prepend=-1) > 0).all():
+        return index.astype(np.int64)
+    return np.arange(count)
 
 
 def _join(points: np.ndarray, scores: np.ndarray) -> Float[np.ndarray, "T P K 3"]:

@@ -38,6 +38,8 @@ _HANDS = ("hand_left_keypoints_2d", "hand_right_keypoints_2d")
 HAND_POINTS = 21
 _SCORES = ("keypoint_scores", "scores")
 _NUMBERS = ("frame_id", "frame_index", "frame_idx", "frame")
+_IDENTITIES = ("person_id", "track_id", "personID", "idx")
+"""Of OpenPose, MMPose, EasyMocap, AlphaPose."""
 _KNOWN = (
     "Known are the files of OpenPose, AlphaPose, MMPose, rtmlib and EasyMocap, and COCO results "
     "(docs/calibration.md)."
@@ -340,9 +342,12 @@ def _flat(path: Path, field: str, points: list[Any], each: int) -> list[Any]:
 
 
 def _identity(person: dict[str, Any]) -> int:
-    value = person.get("person_id", person.get("track_id"))
-    if isinstance(value, list) and len(value) == 1:
+    """Return what a tracker calls a person, -1 where none does; AlphaPose may write 1.0 or [1]."""
+    value = next((person[name] for name in _IDENTITIES if name in person), None)
+    while isinstance(value, list) and len(value) == 1:
         value = value[0]
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
     return value if type(value) is int and 0 <= value < 1 << 31 else -1
 
 

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePath, PurePosixPath
 
+import numpy as np
+
 from ghpt.data.formats.frame_files import Person, read_frame_files
 from ghpt.data.formats.json_content import (
     HAND_POINTS,
@@ -38,8 +40,9 @@ from ghpt.data.formats.validate import (
 )
 from ghpt.data.people.detections import (
     Detections,
+    check_people,
+    detections_in_view,
     merge_views,
-    sort_people,
 )
 from ghpt.errors import GhptDataError
 
@@ -58,9 +61,8 @@ _MOST_DIGITS = 15
 def read_json_people(source: Source) -> Detections:
     """Return everybody in JSON files, each of a frame or of a whole recording.
 
-    The layout of the files is told as ``ghpt.data.formats.layout`` says. A ``person_id`` or
-    ``track_id`` from 0 on is what a tracker of the view gave the person; OpenPose itself writes
-    -1. Raises GhptDataError.
+    The layout of the files is told as ``ghpt.data.formats.layout`` says. A person's number from 0
+    on is what a tracker of the view gave them; OpenPose itself writes -1. Raises GhptDataError.
     """
     files = _json_files(source.path)
     first, content = _first(files)
@@ -193,17 +195,42 @@ def _recordings(source: Source, files: Sequence[Path]) -> list[Detections]:
 def _read_recording(recording: _Recording) -> Detections:
     file = recording.file
     people = [
-        (number, person.joints)
+        (number, person)
         for number, frame in zip(recording.numbers, recording.frames, strict=True)
         for person in read_people(file, frame)
     ]
-    view = sort_people(file, recording.view, recording.numbers, people)
+    view = _sort_people(file, recording.view, recording.numbers, people)
     count = view.points.valid.shape[1]
     if recording.joints and len(view) and count != len(recording.joints):
         problem = f"names {len(recording.joints)} joints, and people have {count}"
         field = "meta_info.keypoint_id2name"
         raise GhptDataError(file, field, problem, "Detect this view again.")
     return replace(view, joints=recording.joints)
+
+
+def _sort_people(
+    path: Path, view: str, frames: Sequence[int], found: Sequence[tuple[int, Person]]
+) -> Detections:
+    """Return one view's people, given with their frame's number in any order, by frame.
+
+    Raises GhptDataError for people of different numbers of joints, or too many of them.
+    """
+    for number, person in found:
+        count, expected = len(person.joints), len(found[0][1].joints)
+        if count != expected:
+            problem = (
+                f"frame {number} has a person of {count} joints, frame {found[0][0]} of {expected}"
+            )
+            raise GhptDataError(path, "keypoints", problem, "Detect all frames with one model.")
+    numbers = np.array([number for number, _ in found], np.int64)
+    order = np.argsort(numbers, kind="stable")
+    people = np.unique(numbers, return_counts=True)[1]
+    check_people(path, "keypoints", int(people.max(initial=0)))
+    values = np.zeros((0, 0, 3))
+    if found:
+        values = np.stack([person.joints for _, person in found])[order]
+    identity = np.array([person.identity for _, person in found], np.int64)[order]
+    return detections_in_view(path, view, frames, numbers[order], values, identity)
 
 
 def _view_of_file(file: Path, view: str) -> _Recording:

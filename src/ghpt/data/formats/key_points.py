@@ -11,17 +11,18 @@ from pathlib import Path
 
 from ghpt.data.formats.authors_npy import is_authors_file, read_authors
 from ghpt.data.formats.caliscope import is_caliscope, read_caliscope
+from ghpt.data.formats.csv_tracks import (
+    is_deeplabcut,
+    is_sleap_analysis,
+    read_deeplabcut_csv,
+    read_sleap_csv,
+)
 from ghpt.data.formats.freemocap import is_freemocap_file, read_freemocap
 from ghpt.data.formats.hdf5_files import ENDINGS as HDF5_ENDINGS
 from ghpt.data.formats.hdf5_files import read_hdf5
 from ghpt.data.formats.json_content import looks_like_people
 from ghpt.data.formats.json_people import read_json_people
 from ghpt.data.formats.layout import find_files
-from ghpt.data.formats.movement_files import (
-    read_deeplabcut_csv,
-    read_lightning_pose,
-    read_sleap_labels,
-)
 from ghpt.data.formats.names import Name
 from ghpt.data.formats.own_npz import read_own, write_key_points
 from ghpt.data.formats.skeletons import find_skeleton, skeleton_of
@@ -47,7 +48,7 @@ _HINT = (
     "files; the authors' all_2d_preds.npy; an npz file of ghpt (docs/calibration.md). Or name it: "
     "format=."
 )
-_ENDINGS = (".json", ".csv", ".slp", *HDF5_ENDINGS, ".npy", ".npz", ".txt")
+_ENDINGS = (".json", ".csv", *HDF5_ENDINGS, ".npy", ".npz", ".txt")
 _LOOKED_AT = 20
 """Files of a folder that are opened to recognise the format."""
 
@@ -108,19 +109,17 @@ FORMATS: dict[str, Callable[[Source], Detections]] = {
     "freemocap": read_freemocap,
     "npz": lambda source: read_own(source.path, source.skeleton),
     "authors": lambda source: read_authors(source.path, source.skeleton),
-    "deeplabcut": lambda source: _of_own_or_hdf5(source, ".csv", read_deeplabcut_csv),
+    "deeplabcut": lambda source: _of_csv_or_hdf5(source, read_deeplabcut_csv),
     "anipose": read_hdf5,
-    "sleap": lambda source: _of_own_or_hdf5(source, ".slp", read_sleap_labels),
-    "lightningpose": read_lightning_pose,
+    "sleap": lambda source: _of_csv_or_hdf5(source, read_sleap_csv),
+    "lightningpose": read_deeplabcut_csv,
 }
 _ONE_RECORDING = ("caliscope", "freemocap", "npz", "authors")
 
 
-def _of_own_or_hdf5(
-    source: Source, ending: str, read: Callable[[Source], Detections]
-) -> Detections:
-    """Return what a tool's own files hold, or its HDF5 where it exported nothing else."""
-    return read(source) if find_files(source.path, (ending,)) else read_hdf5(source)
+def _of_csv_or_hdf5(source: Source, read_csv: Callable[[Source], Detections]) -> Detections:
+    """Return what a tool's CSV files hold, or its HDF5 where it exported nothing else."""
+    return read_csv(source) if find_files(source.path, (".csv",)) else read_hdf5(source)
 
 
 def format_of(path: Path) -> str:
@@ -157,11 +156,13 @@ def _format_of_file(path: Path) -> str | None:
     text = opening(start)
     if is_caliscope(text):
         return "caliscope"
-    if text.startswith("scorer,"):
+    if is_deeplabcut(text):
         return "deeplabcut"
+    if is_sleap_analysis(text):
+        return "sleap"
     if looks_like_people(text):
         return "json"
     return "yolo" if looks_like_yolo(text) else None
 
 
-_MAGIC = {b"PK\x03\x04": "npz", b"\x93NUMPY": "authors", b"\x89HDF": "sleap"}
+_MAGIC = {b"PK\x03\x04": "npz", b"\x93NUMPY": "authors", b"\x89HDF": "anipose"}

@@ -131,7 +131,8 @@ def detections_in_view(
 
     ``frames``: numbers of the frames that were looked at, those without anybody among them.
     ``number``: that of each detection's frame, not falling. ``values``: x, y, confidence; a joint
-    whose confidence is 0 or less is not valid.
+    whose confidence is 0 or less is not valid. ``identity``: the numbers that people have; they
+    count where they can be a tracker's (`_tracker_numbers`).
     """
     frame = np.unique(np.array(frames, np.int64))
     points = KeyPoints(values[..., :2], values[..., 2].clip(0, 1), values[..., 2] > 0)
@@ -142,37 +143,32 @@ def detections_in_view(
         frame=frame,
         row=np.searchsorted(frame, number),
         view=np.zeros(len(number), np.int64),
-        identity=np.full(len(number), -1) if identity is None else identity,
+        identity=np.full(len(number), -1)
+        if identity is None
+        else _tracker_numbers(number, identity),
         points=points,
     )
 
 
-def sort_people(
-    path: Path,
-    view: str,
-    frames: Sequence[int],
-    found: Sequence[tuple[int, Float[np.ndarray, "K 3"]]],
-) -> Detections:
-    """Return one view's people, given as (frame number, joints) in any order, by frame.
+def _tracker_numbers(
+    number: Int[np.ndarray, " N"], identity: Int[np.ndarray, " N"]
+) -> Int[np.ndarray, " N"]:
+    """Return the numbers of people in one view's frames; all are -1 where no tracker gave them.
 
-    Raises GhptDataError for people of different numbers of joints, or too many of them.
+    1. A number that is twice in a frame is nobody's.
+    2. One number for everybody says nothing.
+    3. Numbers that count the people of each frame from 0 on change when somebody comes or goes.
     """
-    count = found[0][1].shape[0] if found else 0
-    for number, joints in found:
-        if joints.shape[0] != count:
-            problem = (
-                f"frame {number} has a person of {joints.shape[0]} joints, "
-                f"frame {found[0][0]} of {count}"
-            )
-            raise GhptDataError(path, "keypoints", problem, "Detect all frames with one model.")
-    numbers = np.array([number for number, _ in found], np.int64)
-    order = np.argsort(numbers, kind="stable")
-    people = np.unique(numbers, return_counts=True)[1]
-    check_people(path, "keypoints", int(people.max(initial=0)))
-    values = np.zeros((0, 0, 3))
-    if found:
-        values = np.stack([joints for _, joints in found])[order]
-    return detections_in_view(path, view, frames, numbers[order], values)
+    named = identity >= 0
+    pairs = np.stack([number, identity], 1)[named]
+    twice = len(np.unique(pairs, axis=0)) < len(pairs)
+    distinct = len(np.unique(identity[named]))
+    starts = np.flatnonzero(np.diff(number, prepend=-1))
+    place = np.arange(len(number)) - np.repeat(starts, np.diff(starts, append=len(number)))
+    leaves = len(np.unique(np.diff(starts, append=len(number)))) > 1
+    if twice or distinct < 2 or (leaves and (identity == place).all()):
+        return np.full(len(identity), -1)
+    return identity
 
 
 def merge_views(path: Path, found: Sequence[Detections], skeleton: str | None) -> Detections:
