@@ -66,9 +66,9 @@ def uncertainty(model: ErrorModel, rig: PlacedRig, scale: float, draws: int) -> 
     lasts = []
     for kind in model.kinds(draws, _SEED):
         step, residual = propagation(kind.draws)
-        moments.append(model.moments(residual, used).mean(-1))
+        moments.append(model.moments(residual[..., :draws], used).mean(-1))
         step = step.unflatten(0, (-1, 6))
-        of_rig.append(step @ step.mT / draws)
+        of_rig.append(step @ step.mT / step.shape[-1])
         lasts.append(kind.lasts)
     seen = model.moments(propagation.residual[..., None], used)[:, 0]
     variance = variances(seen, torch.stack(moments, dim=-1))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from lightning.fabric.loggers import TensorBoardLogger as EventsOnly
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger
 from tensorboard.summary.writer import event_file_writer
 
 from ghpt.files import errors_name
@@ -77,3 +77,19 @@ class ForgivingTensorBoard(TensorBoardLogger):
 
     save = _forgiving(EventsOnly.save)
     finalize = _forgiving(TensorBoardLogger.finalize)
+
+
+def mlflow(
+    save_dir: str, experiment_name: str, run_name: str | None, tracking_uri: str | None
+) -> MLFlowLogger:
+    """Return Lightning's logger for MLflow, which by default writes ``mlflow.db`` in ``save_dir``.
+
+    MLflow takes folders, Lightning's default, no longer.
+    """
+    database = (Path(save_dir) / "mlflow.db").resolve().as_posix()
+    return MLFlowLogger(
+        experiment_name=experiment_name,
+        run_name=run_name,
+        tracking_uri=tracking_uri or f"sqlite:///{database}",
+        save_dir=save_dir,
+    )
