@@ -67,7 +67,7 @@ def ours() -> dict[str, Method]:
     trajectory = build_estimator(wanted).predictor.trajectory
 
     def whole(batch: Observations, rate_hz: float) -> PoseEstimate:
-        return trajectory.at_rate(batch, rate_hz).fitted(batch).complete(batch)
+        return trajectory.at_rate(batch, rate_hz).fit_to(batch).complete(batch)
 
     return {
         "ghpt, adaptive RANSAC": lambda batch, rate_hz: frame(batch),

@@ -342,7 +342,7 @@ def _predict_person(
             views = about.camera_names
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
             course = sample_course(chunks(), len(sequence), limbs_of(about.joints))
-    evaluation, view_course = _evaluate(estimator, setup.compared, sequence, settings)
+    evaluation, view_course = _evaluate(estimator, predictor, setup.compared, sequence, settings)
     result = PredictionResult(
         data=sequence.title,
         source=sequence.source,
@@ -593,16 +593,17 @@ def _fit(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings
 
 def _evaluate(
     estimator: PoseEstimator,
+    predictor: Predictor,
     compared: Mapping[str, Estimator],
     sequence: Sequence,
     settings: PredictSettings,
 ) -> tuple[Evaluation, ViewCourse]:
     """Return what the estimators are worth on the 17 joints, or on all key points without them, and
-    the held-out errors of the prediction's own over time.
+    the held-out errors of the prediction's own over time. ``predictor``: fitted to the sequence.
     """
     judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
     sample = judged.read(judged.spread(settings.fitted_frames))
-    own = _fit(estimator, judged, settings)
+    own = predictor if judged is sequence else _fit(estimator, judged, settings)
     estimates: dict[str, Estimate] = {estimator.name: own.estimate}
     for name, other in compared.items():
         estimates.setdefault(name, other.fit_to(sample))
