@@ -119,7 +119,7 @@ def _draw_errors(
 def _column_means(views: ViewCourse, frames: tuple[float, float]) -> Float[np.ndarray, "C V"]:
     """Return the mean error in columns of the time; NaN where no frame was measured."""
     first, last = frames
-    count = max(1, min(120, len(views.frame) // 2))
+    count = max(1, min(200, len(views.frame)))
     column = ((views.frame - first) / (last - first) * count).astype(int).clip(0, count - 1)
     total = np.zeros((count, len(views.names)))
     measured = np.zeros_like(total)

@@ -30,8 +30,6 @@ _PANELS = {"from above": (0, 1), "from the side": (0, 2)}
 _NAMED = "from above"
 """Where cameras do not hide each other."""
 _SKELETONS = 6
-_TRACK = 200
-"""At most so many dots show where a person was."""
 _DEVIATIONS = 2.0
 """Standard deviations that an ellipse shows."""
 _MAGNIFICATIONS = (1, 10, 100)
@@ -213,12 +211,11 @@ def _draw_person(
     bones: Sequence[tuple[int, int]],
     colour: str,
 ) -> None:
-    """Draw the middle of the person in some frames, and a few skeletons."""
+    """Draw the middle of the person in every frame, and some skeletons."""
     frames = np.flatnonzero(estimated.any(1))
     if not len(frames):
         return
-    shown = frames[:: -(-len(frames) // _TRACK)]
-    middle = np.stack([np.median(points[t][estimated[t]], axis=0) for t in shown])
+    middle = np.stack([np.median(points[t][estimated[t]], axis=0) for t in frames])
     axes.plot(*middle.T, ".", color=colour, markersize=1.5)
     spread = np.linspace(0, len(frames) - 1, min(_SKELETONS, len(frames)))
     for t in frames[spread.astype(int)]:
