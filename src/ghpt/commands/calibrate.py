@@ -34,6 +34,7 @@ from ghpt.calibration.millimetres import (
 from ghpt.calibration.mistakes import SEVERAL_PEOPLE
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.uncalibrated import UncalibratedShifts
+from ghpt.calibration.uncertainty import LensErrors
 from ghpt.calibration.whose import one_person
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
@@ -162,6 +163,8 @@ class Case:
     """What other detectors found of the same recording."""
     intrinsics: str | None = None
     """What was estimated of the intrinsics, in words; None where they were given."""
+    lenses: LensErrors | None = None
+    """What is not known of them."""
 
     @property
     def reference_cameras(self) -> Cameras | None:
@@ -330,7 +333,7 @@ def _from_everybody(
     in the key points of all detectors; and who it was.
     """
     followed = (case.evidence,)
-    estimate = calibrate_people(calibration, followed, seed)
+    estimate = calibrate_people(calibration, followed, seed, lenses=case.lenses)
     cameras = case.evidence.cameras
     in_one_time = cameras.clock is None or cameras.clock.is_synchronised
     whole = estimate.converged and bool(estimate.calibrated.all())
@@ -342,7 +345,7 @@ def _from_everybody(
     people = pool_detectors([own, *(crowd.persons(found) for crowd in case.more)])
     if len(people) < 2:
         return followed, estimate
-    of_all = calibrate_people(calibration, people, seed)
+    of_all = calibrate_people(calibration, people, seed, lenses=case.lenses)
     if not bool(of_all.calibrated.all()):
         return followed, estimate
     return people, of_all
@@ -472,6 +475,7 @@ def with_intrinsics(settings: CalibrateSettings, case: Case, calibration: RigCal
         evidence=with_lenses(case.evidence, cameras),
         notes=notes,
         intrinsics=found.text,
+        lenses=found.errors,
     )
 
 
