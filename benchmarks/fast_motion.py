@@ -177,7 +177,7 @@ def main() -> None:
             one = recorded(in_the_room(motion), detector)
             batch, _ = remove_outliers(one.observations)
             found = {"RANSAC": frame(batch)}
-            fitted = trajectory.at_rate(batch, one.rate_hz).fitted(batch)
+            fitted = trajectory.at_rate(batch, one.rate_hz).fit_to(batch)
             found["trajectory"] = fitted.complete(batch)
             if not arguments.no_online:
                 longest = trajectory.longest_gap_s
