@@ -153,7 +153,7 @@ class Standing:
         self.rate_hz = rate_hz
         return self
 
-    def fitted(self, part: Observations) -> "Standing":
+    def fit_to(self, part: Observations) -> "Standing":
         return self
 
     def __call__(self, part: Observations) -> PoseEstimate:

@@ -27,7 +27,9 @@ from ghpt.report.tables import NONE
 _WANTED_DEG = 0.5
 """The standard deviation of a rotation that is asked for."""
 Matrix = list[list[float]]
-_CAPTION = "error: median reprojection; ±: standard deviation, for errors like those that the residuals show"
+_CAPTION = (
+    "error: median reprojection; ±: standard deviation, for errors as the residuals show them"
+)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ class Runs:
         for recording in observations.recording.unique():
             rows = observations.recording == recording
             part, _ = remove_outliers(observations.rows(rows))
-            fitted = trajectory.at_rate(part, self.rates_hz[int(recording)]).fitted(part)
+            fitted = trajectory.at_rate(part, self.rates_hz[int(recording)]).fit_to(part)
             parts.append(fitted(part))
         points = torch.cat([part.points for part in parts])
         return PoseEstimate(points, torch.cat([part.estimated for part in parts]))
