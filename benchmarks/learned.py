@@ -3,10 +3,10 @@
     python benchmarks/learned.py [--frames 240] [--split test] [data=h36m ...]
 
 Under each perturbation of the robustness curves (conf/reproduce.yaml) a row: the best classical
-estimator, the weighted key points alone, and with the scored joints, the estimator
-``frame_learned``: pelvis-relative MPJPE, mm, and the difference from the best classical one. Words
-with ``=`` are those of test.py; ``data=panoptic`` has the curve over the number of cameras. Ends
-with frames per second of processor time.
+estimator, ``frame_learned``, which weighs key points, and the same with ``joints=joint``, which
+scores joints on top: pelvis-relative MPJPE, mm, and the difference from the best classical one.
+Words with ``=`` are those of test.py; ``data=panoptic`` has the curve over the number of cameras.
+Ends with frames per second of processor time.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 
 import hydra
 import torch
@@ -23,6 +24,7 @@ from ghpt.config import CONF, build, plain, settings
 from ghpt.data.datasets.frames import Frames
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.models.estimators.classical import Estimator
+from ghpt.models.estimators.frame_learned import FrameLearned
 from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
 from ghpt.paper.engine.settings import Robustness
 from ghpt.paper.robustness.curve import PERTURBATIONS, Curve
@@ -87,18 +89,23 @@ def main() -> None:
     torch.set_num_threads(1)
     frames, estimators = draw_frames(arguments.words, arguments.split, arguments.frames)
     batch: Labelled[Observations, Truth] = frames[range(len(frames))]
-    both = estimators["frame_learned"]
-    learned = {"key points": type(both)(both.key_points, None), "with joints": both}
+    own = estimators["frame_learned"]
+    if not isinstance(own, FrameLearned):
+        raise TypeError("conf/baselines has no frame_learned")
+    learned = {
+        "key points": replace(own, joints=None),
+        "with joints": replace(own, joints="joint"),
+    }
     classical = {name: one for name, one in estimators.items() if name != "frame_learned"}
     print("| condition | best classical | key points | with joints |\n|" + "---|" * 4)
     data = next(word for word in arguments.words if word.startswith("data=")).removeprefix("data=")
     for name, perturbation in conditions(data):
-        observations = batch.observations
+        observations = replace(batch.observations, index=torch.from_numpy(frames.frames))
         if perturbation is not None:
             observations = perturbation(observations, 0)
         errors = {
-            own: mean_error(estimate(one, observations), batch.truth)
-            for own, one in classical.items()
+            rival: mean_error(estimate(one, observations), batch.truth)
+            for rival, one in classical.items()
         }
         best = min(errors, key=errors.__getitem__)
         cells = [f"{errors[best]:.2f} ({best})"]

@@ -26,6 +26,7 @@ from ghpt.models.loss import PrecisionLoss
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.weights import load_shipped
 from ghpt.observations import Labelled, PoseEstimate
+from ghpt.paper.robustness.perturbation import Outliers
 from ghpt.skeleton import JOINTS
 
 RANSAC = {"threshold": 0.02, "pairs": 24, "adapt": 5.0, "quantile": 0.55, "rounds": 4}
@@ -161,13 +162,13 @@ def test_shipped_weights_are_ahead_of_the_best_classical_estimator(labelled):
     assert learned < 0.9 * classical
 
 
-def test_scored_subsets_are_ahead_of_the_weighted_key_points(labelled):
-    median = {}
+def test_scored_subsets_are_ahead_of_the_weighted_key_points_where_many_are_wrong(labelled):
+    observations = Outliers(0.2, 0.1, 0.5)(labelled.observations, 0)
+    mean = {}
     for estimator in (LEARNED, BOTH):
-        poses = estimator(labelled.observations)
-        errors, counted = joint_errors(poses, labelled.truth, "relative")
-        median[estimator] = errors[counted].median().item()
-    assert median[BOTH] < 0.98 * median[LEARNED]
+        errors, counted = joint_errors(estimator(observations), labelled.truth, "relative")
+        mean[estimator] = errors[counted].mean().item()
+    assert mean[BOTH] < 0.96 * mean[LEARNED]
 
 
 def test_the_first_hypothesis_of_a_joint_is_the_context(joints):

@@ -35,7 +35,7 @@ from ghpt.calibration.mistakes import SEVERAL_PEOPLE
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.uncalibrated import UncalibratedShifts
 from ghpt.calibration.uncertainty import LensErrors
-from ghpt.calibration.whose import one_person
+from ghpt.calibration.whose import attach_views, one_person
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
@@ -53,13 +53,14 @@ from ghpt.commands.time import calibrate_people, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
 from ghpt.data.formats.names import Name
 from ghpt.data.people.detections import Detections
+from ghpt.data.people.matching import match_views
 from ghpt.data.people.persons import (
     detector_sequence,
     detector_sequences,
     tracks_of_views,
     with_lenses,
 )
-from ghpt.data.people.pooled import pool_detectors
+from ghpt.data.people.pooled import among_cameras, pool_detectors
 from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.errors import GhptDataError, check
@@ -133,8 +134,18 @@ class Crowd:
 
     def follow(self, cameras: CameraSet, calibration: RigCalibration, seed: int) -> Sequence:
         """Return one person, the same in all views, whose cameras need no extrinsics."""
-        tracks = tracks_of_views(self.people, cameras, self.match, self.views)
+        tracks = self.tracks(cameras)
         return one_person(tracks, calibration.pairs, calibration.noise, seed)
+
+    def among(self, cameras: CameraSet, placed: list[int]) -> list[Sequence]:
+        """Return everybody whom some calibrated cameras tell apart, the most visible first."""
+        at, _ = match_views(self.people.path, self.people.views, cameras, self.match, self.views)
+        views = [self.people.views[at[view]] for view in placed]
+        return detector_sequences(self.people, cameras.select(placed), self.match, views)
+
+    def tracks(self, cameras: CameraSet) -> list[Sequence]:
+        """Return those whom each view follows by itself."""
+        return tracks_of_views(self.people, cameras, self.match, self.views)
 
     def persons(self, cameras: CameraSet) -> list[Sequence]:
         """Return everybody whom calibrated cameras tell apart, the most visible first."""
@@ -336,6 +347,8 @@ def _from_everybody(
     estimate = calibrate_people(calibration, followed, seed, lenses=case.lenses)
     cameras = case.evidence.cameras
     in_one_time = cameras.clock is None or cameras.clock.is_synchronised
+    if case.crowd is not None and in_one_time:
+        estimate = _with_all_views(case.evidence, case.crowd, estimate, calibration, seed)
     whole = estimate.converged and bool(estimate.calibrated.all())
     alone = case.crowd is None and not case.more
     if alone or not in_one_time or not whole:
@@ -349,6 +362,31 @@ def _from_everybody(
     if not bool(of_all.calibrated.all()):
         return followed, estimate
     return people, of_all
+
+
+def _with_all_views(
+    evidence: Sequence,
+    crowd: Crowd,
+    estimate: RigEstimate,
+    calibration: RigCalibration,
+    seed: int,
+) -> RigEstimate:
+    """Return the rig with the views that the person who was followed does not link to the others,
+    each linked by whomever it shows; the same rig if nobody does.
+    """
+    placed = _indices(estimate.calibrated)
+    missing = _indices(~estimate.calibrated)
+    if len(placed) < 2 or not missing:
+        return estimate
+    cameras = evidence.cameras.with_cameras(estimate.cameras)
+    found = [among_cameras(person, evidence) for person in crowd.among(cameras, placed)]
+    if not found:
+        return estimate
+    tracks = crowd.tracks(evidence.cameras)
+    pairs = calibration.pairs
+    people = attach_views(found, tracks, missing, pairs, calibration.noise, seed)
+    tried = calibrate_people(calibration, people, seed)
+    return tried if int(tried.calibrated.sum()) > len(placed) else estimate
 
 
 def _halves(

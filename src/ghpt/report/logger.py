@@ -9,6 +9,7 @@ from typing import Any
 
 from lightning.fabric.loggers import TensorBoardLogger as EventsOnly
 from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from tensorboard.summary.writer import event_file_writer
 
 from ghpt.files import errors_name
@@ -70,6 +71,7 @@ class ForgivingTensorBoard(TensorBoardLogger):
         shown = {name: value for name, value in metrics.items() if name != "epoch"}
         super().log_metrics(shown, step)
 
+    @rank_zero_only
     @_forgiving
     def log_hyperparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
         """Write the run's row of hyper-parameters beside its metrics, which are curves already."""

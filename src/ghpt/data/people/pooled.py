@@ -35,6 +35,14 @@ def pool_detectors(detectors: Items[Items[Sequence]]) -> tuple[Sequence, ...]:
     return tuple(pooled)
 
 
+def among_cameras(sequence: Sequence, first: Sequence) -> Sequence:
+    """Return a sequence among the frames and cameras of another: nothing is seen in its others."""
+    count = len(sequence.skeleton)
+    undistorted = _placed(sequence.undistorted(), sequence, first, 0, count)
+    raw = _placed(sequence.detected(), sequence, first, 0, count)
+    return replace(first, points=KeyPointArrays(undistorted, raw), skeleton=sequence.skeleton)
+
+
 def _union(skeletons: Items[Skeleton]) -> Skeleton:
     count = sum(len(each) for each in skeletons)
     first = skeletons[0]

@@ -18,7 +18,7 @@ RANKS = (2, 5, 8, 12)
 """The neighbours of a hypothesis among the others of its joint whose distances are seen."""
 _ENDS = 4
 """The most bones that meet in a joint."""
-SIZE = 16 + len(RANKS) + 2 * _ENDS
+SIZE = 16 + len(RANKS) + 2 * _ENDS + 3 * len(JOINTS)
 """D, the number of features."""
 
 Points = Float[Tensor, "B S J 3"]
@@ -51,11 +51,13 @@ def featurize(points: Points, context: PoseEstimate) -> Float[Tensor, "B S J D"]
         log_length(own.norm(dim=-1)),
         *_signed_log(common).expand_as(moved).unbind(-1),
         log_length(common.norm(dim=-1)).expand(moved.shape[:-1]),
-        *_crowd(local, unit),
+        *_crowd(moved),
         *_bones(local, pose, estimated, unit),
         _is_context(moved),
     ]
-    stacked = torch.stack(features, dim=-1)
+    around = (3 * UNIT * (pose @ axes.mT) / unit[:, None, None]).flatten(1)
+    everywhere = around[:, None, None].expand(*moved.shape[:-1], -1)
+    stacked = torch.cat((torch.stack(features, dim=-1), everywhere), dim=-1)
     return torch.where(estimated[:, None, :, None], stacked, 0.0)
 
 
@@ -75,20 +77,17 @@ def _common(
     return masked.nanmedian(2, keepdim=True).values.nan_to_num(0.0)
 
 
-def _crowd(local: Points, unit: Float[Tensor, " B"]) -> list[PerHypothesis]:
+def _crowd(moved: Float[Tensor, "B S J 3"]) -> list[PerHypothesis]:
     """Return how far each hypothesis is from the others of its joint.
 
     Logarithms of the distances from the ``RANKS``-th nearest and from the median of all, and the
     median distance from the mean.
     """
-    scale = unit[:, None, None]
-    joints_first = local.transpose(1, 2)
-    between = torch.cdist(joints_first, joints_first) / scale[..., None]
-    near = between.sort(-1).values.transpose(1, 2)
+    joints_first = moved.transpose(1, 2)
+    near = torch.cdist(joints_first, joints_first).sort(-1).values.transpose(1, 2)
     ranked = [log_length(near[..., min(rank, near.shape[-1] - 1)]) for rank in RANKS]
-    middle = local.median(1, keepdim=True).values
-    off = log_length((local - middle).norm(dim=-1) / scale)
-    distance = (local - local.mean(1, keepdim=True)).norm(dim=-1) / scale
+    off = log_length((moved - moved.median(1, keepdim=True).values).norm(dim=-1))
+    distance = (moved - moved.mean(1, keepdim=True)).norm(dim=-1)
     spread = log_length(distance.median(1, keepdim=True).values)
     return [*ranked, off, spread.expand_as(off)]
 
