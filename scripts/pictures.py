@@ -181,16 +181,20 @@ def main() -> None:
     parser.add_argument("--walk", action="store_true", help="draw the animation alone")
     options = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
-    pictures = {"walk.svg": draw_walk()}
+    _keep("walk.svg", draw_walk())
     if not options.walk:
-        pictures |= dict(draw_reports())
-    for name, picture in pictures.items():
-        (FOLDER / name).write_text(picture, encoding="utf-8")
+        for name, picture in draw_reports():
+            _keep(name, picture)
+
+
+def _keep(name: str, picture: str) -> None:
+    """Write a picture and the digest of the code that made it."""
+    (FOLDER / name).write_text(picture, encoding="utf-8")
     known = {}
     with contextlib.suppress(FileNotFoundError):
         known = json.loads(DIGESTS.read_text(encoding="utf-8"))
-    current = {name: digest for name, digest in digests().items() if name in pictures}
-    DIGESTS.write_text(json.dumps(known | current, indent=2) + "\n", encoding="utf-8")
+    known[name] = digests()[name]
+    DIGESTS.write_text(json.dumps(known, indent=2) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -401,7 +401,7 @@ run(Path({conf!r}), ghpt.commands.predict.COMMAND)
 
 
 @pytest.mark.posix
-@pytest.mark.parametrize(("limit", "file"), [(9_000, "000000.npz"), (25_000, "poses.npz")])
+@pytest.mark.parametrize(("limit", "file"), [(15_000, "000000.npz"), (25_000, "poses.npz")])
 def test_a_full_disk_is_named_and_the_next_run_goes_on(tmp_path, limit, file):
     given = [
         *QUICK,
