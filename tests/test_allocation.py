@@ -16,6 +16,8 @@ from predicting import CONF, QUICK
 from reconstructions import random_reconstruction
 from test_predict import points_file, result, words
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 SIZE = 3_000_001
 LIMIT = 20_000
 """Bytes of a file: less than the positions of 90 frames take."""

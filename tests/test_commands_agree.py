@@ -22,6 +22,8 @@ from ghpt.skeleton import MIRROR
 from predicting import config
 from test_verdict import NAMES, RIG, late, pixels, points_file
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 OF_THE_RESULT = ("left_out_error", "few_views_agree", "rejected")
 """What predict.py says of its own result."""
 QUICK = ("camera_check.clean=0.004", "camera_check.frames=24", "camera_check.shift=12")

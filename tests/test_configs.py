@@ -17,7 +17,7 @@ def choices(group: str) -> list[str]:
 
 def test_the_groups_hold_the_issue_s_choices():
     assert {"cmu1", "cmu2", "cmu3", "cmu4", "h36m"} <= set(choices("data"))
-    assert choices("model") == ["camera", "key_points", "pose"]
+    assert choices("model") == ["camera", "joint", "key_points", "pose"]
     assert choices("experiment") == [
         "coordinates_only",
         "lengths_only",

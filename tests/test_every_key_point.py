@@ -21,6 +21,8 @@ from ghpt.skeleton import JOINT, JOINTS
 from predicting import cameras_file, config, numbers_of, walk
 from reconstructions import about, in_parts, random_reconstruction
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 HALPE = SKELETONS["halpe_26"]
 FRAMES = 30
 HEAD = ("left_eye", "right_eye", "left_ear", "right_ear")

@@ -32,6 +32,8 @@ from predicting import config, numbers_of, walk
 from reconstructions import about, in_parts, random_reconstruction
 from test_predict import PIXELS, checkpoint, points_file
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 FRAMES = 6
 METRE = 1000.0
 """mm."""

@@ -12,6 +12,7 @@ from ghpt.calibration.focal import (
     FocalLengths,
     _linearise,
     _residual,
+    lens_errors,
     seen_by,
     state_of,
     without,
@@ -163,3 +164,20 @@ def test_an_image_size_that_is_none_is_refused(words):
 def test_another_word_for_the_focal_lengths_is_refused():
     with pytest.raises(GhptConfigError, match="some"):
         build(calibrate_settings("intrinsics.focal=some").intrinsics, "intrinsics")
+
+
+def test_the_rig_is_known_less_where_its_focal_lengths_are(walk):
+    rig = cameras(1150.0)
+    pixels = shown(walk[::2], rig, 2.0)
+    valid = torch.ones(pixels.shape[:3], dtype=torch.bool)
+    settings = calibrate_settings("calibration.frames=30")
+    calibration: RigCalibration = build(settings.calibration, "calibration")
+    every = FocalLengths.EACH
+    errors = lens_errors(every, torch.full((4,), 0.02).double(), torch.full((4,), 0.01).double())
+    names = ("a", "b", "c", "d")
+    given = (names, rig.K, pixels, valid.double(), valid, SIZE.repeat(4, 1), 0)
+    known = calibration(*given).rotation_std_deg
+    unknown = calibration(*given, lenses=errors).rotation_std_deg
+    assert (unknown > known).all()
+    # principal points off by 0.01 focal lengths turn cameras by as many radians at most
+    assert float(unknown.max()) < float(known.max()) + 1.2

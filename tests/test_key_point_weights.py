@@ -1,4 +1,6 @@
-"""The weight of each key point: features, network, training, and the weights that ship."""
+"""The weight of each key point, and of each joint's hypotheses: features, network, training, and
+the weights that ship.
+"""
 
 from dataclasses import replace
 from functools import partial
@@ -10,20 +12,26 @@ import torch
 from ghpt.data.datasets.frames import Frames
 from ghpt.data.synthetic.random_recordings import VIEWS, random_recordings
 from ghpt.errors import GhptConfigError
+from ghpt.geometry.rotations import vector_to_matrix
+from ghpt.metrics.pose_error import joint_errors
 from ghpt.models.estimators.classical import Linear
 from ghpt.models.estimators.frame_learned import FrameLearned
 from ghpt.models.estimators.ransac import AdaptiveRansac
+from ghpt.models.joint.features import featurize
+from ghpt.models.joint.problem import JointSubsets
 from ghpt.models.key_points.features import NAMES
 from ghpt.models.key_points.problem import KeyPointWeights
 from ghpt.models.key_points.scorer import KeyPointScorer
 from ghpt.models.loss import PrecisionLoss
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.weights import load_shipped
-from ghpt.observations import Labelled
+from ghpt.observations import Labelled, PoseEstimate
+from ghpt.paper.robustness.perturbation import Outliers
 from ghpt.skeleton import JOINTS
 
 RANSAC = {"threshold": 0.02, "pairs": 24, "adapt": 5.0, "quantile": 0.55, "rounds": 4}
-LEARNED = FrameLearned("key_points", trust=0.5)
+LEARNED = FrameLearned("key_points", joints=None)
+BOTH = FrameLearned("key_points", joints="joint")
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +41,13 @@ def labelled():
     return Frames(recordings, np.arange(72))[range(72)]
 
 
+@pytest.fixture(scope="module")
+def joints(labelled):
+    """Hypotheses of the joints of a few frames."""
+    observations = labelled.observations.rows(slice(0, 40))
+    return JointSubsets("key_points").generate(observations, 12, observations.index)
+
+
 @pytest.fixture
 def model():
     def adam(parameters):
@@ -40,7 +55,7 @@ def model():
 
     return StochasticEstimator(
         problem=KeyPointWeights(**RANSAC),
-        scorer=lambda size: KeyPointScorer(size, width=16, clip=8.0),
+        scorer=lambda size: KeyPointScorer(size, width=16, clip=8.0, limit=None),
         loss=PrecisionLoss(alpha=0.05, gamma=1.0),
         optimizer=adam,
         hypotheses=1,
@@ -109,8 +124,8 @@ def test_weights_do_not_depend_on_the_order_of_the_views(labelled):
 
 def test_a_frame_has_the_same_points_in_any_batch(labelled):
     observations = labelled.observations.rows(slice(0, 30))
-    together = LEARNED(observations).points
-    alone = torch.cat([LEARNED(observations.rows(slice(i, i + 1))).points for i in range(30)])
+    together = BOTH(observations).points
+    alone = torch.cat([BOTH(observations.rows(slice(i, i + 1))).points for i in range(30)])
     torch.testing.assert_close(together, alone, atol=0.01, rtol=0)
 
 
@@ -147,14 +162,54 @@ def test_shipped_weights_are_ahead_of_the_best_classical_estimator(labelled):
     assert learned < 0.9 * classical
 
 
+def test_scored_subsets_are_ahead_of_the_weighted_key_points_where_many_are_wrong(labelled):
+    observations = Outliers(0.2, 0.1, 0.5)(labelled.observations, 0)
+    mean = {}
+    for estimator in (LEARNED, BOTH):
+        errors, counted = joint_errors(estimator(observations), labelled.truth, "relative")
+        mean[estimator] = errors[counted].mean().item()
+    assert mean[BOTH] < 0.96 * mean[LEARNED]
+
+
+def test_the_first_hypothesis_of_a_joint_is_the_context(joints):
+    assert joints.points.shape[:2] == (40, 13)
+    torch.testing.assert_close(joints.points[:, 0], joints.context.points)
+
+
+def test_joints_are_scored_in_any_world_alike(joints):
+    """The scorer sees people in 3D: where the world's zero and axes are is nothing to it."""
+    angle = torch.tensor([0.3, -1.1, 0.4], dtype=torch.float64)
+    R = vector_to_matrix(angle)
+    shift = torch.tensor([3000.0, -500.0, 900.0], dtype=torch.float64)
+    context = PoseEstimate(joints.context.points @ R.mT + shift, joints.context.estimated)
+    trunk = joints.context.estimated.all(-1)
+    here = featurize(joints.points, joints.context)[trunk]
+    there = featurize(joints.points @ R.mT + shift, context)[trunk]
+    assert trunk.sum() > 20
+    torch.testing.assert_close(here, there, atol=0.02, rtol=0)
+
+
+def test_a_joint_is_the_average_of_its_hypotheses_by_their_share(joints):
+    problem = JointSubsets("key_points")
+    shape = joints.points.shape[1:3]
+    weights = torch.zeros(40, *shape)
+    weights[:, 5] = 1e-3
+    chosen = problem.aggregate(joints, weights.flatten(1))
+    torch.testing.assert_close(chosen.points, joints.points[:, 5])
+    equal = problem.aggregate(joints, torch.ones(40, *shape).flatten(1))
+    torch.testing.assert_close(equal.points, joints.points.mean(1))
+    none = problem.aggregate(joints, torch.zeros(40, *shape).flatten(1))
+    torch.testing.assert_close(none.points, joints.context.points)
+
+
 def test_a_joint_of_one_view_is_not_estimated(labelled):
     observations = labelled.observations
     only = observations.valid & (torch.arange(VIEWS) == 0)[:, None]
-    assert not LEARNED(replace(observations, valid=only)).estimated.any()
+    assert not BOTH(replace(observations, valid=only)).estimated.any()
 
 
 def test_no_frames_give_no_poses(labelled: Labelled):
-    assert LEARNED(labelled.observations.rows(slice(0, 0))).points.shape == (0, len(JOINTS), 3)
+    assert BOTH(labelled.observations.rows(slice(0, 0))).points.shape == (0, len(JOINTS), 3)
 
 
 def test_an_unknown_name_of_weights_is_refused():

@@ -8,23 +8,28 @@ import torch
 
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.rotations import is_rotation, matrix_to_vector
-from ghpt.models.estimators.classical import person_scale
+from ghpt.models.estimators.classical import Linear, person_scale
 from ghpt.observations import Observations
 from ghpt.paper.robustness.perturbation import (
     FewerCameras,
+    FlippedViews,
     MissingDetections,
     MissingViews,
     Noise,
+    OtherPeople,
     Outliers,
     Perturbation,
     RotatedCameras,
     ShiftedCameras,
 )
+from ghpt.skeleton import PELVIS
 from scenes import random_scene
 
 SEED = 3
 NOTHING = {
     "outliers": Outliers(0.0, 0.1, 0.5),
+    "flips": FlippedViews(0.0, 5),
+    "people": OtherPeople(0.0, 5, 400, 1500),
     "noise": Noise(0.0),
     "detections": MissingDetections(0.0),
     "views": MissingViews(0),
@@ -33,6 +38,9 @@ NOTHING = {
 }
 SOMETHING = {
     "outliers": Outliers(0.3, 0.1, 0.5),
+    "lasting": Outliers(0.3, 0.1, 0.5, frames=5),
+    "flips": FlippedViews(0.3, 5),
+    "people": OtherPeople(0.3, 5, 400, 1500),
     "noise": Noise(0.02),
     "detections": MissingDetections(0.3),
     "views": MissingViews(2),
@@ -47,7 +55,8 @@ def a_batch(frames: int = 40, views: int = 5) -> Observations:
     scene = random_scene(0, frames, views)
     valid = torch.rand(frames, views, 17, generator=torch.Generator().manual_seed(1)) > 0.1
     batch = scene.batch(valid)
-    return replace(batch, key_points=torch.where(valid[..., None], batch.key_points, -7.0))
+    key_points = torch.where(valid[..., None], batch.key_points, -7.0)
+    return replace(batch, key_points=key_points, recording=torch.arange(frames))
 
 
 def tensors(batch: Observations) -> dict[str, torch.Tensor]:
@@ -103,6 +112,33 @@ def test_outliers_are_as_many_and_as_far_as_asked_and_nested() -> None:
         assert distance[batch.valid][hit].mean().item() == pytest.approx(0.3, abs=0.01)
     less = off[0.1] > 0
     assert torch.equal(off[0.2][less], off[0.1][less])
+
+
+@pytest.mark.parametrize("name", ["lasting", "flips", "people"])
+def test_what_lasts_is_the_same_in_successive_frames(name: str) -> None:
+    batch = replace(a_batch(), valid=torch.ones(40, 5, 17, dtype=torch.bool))
+    hit = (SOMETHING[name](batch, SEED).key_points != batch.key_points).any(-1)
+    by_block = hit.unflatten(0, (8, 5))
+    assert (by_block == by_block[:, :1]).double().mean() > 0.99
+    assert by_block.any(-1).double().mean() > 0.1
+    assert not (by_block == by_block[:1]).all()
+
+
+def test_all_views_show_the_same_other_person_as_far_away_as_asked() -> None:
+    scene = random_scene(0, 20, 5)
+    batch = scene.batch(torch.ones(20, 5, 17, dtype=torch.bool))
+    changed = OtherPeople(1.0, 1, 400, 1500)(batch, SEED)
+    before = Linear().triangulate(batch)
+    after = Linear().triangulate(changed)
+    both = before.ok & after.ok
+    assert both.double().mean() > 0.5
+    offset = (after.points - before.points)[:, PELVIS]
+    distance = offset[both[:, PELVIS], :2].norm(dim=-1)
+    assert distance.min() > 399
+    assert distance.max() < 1501
+    torch.testing.assert_close(
+        offset[both[:, PELVIS], 2], torch.zeros_like(distance), atol=1.0, rtol=0
+    )
 
 
 def test_noise_has_the_deviation_asked_in_each_coordinate_and_only_grows() -> None:

@@ -17,6 +17,8 @@ from ghpt.export import read_reconstruction
 from ghpt.geometry.cameras import project
 from predicting import cameras_file, config, walk, write_people
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 FRAMES = 16
 WORDS = ("rate_hz=50", "estimator=linear", "formats=[npz,html]")
 

@@ -109,7 +109,7 @@ def of_conf() -> dict[str, dict[str, Any]]:
         groups = {"experiment": "experiment", "scale_of_t": "scale_of_t@model.problem.scale"}
         group = "scale_of_t" if model == "camera" else "experiment"
         choices = sorted(path.stem for path in (CONF / group).glob("*.yaml"))
-        if model == "key_points":  # the experiments are of the paper's models
+        if model in ("joint", "key_points"):  # the experiments are of the paper's models
             choices = []
         for choice in (None, *choices):
             words = (f"model={model}", *([f"{groups[group]}={choice}"] if choice else []))

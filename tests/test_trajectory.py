@@ -213,6 +213,21 @@ def test_a_cut_parts_the_recording(predictor, batch):
     assert float((part.points[:65] - first.points).norm(dim=-1).mean()) < 3
 
 
+def test_a_person_who_is_suddenly_elsewhere_is_followed(predictor, batch, truth):
+    """The rig moves instead: a cut that frame numbers do not show."""
+    offset = torch.zeros(FRAMES, 3, dtype=torch.float64)
+    offset[65:, 0] = 700.0
+    cameras = batch.cameras
+    moved = Cameras(
+        cameras.K, cameras.R, cameras.t - torch.einsum("tvij,tj->tvi", cameras.R, offset)
+    )
+    part = predict(predictor, Source(replace(batch, cameras=moved)))
+    near = slice(60, 70)
+    distance = (part.points - truth - offset[:, None])[near].norm(dim=-1)
+    assert (part.state[near] == State.OBSERVED).all()
+    assert float(distance.mean()) < 30
+
+
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_a_few_frames_are_enough(predictor, batch, truth, count):
     part = predict(predictor, Source(batch.rows(slice(0, count)), rate_hz=None))

@@ -15,6 +15,7 @@ import pytest
 import torch
 from hydra.core.override_parser.overrides_parser import OverridesParser
 
+import sizes
 from composed import cameras_settings, compose
 from ghpt.calibration.check.units import unit_for, unit_of
 from ghpt.commands.cameras import CamerasSettings, check_cameras
@@ -31,6 +32,8 @@ from ghpt.geometry.cameras import Cameras, CameraSet, project
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import cameras_file, config, numbers_of, walk
 from single_person import SinglePerson, write_person
+
+pytestmark = pytest.mark.usefixtures("blank_figures")
 
 RIG = human36m_rig("S9")
 QUICKLY = (
@@ -135,7 +138,7 @@ def test_an_upper_body_is_good_and_measured_by_its_arms(tmp_path):
     assert 1650 < numbers["stature_mm"] < 2000
 
 
-@pytest.mark.parametrize("unit_mm", [1.0, 10.0, 1000.0])
+@pytest.mark.parametrize("unit_mm", sizes.representatives([1000.0], [1.0, 10.0]))
 def test_the_person_tells_the_unit_of_a_file_that_does_not_say_it(unit_mm, tmp_path):
     numbers = judged(tmp_path, pixels(), rig_file(tmp_path / "rig.toml", unit_mm))
     assert numbers["unit_mm"] == unit_mm

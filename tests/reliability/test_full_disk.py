@@ -23,6 +23,8 @@ from predicting import sequence_of
 from reconstructions import random_reconstruction
 from toy_tasks import task
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 resource = pytest.importorskip("resource", reason="limits the size of files")
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = (

@@ -19,6 +19,8 @@ from ghpt.reconstruction import About, State
 from ghpt.skeleton import JOINTS
 from predicting import walk
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 ezc3d = pytest.importorskip("ezc3d", reason="ezc3d reads C3D; it comes with ghpt[test]")
 
 T, V, J = 40, 4, len(JOINTS)

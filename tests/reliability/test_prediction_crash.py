@@ -17,6 +17,8 @@ from ghpt.commands import predict as command
 from ghpt.commands.prediction.shards import MANIFEST
 from predicting import config, sequence_of
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 OUTPUTS = ("poses.npz", "poses.csv", "poses.trc", "prediction.json", "report.md")
 
 

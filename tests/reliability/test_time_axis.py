@@ -20,6 +20,8 @@ from ghpt.geometry.cameras import project
 from ghpt.reconstruction import State
 from predicting import cameras_file, config, openpose_folders, walk, write_people
 
+pytestmark = pytest.mark.usefixtures("blank_figures")
+
 FRAMES = list(range(3, 15))
 WORDS = ("skeleton=human36m", "estimator=linear", "formats=[npz]", "rate_hz=50")
 PIXELS = project(human36m_rig("S9").cameras, walk())[0]

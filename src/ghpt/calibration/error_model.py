@@ -25,12 +25,18 @@ _NEIGHBOURS = 0.42
 """Statures within which the correlation of key points' errors falls by e: that of detectors in the
 field (conf/detector/field.yaml: 0.62 a bone).
 """
+_ALIKE = 0.6
+"""The correlation of the lasting errors of two detectors that see the same key point: 0.4 to 0.77
+of OpenPose and BlazePose on one recording.
+"""
 _SIDE_DEGREES = 30.0
 """Turn of the body within which what depends on the side seen is forgotten (the same file)."""
 _WAVES = 32
 """Of a random function of the side seen."""
 _SECTORS = 12
 """Into which the sides seen are cut to measure what depends on them."""
+_MORE_DRAWS = 4
+"""Of errors that last, over those of others."""
 _LONGER = 4.0
 """Ratio of successive correlation times."""
 _ROWS = 60
@@ -73,11 +79,10 @@ class ErrorModel:
         """Return the model of a rig's points; ``frame``: the number of each used frame; ``axes``:
         of each row's body, columns; ``stature``: of the people, in the rig's unit.
         """
-        points = _points_of_rows(observed, rig)
-        sample = points[:: max(1, len(points) // _ROWS)]
-        distance = (sample[:, :, None] - sample[:, None]).norm(dim=-1).nanmedian(0).values
-        distance = distance.nan_to_num(torch.inf).fill_diagonal_(0.0)
-        values, vectors = torch.linalg.eigh(torch.exp(-distance / (_NEIGHBOURS * stature)))
+        points = _table(observed, rig, observed.row)
+        together = _table(observed, rig, observed.frame)
+        kernel = _ALIKE * _kernel(together, stature) + (1 - _ALIKE) * _kernel(points, stature)
+        values, vectors = torch.linalg.eigh(kernel)
         middle = points.nanmean(1).nan_to_num(0.0)
         ray = torch.nn.functional.normalize(rig.centre[:, None] - middle, dim=-1)
         return cls(
@@ -99,7 +104,9 @@ class ErrorModel:
         return [longest / _LONGER**power for power in range(count)]
 
     def kinds(self, count: int, seed: int) -> Iterator[ErrorKind]:
-        """Yield all kinds, with ``count`` draws of each."""
+        """Yield all kinds, with ``count`` draws of each; of those that last with more, because few
+        numbers make them up.
+        """
         generator = torch.Generator().manual_seed(seed)
         normal = partial(torch.randn, generator=generator, dtype=torch.float64)
         white = normal(len(self.mixing), len(self.frame), len(self.side), 2, count)
@@ -108,12 +115,14 @@ class ErrorModel:
             lasting = _lasting(white, self.frame, time)
             yield ErrorKind(False, self._at_points(lasting))
             yield ErrorKind(False, self._at_points(self._shared(lasting)))
-        static = self._shared(white[:, :1])
-        yield ErrorKind(True, self._at_points(static.expand(white.shape)))
+        more = _MORE_DRAWS * count
+        static = self._shared(normal(len(self.mixing), 1, len(self.side), 2, more))
+        static = static.expand(-1, len(self.frame), -1, -1, -1)
+        yield ErrorKind(True, self._at_points(static))
         frequency = normal(3, _WAVES) / (2.0 * math.sin(math.radians(_SIDE_DEGREES) / 2.0))
         phase = 2.0 * math.pi * torch.rand(_WAVES, generator=generator, dtype=torch.float64)
         wave = (2.0 / _WAVES) ** 0.5 * torch.cos(self.side @ frequency + phase)
-        amplitude = normal(len(self.mixing), _WAVES, 2, count)
+        amplitude = normal(len(self.mixing), _WAVES, 2, more)
         series = torch.tensordot(wave, self._shared(amplitude), dims=([2], [1]))
         yield ErrorKind(True, series[:, self.observed.row, self.observed.joint])
 
@@ -184,11 +193,20 @@ def _lasting(
     return series
 
 
-def _points_of_rows(observed: Correspondences, rig: PlacedRig) -> Float[Tensor, "R J 3"]:
+def _table(
+    observed: Correspondences, rig: PlacedRig, row: Int[Tensor, " N"]
+) -> Float[Tensor, "R J 3"]:
     """Return the points of each row's key points; NaN where there are none."""
-    rows = int(observed.row.max()) + 1
     joints = int(observed.joint.max()) + 1
-    points = torch.full((rows, joints, 3), torch.nan, dtype=torch.float64)
+    points = torch.full((int(row.max()) + 1, joints, 3), torch.nan, dtype=torch.float64)
     known = rig.inlier.any(0)
-    points[observed.row[known], observed.joint[known]] = rig.points[known]
+    points[row[known], observed.joint[known]] = rig.points[known]
     return points
+
+
+def _kernel(points: Float[Tensor, "R J 3"], stature: float) -> Float[Tensor, "J J"]:
+    """Return the correlations of key points' errors; none of those that no row has together."""
+    sample = points[:: max(1, len(points) // _ROWS)]
+    distance = (sample[:, :, None] - sample[:, None]).norm(dim=-1).nanmedian(0).values
+    distance = distance.nan_to_num(torch.inf).fill_diagonal_(0.0)
+    return torch.exp(-distance / (_NEIGHBOURS * stature))

@@ -15,11 +15,17 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from ghpt.calibration.normal_matrix import precondition
-from ghpt.errors import check, check_positive
+from ghpt.calibration.error_model import ErrorModel
+from ghpt.calibration.independence import turning
+from ghpt.calibration.normal_matrix import Derivatives, precondition
+from ghpt.calibration.observations import Correspondences
+from ghpt.calibration.resection import PlacedRig
+from ghpt.calibration.uncertainty import LensErrors, Propagation, curvature, error_steps
+from ghpt.errors import check_positive
 from ghpt.geometry.cameras import camera_centre
 from ghpt.geometry.epipolar import cross_matrix, normalise
 from ghpt.geometry.rotations import vector_to_matrix
+from ghpt.models.relative_pose.scale import stature
 
 _EXTRINSICS = 6
 _FOCAL = 6
@@ -90,21 +96,19 @@ class FocalAdjustment:
 
     ``loss_scale``: of the Cauchy loss, in standard deviations of the key points. ``rounds``:
     adjustments, each with the noise that the one before has shown. ``iterations``: most steps of a
-    round. ``blocks``, ``joint_groups``: of time and of joints that are left out in turn, for the
-    uncertainty. ``principal_point``: what the principal points of all cameras may be off by alike,
-    in the longer side of the image; it adds to the uncertainty.
+    round. ``draws``: of each kind of error, for the uncertainty. ``principal_point``: what the
+    principal points of all cameras may be off by alike, in the longer side of the image; it adds to
+    the uncertainty.
     """
 
     loss_scale: float
     rounds: int
     iterations: int
-    blocks: int
-    joint_groups: int
+    draws: int
     principal_point: float
 
     def __post_init__(self) -> None:
         check_positive(**vars(self))
-        check(self.blocks > 1, "blocks", f"is {self.blocks}", "Give 2 or more.")
 
     @torch.no_grad()
     def __call__(
@@ -177,35 +181,70 @@ class FocalAdjustment:
         chosen: Float[Tensor, "P Q"],
         centre_std: Float[Tensor, " V"],
     ) -> Float[Tensor, " V"]:
-        """Return relative standard deviations: errors that last as long as a block of time, those
-        that belong to a joint, and the principal point's, added in squares.
+        """Return relative standard deviations: what errors like the residuals do, and principal
+        points that are not at the centre.
         """
         system = _linearise(seen, state, noise, self.loss_scale)
         views = len(seen.u)
         focal = torch.arange(views) * _PARAMETERS + _FOCAL
-        frames = int(seen.frame.max()) + 1
-        joints = int(seen.joint.max()) + 1
-        by_time = seen.frame * self.blocks // frames
-        by_joint = seen.joint * self.joint_groups // joints
-        variance = torch.zeros(views, dtype=torch.float64)
-        full, _ = system.reduce(torch.ones_like(seen.frame, dtype=torch.bool))
-        matrix = chosen.mT @ full @ chosen
-        for group in (by_time, by_joint):
-            steps = []
-            for number in group.unique().tolist():
-                own, gradient = system.reduce(group == number)
-                rest = matrix - chosen.mT @ own @ chosen
-                steps.append((chosen @ _solve(rest, chosen.mT @ gradient))[focal])
-            sample = torch.stack(steps)
-            count = len(sample)
-            variance += (sample - sample.mean(0)).square().mean(0) * (count - 1)
+        matrix, _ = system.reduce(torch.ones_like(seen.frame, dtype=torch.bool))
+        inverse = chosen @ _inverse_of_scaled(chosen.mT @ matrix @ chosen) @ chosen.mT
+        cross = torch.einsum("vnri,vnrj->nvij", system.by_view, system.by_point).flatten(1, 2)
+        length = system.residual.norm(dim=-1) / system.root.clamp(min=_LEAST)
+        propagation = Propagation(
+            slopes=Derivatives(system.root, system.by_view, system.by_point),
+            inverse=inverse,
+            cross=cross,
+            eliminated=cross @ system.inverse,
+            points=system.inverse,
+            residual=system.residual,
+            curvature=curvature(length, system.root.square(), self.loss_scale),
+        )
+        steps, _ = error_steps(_error_model(seen, state, noise), propagation, self.draws)
         at_centre = torch.arange(views)[:, None] * _PARAMETERS + _CENTRE + torch.arange(2)
-        columns = full[:, at_centre.flatten()]
-        moved = torch.stack([_solve(matrix, column) for column in (chosen.mT @ columns).T])
-        by_centre = (moved @ chosen.mT)[:, focal] * centre_std.repeat_interleave(2)[:, None]
-        common = by_centre.unflatten(0, (-1, 2)).sum(0)
-        own = _OWN * by_centre
-        return (variance + common.square().sum(0) + own.square().sum(0)).sqrt()
+        by_centre = (inverse @ matrix[:, at_centre.flatten()])[focal]
+        by_centre = by_centre * centre_std.repeat_interleave(2)
+        common = by_centre.unflatten(1, (-1, 2)).sum(1)
+        parts = (steps[focal], common, _OWN * by_centre)
+        return torch.cat(parts, dim=-1).norm(dim=-1)
+
+
+def _error_model(seen: View3D, state: Lenses, noise: Float[Tensor, " V"]) -> ErrorModel:
+    frames = int(seen.frame.max()) + 1
+    observed = Correspondences(
+        xy=seen.u,
+        noise=noise[:, None].expand_as(seen.valid),
+        valid=seen.valid,
+        frame=seen.frame,
+        joint=seen.joint,
+        row=seen.frame,
+    )
+    t = -(state.R @ state.centre[..., None])[..., 0]
+    rig = PlacedRig(state.R, t, seen.valid.any(-1), state.points, seen.valid)
+    points = state.points.unflatten(0, (frames, -1))
+    known = seen.valid.any(0).unflatten(0, (frames, -1))
+    height = float(stature(points, known)) or 1.0
+    axes = turning(points, known).axes
+    return ErrorModel.of(observed, rig, torch.arange(frames), axes, height)
+
+
+def lens_errors(
+    focal: FocalLengths, std: Float[Tensor, " V"], centre_std: Float[Tensor, " V"]
+) -> LensErrors:
+    """Return what is not known of estimated intrinsics; ``std``: of the focal lengths, relative;
+    ``centre_std``: of the principal points all alike, in focal lengths.
+    """
+    views = len(std)
+    of_focal = torch.diag(std) if focal is FocalLengths.EACH else std[:, None]
+    common = centre_std[:, None, None] * torch.eye(2, dtype=std.dtype)
+    own = _OWN * torch.diag(centre_std)[:, None, :, None] * torch.eye(2, dtype=std.dtype)[:, None]
+    of_centre = torch.cat((common, own.flatten(2)), dim=-1)
+    nothing = torch.zeros(views, of_centre.shape[-1], dtype=std.dtype)
+    no_shift = torch.zeros(views, 2, of_focal.shape[-1], dtype=std.dtype)
+    return LensErrors(
+        focal=torch.cat((of_focal, nothing), dim=-1),
+        centre=torch.cat((no_shift, of_centre), dim=-1),
+    )
 
 
 def _selection(views: int, focal: FocalLengths, with_k1: bool) -> Float[Tensor, "P Q"]:
@@ -248,10 +287,12 @@ def _residual(seen: View3D, state: Lenses) -> tuple[Float[Tensor, "V N 2"], Bool
 class _System:
     """The normal equations, with the points not yet eliminated."""
 
+    root: Float[Tensor, "V N"]
+    """Square root of the weights."""
     by_view: Float[Tensor, "V N 2 P"]
     by_point: Float[Tensor, "V N 2 3"]
     residual: Float[Tensor, "V N 2"]
-    """All three with the square roots of the weights."""
+    """All three with these roots."""
     inverse: Float[Tensor, "N 3 3"]
     """Of the points' own matrices; 0 where a point is not fixed."""
     point_gradient: Float[Tensor, "N 3"]
@@ -323,7 +364,7 @@ def _linearise(
     residual = residual * root
     matrix = torch.einsum("vnri,vnrj->nij", by_point, by_point)
     gradient = torch.einsum("vnri,vnr->ni", by_point, residual)
-    return _System(by_view, by_point, residual, _inverse(matrix), gradient)
+    return _System(root[..., 0], by_view, by_point, residual, _inverse(matrix), gradient)
 
 
 def _outer(p: Float[Tensor, "*B 2"]) -> Float[Tensor, "*B 2 2"]:
@@ -340,13 +381,12 @@ def _inverse(matrix: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 3 3"]:
     return torch.where(solvable[:, None, None], inverse / safe, 0.0)
 
 
-def _solve(matrix: Float[Tensor, "Q Q"], right: Float[Tensor, " Q"]) -> Float[Tensor, " Q"]:
-    """Return the least solution of a system that is singular along the gauge."""
+def _inverse_of_scaled(matrix: Float[Tensor, "Q Q"]) -> Float[Tensor, "Q Q"]:
+    """Return the inverse of a matrix that is singular along the gauge, with that left out."""
     scale, values, vectors = precondition(matrix)
-    along = vectors.mT @ (scale * right)
     known = values > 1e-10 * values[-1].clamp_min(1e-300)
-    solved = torch.where(known, along / torch.where(known, values, 1.0), 0.0)
-    return scale * (vectors @ solved)
+    basis = scale[:, None] * vectors[:, known]
+    return basis / values[known] @ basis.mT
 
 
 def seen_by(

@@ -14,6 +14,7 @@ from ghpt.calibration.focal import (
     FocalAdjustment,
     FocalEstimate,
     FocalLengths,
+    lens_errors,
     seen_by,
     state_of,
     with_focal,
@@ -21,6 +22,7 @@ from ghpt.calibration.focal import (
 )
 from ghpt.calibration.mistakes import FOCAL_DIFFERS, FOCAL_UNKNOWN
 from ghpt.calibration.rig import RigCalibration
+from ghpt.calibration.uncertainty import LensErrors
 from ghpt.errors import check, check_positive
 from ghpt.geometry.cameras import CameraSet
 
@@ -36,6 +38,8 @@ class EstimatedIntrinsics:
     distortion: Float[Tensor, "V 5"]
     std: Float[Tensor, " V"]
     """Relative, of the focal lengths; inf where nothing is determined."""
+    errors: LensErrors | None
+    """What is not known of them; None where nothing is determined."""
     findings: tuple[Finding, ...]
     text: str
     """What was estimated, in words."""
@@ -124,13 +128,14 @@ class IntrinsicsEstimation:
         distortion[:, 0] = found.k1
         estimated = with_focal(K, found.ratio)
         text = self._text(cameras.names, estimated, found)
-        return EstimatedIntrinsics(estimated, distortion, found.std, findings, text)
+        errors = lens_errors(focal, found.std, centre_std / found.ratio)
+        return EstimatedIntrinsics(estimated, distortion, found.std, errors, findings, text)
 
     def _unknown(self, cameras: CameraSet, why: str) -> EstimatedIntrinsics:
         std = torch.full((len(cameras),), torch.inf, dtype=torch.float64)
         finding = FOCAL_UNKNOWN.finding((), limit=self.std, why=why)
         text = f"focal length: not determined ({why})"
-        return EstimatedIntrinsics(cameras.K, cameras.distortion, std, (finding,), text)
+        return EstimatedIntrinsics(cameras.K, cameras.distortion, std, None, (finding,), text)
 
     def _differing(
         self,

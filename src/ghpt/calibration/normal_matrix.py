@@ -67,7 +67,7 @@ class Derivatives:
 
     root: Float[Tensor, "V N"]
     """Square root of the weight, which the others contain."""
-    by_view: Float[Tensor, "V N 2 6"]
+    by_view: Float[Tensor, "V N 2 A"]
     by_point: Float[Tensor, "V N 2 3"]
 
     @classmethod

@@ -28,7 +28,7 @@ from ghpt.calibration.observations import (
 )
 from ghpt.calibration.pairs import PairEstimation, PairTable
 from ghpt.calibration.resection import PlacedRig, Resection
-from ghpt.calibration.uncertainty import Uncertainty, uncertainty
+from ghpt.calibration.uncertainty import LensErrors, Uncertainty, uncertainty
 from ghpt.errors import GhptDataError, check_positive
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.scale import stature
@@ -163,13 +163,14 @@ class RigCalibration:
         frame: Int[Tensor, " T"] | None = None,
         person: Int[Tensor, " T"] | None = None,
         skeleton: Skeleton = HUMAN36M,
+        lenses: LensErrors | None = None,
     ) -> RigEstimate:
         """Calibrate; ``key_points`` are undistorted pixels of the ``skeleton``. Never raises on
         values: what is wrong is among the findings. Raises GhptDataError for fewer than two
         cameras, a name that occurs twice, or arrays that do not belong together.
 
         ``frame`` and ``person``: the numbers of each row's, where there are several people; frames
-        rise.
+        rise. ``lenses``: what is not known of the intrinsics; it adds to the ±.
         """
         _check(names, K, key_points)
         if frame is None:
@@ -201,7 +202,8 @@ class RigCalibration:
             height = float(stature(shown.points, shown.estimated)) or 1.0
             errors = ErrorModel.of(observed, adjusted.rig, used, facing.axes, height)
             lasting = persistence(observed, adjusted.rig)
-            spread = uncertainty(errors, adjusted.rig, self.bundle.loss_scale, self.draws)
+            scale = self.bundle.loss_scale
+            spread = uncertainty(errors, adjusted.rig, scale, self.draws, lenses)
             evidence = Evidence(
                 frames=len(frame.unique()),
                 used=observed.frames,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.calibration.error_model import ErrorModel, variances
@@ -45,49 +45,84 @@ def gauge(R: Float[Tensor, "V 3 3"], centre: Float[Tensor, "V 3"]) -> Float[Tens
     return torch.cat((rotation, translation, scale), dim=-1).flatten(0, 1)
 
 
-def uncertainty(model: ErrorModel, rig: PlacedRig, scale: float, draws: int) -> Uncertainty:
+def uncertainty(
+    model: ErrorModel,
+    rig: PlacedRig,
+    scale: float,
+    draws: int,
+    lenses: LensErrors | None = None,
+) -> Uncertainty:
     """Return the covariance of a rig, whose size (root mean square distance of the centres from
-    their mean) is 1; ``scale``: of its Cauchy loss, units of noise.
-
-    1. ``draws`` errors of each kind of the model are propagated, in first order, to the rig and to
-       the residuals that it leaves.
-    2. The variances of the kinds are those whose residuals have the moments of the true residuals.
-    3. The covariance is the sum of what the kinds do to the rig. Along an error the loss bends more
-       than its weight says, which enlarges it.
+    their mean) is 1; ``scale``: of its Cauchy loss, units of noise; ``lenses``: what is not known
+    of the intrinsics.
     """
     covariance = torch.zeros(len(rig.R), 6, 6, dtype=torch.float64)
     views = torch.nonzero(rig.placed)[:, 0]
     if len(views) < 2 or not rig.inlier.any():
         return Uncertainty(covariance, 0.0)
     propagation = Propagation.of(model.observed, rig, scale)
-    used = propagation.used
-    moments = []
-    of_rig = []
-    lasts = []
-    for kind in model.kinds(draws, _SEED):
-        step, residual = propagation(kind.draws)
-        moments.append(model.moments(residual, used).mean(-1))
-        step = step.unflatten(0, (-1, 6))
-        of_rig.append(step @ step.mT / draws)
-        lasts.append(kind.lasts)
-    seen = model.moments(propagation.residual[..., None], used)[:, 0]
-    variance = variances(seen, torch.stack(moments, dim=-1))
-    parts = variance[:, None, None, None] * torch.stack(of_rig)
-    rotation = parts.diagonal(dim1=-2, dim2=-1)[..., :3].sum((1, 2))
-    lasting = float(rotation[torch.tensor(lasts)].sum() / rotation.sum().clamp(min=1e-300))
-    covariance[views] = parts.sum(0)[views] / propagation.curvature**2
+    steps, lasts = error_steps(model, propagation, draws)
+    if lenses is not None:
+        of_lenses = propagation(lenses.shifts(model.observed))[0]
+        steps = torch.cat((steps, of_lenses), dim=-1)
+        lasts = torch.cat((lasts, torch.ones(of_lenses.shape[-1], dtype=torch.bool)))
+    blocks = steps.unflatten(0, (-1, 6))
+    covariance[views] = (blocks @ blocks.mT)[views]
+    rotation = blocks[:, :3].square().sum((0, 1))
+    lasting = float(rotation[lasts].sum() / rotation.sum().clamp(min=1e-300))
     return Uncertainty(covariance, lasting)
 
 
 @dataclass(frozen=True)
+class LensErrors:
+    """S independent errors of the intrinsics of V views, each of one standard deviation."""
+
+    focal: Float[Tensor, "V S"]
+    """Relative, of the focal lengths."""
+    centre: Float[Tensor, "V 2 S"]
+    """Of the principal points, in focal lengths."""
+
+    def shifts(self, observed: Correspondences) -> Float[Tensor, "V N 2 S"]:
+        """Return what they change in the key points, in units of noise."""
+        shift = observed.xy[..., None] * self.focal[:, None, None] + self.centre[:, None]
+        return shift / observed.noise[..., None, None]
+
+
+def error_steps(
+    model: ErrorModel, propagation: Propagation, draws: int
+) -> tuple[Float[Tensor, "P M"], Bool[Tensor, " M"]]:
+    """Return M steps of the views' parameters whose squares sum to their covariance, and which of
+    them belong to errors that last.
+
+    1. ``draws`` errors of each kind of the model, or more, are propagated to the parameters, and to
+       the residuals that remain.
+    2. The variances of the kinds are those whose residuals have the moments of the true residuals.
+    3. Along an error the loss bends less than its weight says, which enlarges the steps.
+    """
+    steps = []
+    moments = []
+    lasts = []
+    for kind in model.kinds(draws, _SEED):
+        step, residual = propagation(kind.draws)
+        moments.append(model.moments(residual[..., :draws], propagation.used).mean(-1))
+        steps.append(step / step.shape[-1] ** 0.5)
+        lasts.append(torch.full(step.shape[-1:], kind.lasts))
+    seen = model.moments(propagation.residual[..., None], propagation.used)[:, 0]
+    variance = variances(seen, torch.stack(moments, dim=-1))
+    sizes = variance.sqrt() / propagation.curvature
+    scaled = [size * step for size, step in zip(sizes, steps, strict=True)]
+    return torch.cat(scaled, dim=-1), torch.cat(lasts)
+
+
+@dataclass(frozen=True)
 class Propagation:
-    """From errors of key points, in units of noise, to the rig and the residuals that they leave,
-    in first order.
+    """From errors of key points, in units of noise, to the P parameters of all views and the
+    residuals that remain, in first order.
     """
 
     slopes: Derivatives
     inverse: Float[Tensor, "P P"]
-    """Of the views' normal matrix, gauge left out."""
+    """Of the normal matrix, gauge left out."""
     cross: Float[Tensor, "N P 3"]
     eliminated: Float[Tensor, "N P 3"]
     points: Float[Tensor, "N 3 3"]
@@ -119,11 +154,11 @@ class Propagation:
             eliminated=reduced.eliminated,
             points=reduced.inverse,
             residual=slopes.root[..., None] * now.error,
-            curvature=_curvature(now.error.norm(dim=-1), now.weight, scale),
+            curvature=curvature(now.error.norm(dim=-1), now.weight, scale),
         )
 
     @property
-    def used(self) -> Float[Tensor, "V N"]:
+    def used(self) -> Bool[Tensor, "V N"]:
         """Which observations the rig rests on."""
         return self.slopes.root > 0
 
@@ -141,12 +176,13 @@ class Propagation:
         reduced = torch.tensordot(self.eliminated, of_points, dims=([0, 2], [0, 1]))
         step = self.inverse @ (of_views.flatten(0, 1) - reduced)
         moved = self.points @ (of_points - self.cross.mT @ step)
-        of_step = by_view.flatten(1, 2) @ step.unflatten(0, (-1, 6))
+        of_step = by_view.flatten(1, 2) @ step.unflatten(0, (len(by_view), -1))
         of_move = (rows @ moved).unflatten(1, (-1, 2)).transpose(0, 1)
         return step, of_step.view_as(weighted) + of_move - weighted
 
 
-def _curvature(error: Float[Tensor, "V N"], weight: Float[Tensor, "V N"], scale: float) -> float:
+def curvature(error: Float[Tensor, "V N"], weight: Float[Tensor, "V N"], scale: float) -> float:
+    """Return the mean curvature of the Cauchy loss over its weight."""
     used = weight > 0
     error = error[used].clamp(max=BEHIND)
     weight = weight[used]

@@ -4,6 +4,7 @@ before any extrinsics are known.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
@@ -11,13 +12,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghpt.calibration.observations import observe, usable
+from ghpt.calibration.observations import Correspondences, observe, usable
 from ghpt.calibration.pairs import PairEstimation
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
 
 _FRAMES = 60
 """Of the recording, evenly spread."""
+_PEOPLE = 4
+"""Most people to whom a view is attached."""
 _CLEARLY = 0.05
 """By how much larger the mean share of inliers must be for other tracks than the first of each
 view to be taken.
@@ -42,6 +45,35 @@ def one_person(tracks: list[Sequence], pairs: PairEstimation, noise: float, seed
     if _mean(share, best) < _mean(share, first) + _CLEARLY:
         best = first
     return combine(tracks, best)
+
+
+def attach_views(
+    people: list[Sequence],
+    tracks: list[Sequence],
+    views: list[int],
+    pairs: PairEstimation,
+    noise: float,
+    seed: int,
+) -> list[Sequence]:
+    """Return people who were told apart in the other views, one of them in each of these ``views``
+    too: the person and the track of the view whose key points agree best with essential matrices.
+    """
+    attached = list(people[:_PEOPLE])
+    seen = _Observed.of([*attached, *tracks], noise)
+    others = [view for view in range(len(people[0].cameras)) if view not in views]
+    for view in views:
+        share = torch.zeros(len(attached), len(tracks), dtype=torch.float64)
+        for person in range(len(attached)):
+            for track in range(len(tracks)):
+                place = len(attached) + track
+                parts = [
+                    seen.share(pairs, (person, other), (place, view), seed) for other in others
+                ]
+                share[person, track] = sum(parts) / len(parts)
+        person, track = divmod(int(share.argmax()), len(tracks))
+        choice = [int(other == view) for other in range(len(people[0].cameras))]
+        attached[person] = combine([attached[person], tracks[track]], tuple(choice))
+    return attached
 
 
 def combine(tracks: list[Sequence], choice: tuple[int, ...]) -> Sequence:
@@ -72,24 +104,48 @@ def _shares(
     tracks: list[Sequence], pairs: PairEstimation, noise: float, seed: int
 ) -> Float[Tensor, "V P V P"]:
     """Return the share of common key points that agree, of each two tracks in two views."""
-    joints = [track.as_joints() for track in tracks]
-    rows = joints[0].spread(_FRAMES)
-    parts = [sequence.undistorted(rows) for sequence in joints]
-    pixels = torch.from_numpy(np.concatenate([part.pixels for part in parts], axis=1)).double()
-    valid = torch.from_numpy(np.concatenate([part.valid for part in parts], axis=1))
-    views = len(tracks[0].cameras)
-    K = tracks[0].cameras.K.repeat(len(tracks), 1, 1)
-    observed = observe(K, pixels, usable(K, pixels, valid), noise)
+    seen = _Observed.of(tracks, noise)
+    views = seen.views
     share = torch.zeros(views, len(tracks), views, len(tracks), dtype=torch.float64)
     for a, b in combinations(range(views), 2):
         for i in range(len(tracks)):
             for j in range(len(tracks)):
-                found = pairs.pair(observed, views * i + a, views * j + b, seed)
-                if found is not None:
-                    _, common, inliers, *_ = found
-                    share[a, i, b, j] = inliers / common.clamp(min=1)
-                    share[b, j, a, i] = share[a, i, b, j]
+                share[a, i, b, j] = seen.share(pairs, (i, a), (j, b), seed)
+                share[b, j, a, i] = share[a, i, b, j]
     return share
+
+
+@dataclass(frozen=True)
+class _Observed:
+    """The joints of some frames of several sequences, whose views are side by side."""
+
+    points: Correspondences
+    views: int
+    """Of each sequence."""
+
+    @classmethod
+    def of(cls, sequences: list[Sequence], noise: float) -> _Observed:
+        joints = [sequence.as_joints() for sequence in sequences]
+        rows = joints[0].spread(_FRAMES)
+        parts = [sequence.undistorted(rows) for sequence in joints]
+        pixels = torch.from_numpy(np.concatenate([part.pixels for part in parts], axis=1)).double()
+        valid = torch.from_numpy(np.concatenate([part.valid for part in parts], axis=1))
+        K = sequences[0].cameras.K.repeat(len(sequences), 1, 1)
+        observed = observe(K, pixels, usable(K, pixels, valid), noise)
+        return cls(observed, len(sequences[0].cameras))
+
+    def share(
+        self, pairs: PairEstimation, one: tuple[int, int], other: tuple[int, int], seed: int
+    ) -> float:
+        """Return the share of common key points that agree, of a sequence in a view with another in
+        another.
+        """
+        places = [self.views * sequence + view for sequence, view in (one, other)]
+        found = pairs.pair(self.points, places[0], places[1], seed)
+        if found is None:
+            return 0.0
+        _, common, inliers, *_ = found
+        return float(inliers / common.clamp(min=1))
 
 
 def _mean(share: Float[Tensor, "V P V P"], choice: tuple[int, ...]) -> float:

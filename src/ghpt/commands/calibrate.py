@@ -34,7 +34,8 @@ from ghpt.calibration.millimetres import (
 from ghpt.calibration.mistakes import SEVERAL_PEOPLE
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.uncalibrated import UncalibratedShifts
-from ghpt.calibration.whose import one_person
+from ghpt.calibration.uncertainty import LensErrors
+from ghpt.calibration.whose import attach_views, one_person
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
@@ -52,12 +53,14 @@ from ghpt.commands.time import calibrate_people, clock_of, log_time, time_of_rig
 from ghpt.config import Target, build, suggest
 from ghpt.data.formats.names import Name
 from ghpt.data.people.detections import Detections
+from ghpt.data.people.matching import match_views
 from ghpt.data.people.persons import (
     detector_sequence,
     detector_sequences,
     tracks_of_views,
     with_lenses,
 )
+from ghpt.data.people.pooled import among_cameras, pool_detectors
 from ghpt.data.people.retimed import retime
 from ghpt.data.people.sequence import Rows, Sequence
 from ghpt.errors import GhptDataError, check
@@ -100,6 +103,7 @@ class CalibrateSettings(InputSettings):
     start_times: Target
     intrinsics: Target
     image_size: list[int] | None
+    more_keypoints: list[str] | None
     evaluated_frames: int
     seed: int
 
@@ -113,6 +117,9 @@ class CalibrateSettings(InputSettings):
             check(sane, "image_size", f"is {self.image_size}", example)
             hint = "Give the image size or the cameras' file."
             check(not self.cameras, "image_size", "is given beside cameras", hint)
+        hint = "Name the first detector's key points: keypoints=pose/"
+        alone = bool(self.more_keypoints) and not self.keypoints
+        check(not alone, "more_keypoints", "is given without keypoints", hint)
         name = self.estimator
         hint = suggest(name, self.baselines)
         check(name in self.baselines, "estimator", f"is {name!r}", hint)
@@ -128,8 +135,18 @@ class Crowd:
 
     def follow(self, cameras: CameraSet, calibration: RigCalibration, seed: int) -> Sequence:
         """Return one person, the same in all views, whose cameras need no extrinsics."""
-        tracks = tracks_of_views(self.people, cameras, self.match, self.views)
+        tracks = self.tracks(cameras)
         return one_person(tracks, calibration.pairs, calibration.noise, seed)
+
+    def among(self, cameras: CameraSet, placed: list[int]) -> list[Sequence]:
+        """Return everybody whom some calibrated cameras tell apart, the most visible first."""
+        at, _ = match_views(self.people.path, self.people.views, cameras, self.match, self.views)
+        views = [self.people.views[at[view]] for view in placed]
+        return detector_sequences(self.people, cameras.select(placed), self.match, views)
+
+    def tracks(self, cameras: CameraSet) -> list[Sequence]:
+        """Return those whom each view follows by itself."""
+        return tracks_of_views(self.people, cameras, self.match, self.views)
 
     def persons(self, cameras: CameraSet) -> list[Sequence]:
         """Return everybody whom calibrated cameras tell apart, the most visible first."""
@@ -154,8 +171,12 @@ class Case:
     notes: tuple[Finding, ...] = ()
     crowd: Crowd | None = None
     """Everybody's detections, where the views show several people."""
+    more: tuple[Crowd, ...] = ()
+    """What other detectors found of the same recording."""
     intrinsics: str | None = None
     """What was estimated of the intrinsics, in words; None where they were given."""
+    lenses: LensErrors | None = None
+    """What is not known of them."""
 
     @property
     def reference_cameras(self) -> Cameras | None:
@@ -213,7 +234,9 @@ class RigSolution:
 def files(settings: CalibrateSettings) -> Files:
     """Return what a calibration reads and writes."""
     check_apart(settings.keypoints, settings.output)
-    reads = input_paths(settings.cameras, settings.keypoints, settings.data.get("root"))
+    more = settings.more_keypoints or []
+    root = settings.data.get("root")
+    reads = input_paths(settings.cameras, settings.keypoints, *more, root)
     return Files(reads, (*RIG_FILES, *_REPORTS))
 
 
@@ -318,23 +341,53 @@ def solve_rig(
 def _from_everybody(
     case: Case, calibration: RigCalibration, seed: int
 ) -> tuple[tuple[Sequence, ...], RigEstimate]:
-    """Return the rig from the person who was followed, or from everybody whom that rig tells apart;
-    and who it was.
+    """Return the rig from the person who was followed, or from everybody whom that rig tells apart
+    in the key points of all detectors; and who it was.
     """
     followed = (case.evidence,)
-    estimate = calibrate_people(calibration, followed, seed)
+    estimate = calibrate_people(calibration, followed, seed, lenses=case.lenses)
     cameras = case.evidence.cameras
     in_one_time = cameras.clock is None or cameras.clock.is_synchronised
+    if case.crowd is not None and in_one_time:
+        estimate = _with_all_views(case.evidence, case.crowd, estimate, calibration, seed)
     whole = estimate.converged and bool(estimate.calibrated.all())
-    if case.crowd is None or not in_one_time or not whole:
+    alone = case.crowd is None and not case.more
+    if alone or not in_one_time or not whole:
         return followed, estimate
-    people = tuple(case.crowd.persons(cameras.with_cameras(estimate.cameras)))
+    found = cameras.with_cameras(estimate.cameras)
+    own = followed if case.crowd is None else case.crowd.persons(found)
+    people = pool_detectors([own, *(crowd.persons(found) for crowd in case.more)])
     if len(people) < 2:
         return followed, estimate
-    of_all = calibrate_people(calibration, people, seed)
+    of_all = calibrate_people(calibration, people, seed, lenses=case.lenses)
     if not bool(of_all.calibrated.all()):
         return followed, estimate
     return people, of_all
+
+
+def _with_all_views(
+    evidence: Sequence,
+    crowd: Crowd,
+    estimate: RigEstimate,
+    calibration: RigCalibration,
+    seed: int,
+) -> RigEstimate:
+    """Return the rig with the views that the person who was followed does not link to the others,
+    each linked by whomever it shows; the same rig if nobody does.
+    """
+    placed = _indices(estimate.calibrated)
+    missing = _indices(~estimate.calibrated)
+    if len(placed) < 2 or not missing:
+        return estimate
+    cameras = evidence.cameras.with_cameras(estimate.cameras)
+    found = [among_cameras(person, evidence) for person in crowd.among(cameras, placed)]
+    if not found:
+        return estimate
+    tracks = crowd.tracks(evidence.cameras)
+    pairs = calibration.pairs
+    people = attach_views(found, tracks, missing, pairs, calibration.noise, seed)
+    tried = calibrate_people(calibration, people, seed)
+    return tried if int(tried.calibrated.sum()) > len(placed) else estimate
 
 
 def _halves(
@@ -408,7 +461,14 @@ def open_case(settings: CalibrateSettings, estimator: Estimator) -> Case:
     notes = people_findings(people)
     own = "the file's own calibration"
     crowd = Crowd(people, settings.match, settings.views) if notes else None
-    return Case(sequence, evidence, own, is_own=True, notes=notes, crowd=crowd)
+    more = tuple(_other_detector(settings, path) for path in settings.more_keypoints or [])
+    return Case(sequence, evidence, own, is_own=True, notes=notes, crowd=crowd, more=more)
+
+
+def _other_detector(settings: CalibrateSettings, path: str) -> Crowd:
+    """Return what another detector found of the same recording."""
+    own = replace(settings, keypoints=path, format=None, skeleton=None, session=None)
+    return Crowd(own_people(own), settings.match, settings.views)
 
 
 def of_one_person(case: Case, calibration: RigCalibration, seed: int) -> Case:
@@ -454,6 +514,7 @@ def with_intrinsics(settings: CalibrateSettings, case: Case, calibration: RigCal
         evidence=with_lenses(case.evidence, cameras),
         notes=notes,
         intrinsics=found.text,
+        lenses=found.errors,
     )
 
 

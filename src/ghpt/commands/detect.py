@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,6 +93,8 @@ def detect(settings: DetectSettings, output: Path) -> DetectResult:
     paths = find_videos(settings.videos)
     check_installed("mediapipe", "detect")
     check_installed("cv2", "detect")
+    os.environ.setdefault("GLOG_minloglevel", "2")  # MediaPipe's warnings are of its own making
+    warnings.filterwarnings("ignore", "SymbolDatabase", UserWarning)
     views = []
     for path in paths:
         view = detect_view(path, settings)

@@ -2,7 +2,6 @@
 several processes.
 """
 
-import importlib.util
 import math
 import os
 import shutil
@@ -12,6 +11,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -85,7 +85,7 @@ def chosen_launcher(overrides: Sequence[Override], compose_only: bool) -> str:
         raise GhptConfigError(
             LAUNCHER, f"there is no {str(name)!r}", suggest(str(name), _LAUNCHERS)
         )
-    if name != "basic" and importlib.util.find_spec("submitit") is None:
+    if name != "basic" and find_spec("submitit") is None:
         raise GhptConfigError(
             LAUNCHER, f"{name} needs hydra-submitit-launcher", "Run: pip install -e '.[slurm]'"
         )
@@ -105,7 +105,7 @@ def check_search(words: Sequence[str], sweep: bool) -> None:
         return
     if not sweep:
         raise GhptConfigError(_SEARCH, "is of several runs", "Add -m.")
-    if importlib.util.find_spec("optuna") is None:
+    if find_spec("optuna") is None:
         raise NotInstalled(_SEARCH, "optuna")
 
 
@@ -234,7 +234,7 @@ def own_command(program: Program, added: Sequence[str] = ()) -> Iterator[None]:
     settings = [word for word in hydra.overrides.task if not word.startswith("output=")]
     output = f"output='{hydra.runtime.output_dir}'"
     sys.argv[:] = [program.path, *settings, *added, output]
-    __main__.__spec__ = None if program.module is None else importlib.util.find_spec(program.module)
+    __main__.__spec__ = None if program.module is None else find_spec(program.module)
     try:
         yield
     finally:

@@ -26,6 +26,7 @@ from ghpt.commands.inputs import (
     resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
+from ghpt.commands.prediction.beside import compared_poses, find_videos
 from ghpt.commands.prediction.camera_check import check_cameras
 from ghpt.commands.prediction.gaps import OWN, Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
@@ -51,12 +52,14 @@ from ghpt.errors import GhptCheckpointError, GhptDataError, check
 from ghpt.export import WRITERS, Chunks, Evidence, Scene, find_marker_set
 from ghpt.export.scene import images_of, origin_note
 from ghpt.files import remove, sweep_temporaries, write_json
+from ghpt.geometry.cameras import CameraSet
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.joint_means import JointMeans, all_joints, human_joints
 from ghpt.models.estimators.predictors import Classical, Estimate, Learned, Predictor
 from ghpt.models.estimators.trajectory.predictor import TrajectoryPredictor
+from ghpt.models.estimators.trajectory.priors import NOMINAL_RATE
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, Reconstruction
@@ -90,6 +93,7 @@ _FEW_JOINTS = (
     "%s: the key points give too few of the 17 joints by name: the size of the person, the cameras "
     "and exchanged sides are not checked (docs/skeletons.md)."
 )
+_UNKNOWN_RATE = "%s: the frame rate is unknown; %g Hz are assumed of its motion (rate_hz=60, say)."
 _log = logging.getLogger(__name__)
 
 
@@ -115,6 +119,7 @@ class PredictorSettings:
 class PredictSettings(InputSettings):
     """The settings of predict.py."""
 
+    videos: str | None
     person: int | None
     joints: Literal["detector", "human36m"]
     ckpt: str | None
@@ -226,7 +231,8 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
     first = results[0]
     cameras = world.cameras(sequences[0].cameras.cameras)
     if len(results) > 1:
-        scene = Scene(cameras, images=images_of(sequences[0].cameras))
+        own = sequences[0].cameras
+        scene = Scene(cameras, images=images_of(own, _videos(settings, own, output)))
         folders = [_person_folder(output, person) for person in range(len(results))]
         write_pictures(output, folders, own_title(settings), first.formats, scene)
         first = replace(first, people=tuple(map(_about_person, results)))
@@ -313,11 +319,14 @@ def _predict_person(
     )
     if settings.smooth and estimator.name in (TRAJECTORY, ONLINE):
         _log.info("smooth: a trajectory is smooth already; it is filtered once more.")
+    if sequence.rate_hz is None and estimator.name in (TRAJECTORY, ONLINE):
+        _log.info(_UNKNOWN_RATE, sequence.title, NOMINAL_RATE)
     joints = joints_of(settings, sequence.skeleton)
     about = _about(sequence, joints, estimator, gaps, setup.origin)
     if settings.markers:
         find_marker_set(settings.markers).check_joints(about.joints)
     formats = _formats(settings, sequence)
+    videos = _videos(settings, sequence.cameras, output)
     _warn_of_origin(about, formats)
     _log.info(
         "%s: %d frames, %d views, by %s.",
@@ -339,11 +348,12 @@ def _predict_person(
             own = _map_chunks(key_points, joints)
             world = world or _choose_world(settings, sequence, about, own)
             chunks = _map_chunks(own, world.reconstruction)
-            _write_formats(settings, output, world, about, chunks, formats, sequence, shards)
+            scene = _scene(settings, setup, world, sequence, shards, videos)
+            _write_formats(settings, output, world, about, chunks, formats, scene)
             views = about.camera_names
             coverage = measure_coverage(chunks(), about.joints, views, len(sequence))
             course = sample_course(chunks(), len(sequence), limbs_of(about.joints))
-    evaluation, view_course = _evaluate(estimator, setup.compared, sequence, settings)
+    evaluation, view_course = _evaluate(estimator, predictor, setup.compared, sequence, settings)
     result = PredictionResult(
         data=sequence.title,
         source=sequence.source,
@@ -594,16 +604,17 @@ def _fit(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings
 
 def _evaluate(
     estimator: PoseEstimator,
+    predictor: Predictor,
     compared: Mapping[str, Estimator],
     sequence: Sequence,
     settings: PredictSettings,
 ) -> tuple[Evaluation, ViewCourse]:
     """Return what the estimators are worth on the 17 joints, or on all key points without them, and
-    the held-out errors of the prediction's own over time.
+    the held-out errors of the prediction's own over time. ``predictor``: fitted to the sequence.
     """
     judged = sequence.as_joints() if sequence.skeleton.has_joints else sequence
     sample = judged.read(judged.spread(settings.fitted_frames))
-    own = _fit(estimator, judged, settings)
+    own = predictor if judged is sequence else _fit(estimator, judged, settings)
     estimates: dict[str, Estimate] = {estimator.name: own.estimate}
     for name, other in compared.items():
         estimates.setdefault(name, other.fit_to(sample))
@@ -681,6 +692,31 @@ def _warn_of_origin(about: About, formats: list[str]) -> None:
         _log.warning(text, ", ".join(single), origin_note(about))
 
 
+def _scene(
+    settings: PredictSettings,
+    setup: _Setup,
+    world: World,
+    sequence: Sequence,
+    shards: Shards,
+    videos: tuple[str | None, ...],
+) -> Scene:
+    """Return what the pictures show beside the person."""
+    cameras = sequence.cameras
+    return Scene(
+        world.cameras(cameras.cameras),
+        evidence=lambda: _evidence(sequence, shards),
+        images=images_of(cameras, videos),
+        key_point_joints=joints_of(settings, sequence.skeleton).key_point_joints,
+        others=compared_poses(
+            sequence, setup.compared, setup.estimator.flips, settings.fitted_frames, world
+        ),
+    )
+
+
+def _videos(settings: PredictSettings, cameras: CameraSet, output: Path) -> tuple[str | None, ...]:
+    return find_videos(Path(settings.videos), cameras.names, output) if settings.videos else ()
+
+
 def _write_formats(
     settings: PredictSettings,
     output: Path,
@@ -688,16 +724,8 @@ def _write_formats(
     about: About,
     chunks: Chunks,
     formats: list[str],
-    sequence: Sequence,
-    shards: Shards,
+    scene: Scene,
 ) -> None:
-    cameras = world.cameras(sequence.cameras.cameras)
-    scene = Scene(
-        cameras,
-        evidence=lambda: _evidence(sequence, shards),
-        images=images_of(sequence.cameras),
-        key_point_joints=joints_of(settings, sequence.skeleton).key_point_joints,
-    )
     up = {"world_up": "z"} if world.name == "people" else {}
     given = {name: value for name, value in settings.trc.items() if value is not None}
     arguments: dict[str, dict[str, Any]] = {

@@ -31,6 +31,7 @@ from ghpt.paper.engine.tasks import Task
 from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
 from ghpt.paper.pose import figures as pose_figures
 from ghpt.paper.robustness import curves as robustness
+from ghpt.paper.robustness import sets
 from ghpt.provenance import provenance
 from ghpt.report.document import Code, Text
 from ghpt.report.tables import display_name
@@ -42,6 +43,7 @@ _PARTS = (
     pose_figures,
     camera_tables,
     view_weights,
+    sets,
     ablations,
     robustness,
 )

@@ -16,6 +16,7 @@ from ghpt.calibration.check.recording_time import (
 from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.estimation import TimeEstimate, TimeEstimation
 from ghpt.calibration.time.uncalibrated import UncalibratedShifts
+from ghpt.calibration.uncertainty import LensErrors
 from ghpt.clock import Clock
 from ghpt.commands.inputs import InputSettings, own_detector_sequences, own_sequence
 from ghpt.data.people.detections import Detections
@@ -124,9 +125,16 @@ def calibrate_sequence(calibration: RigCalibration, sequence: Sequence, seed: in
 
 
 def calibrate_people(
-    calibration: RigCalibration, people: Items[Sequence], seed: int, rows: Rows | None = None
+    calibration: RigCalibration,
+    people: Items[Sequence],
+    seed: int,
+    rows: Rows | None = None,
+    lenses: LensErrors | None = None,
 ) -> RigEstimate:
-    """Return the rig that everybody shows whose sequences these are, in some frames or in all."""
+    """Return the rig that everybody shows whose sequences these are, in some frames or in all.
+
+    ``lenses``: what is not known of the cameras' intrinsics.
+    """
     cameras = people[0].cameras
     parts = [sequence.undistorted(rows) for sequence in people]
     frames = people[0].frame if rows is None else people[0].frame[rows]
@@ -151,4 +159,5 @@ def calibrate_people(
         torch.from_numpy(frame[order]),
         torch.from_numpy(person[order]),
         people[0].skeleton,
+        lenses,
     )

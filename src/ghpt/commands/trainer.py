@@ -7,7 +7,7 @@ from typing import Any
 
 import lightning as L
 from lightning.fabric.utilities.exceptions import MisconfigurationException
-from lightning.pytorch.loggers import Logger
+from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
 from ghpt.commands.lost import OwnSignals
 from ghpt.config import build, check_arguments
@@ -37,7 +37,7 @@ def make_trainer(settings: Mapping[str, Any], **ours: Any) -> L.Trainer:
         return L.Trainer(**built, **ours, use_distributed_sampler=False)
     except (TypeError, ValueError, MisconfigurationException) as error:
         hint = "See lightning.Trainer's arguments."
-        raise GhptConfigError("trainer", str(error).rstrip("."), hint) from error
+        raise GhptConfigError("trainer", str(error).rstrip(".!"), hint) from error
 
 
 def progress(shown: bool) -> list[L.Callback]:
@@ -52,9 +52,21 @@ def make_loggers(settings: Mapping[str, Any], output: Path) -> list[Logger]:
     """
     loggers = []
     for name, logger in build(settings, "logger").items():
-        with in_our_words(f"logger.{name}"):
+        key = f"logger.{name}"
+        with in_our_words(key):
             loggers.append(logger(save_dir=str(output)))
+        if not isinstance(loggers[-1], TensorBoardLogger):
+            _open(loggers[-1], key)
     return loggers
+
+
+def _open(logger: Logger, key: str) -> None:
+    """Let a logger connect or write before the training. Raises GhptConfigError if it cannot."""
+    try:
+        getattr(logger, "experiment", None)
+    except Exception as error:  # a server that is not there, an account, a version: of many kinds
+        hint = "Change its settings, or take another logger."
+        raise GhptConfigError(key, one_line(error)[:300].rstrip("."), hint) from error
 
 
 @contextmanager
@@ -69,4 +81,4 @@ def in_our_words(key: str = "trainer") -> Iterator[None]:
         raise NotInstalled(key, missing) from error
     except MisconfigurationException as error:
         hint = "Change this setting."
-        raise GhptConfigError(key, one_line(error).rstrip("."), hint) from error
+        raise GhptConfigError(key, one_line(error).rstrip(".!"), hint) from error

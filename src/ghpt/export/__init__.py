@@ -12,7 +12,7 @@ from ghpt.export.html import write_html
 from ghpt.export.markers import MarkerSet, find_marker_set
 from ghpt.export.npz import read_reconstruction, write_npz
 from ghpt.export.rerun import write_rerun
-from ghpt.export.scene import Evidence, Scene
+from ghpt.export.scene import Evidence, OtherPoses, Scene
 from ghpt.export.stream import Chunks
 from ghpt.export.table import write_csv, write_parquet
 from ghpt.export.trc import write_trc
@@ -22,6 +22,7 @@ __all__ = [
     "Chunks",
     "Evidence",
     "MarkerSet",
+    "OtherPoses",
     "Scene",
     "Writer",
     "find_marker_set",

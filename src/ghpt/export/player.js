@@ -321,13 +321,14 @@ async function start(document, window) {
       const a = pixels.get(from.j), b = pixels.get(to.j);
       if (a && b) stroke(context, place(a), place(b), colours[side], 1.5, filled ? [4, 3] : []);
     }
+    const radius = Math.min(data.kinds > 40 ? 1.2 : 2.2, 0.012 * canvas.clientWidth);
     if (data.key_points && index >= 0) {
-      context.fillStyle = colours.point; context.strokeStyle = colours.ink; context.lineWidth = 0.5;
+      context.fillStyle = colours.point; context.strokeStyle = colours.ink; context.lineWidth = 0.25 * radius;
       for (let k = 0; k < data.kinds; k++) {
         const at = 2 * ((index * data.cameras.length + viewIndex) * data.kinds + k);
         if (Number.isNaN(data.key_points[at])) continue;
         const [x, y] = place(through(camera, data.key_points[at], data.key_points[at + 1]));
-        context.beginPath(); context.arc(x, y, data.kinds > 40 ? 1.2 : 2.2, 0, 2 * Math.PI); context.fill(); context.stroke();
+        context.beginPath(); context.arc(x, y, radius, 0, 2 * Math.PI); context.fill(); context.stroke();
       }
     }
     const value = viewError(data, viewIndex, index);

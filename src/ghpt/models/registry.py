@@ -18,6 +18,7 @@ from torch.optim import lr_scheduler
 
 from ghpt.config import build, locate, suggest
 from ghpt.errors import GhptConfigError
+from ghpt.models.joint.problem import JointSubsets
 from ghpt.models.key_points.problem import KeyPointWeights
 from ghpt.models.key_points.scorer import KeyPointScorer
 from ghpt.models.loss import PrecisionLoss, StochasticLoss
@@ -71,7 +72,14 @@ def register(part: str, *classes: type) -> None:
 
 
 register("model", StochasticEstimator)
-register("model.problem", PoseTriangulation, KeyPointWeights, WorldPoses, RelativePose)
+register(
+    "model.problem",
+    PoseTriangulation,
+    JointSubsets,
+    KeyPointWeights,
+    WorldPoses,
+    RelativePose,
+)
 register("model.problem.scale", KnownScale, BodyHeight, BoneLengths)
 register("model.scorer", Scorer, KeyPointScorer, AuthorsScorer)
 register("model.loss", StochasticLoss, PrecisionLoss)

@@ -28,7 +28,7 @@ _WANTED_DEG = 0.5
 """The standard deviation of a rotation that is asked for."""
 Matrix = list[list[float]]
 _CAPTION = (
-    "error: median reprojection; ±: standard deviation, by leaving out parts of the recording"
+    "error: median reprojection; ±: standard deviation, for errors as the residuals show them"
 )
 
 

@@ -17,6 +17,7 @@ from ghpt.report.document import (
 )
 
 _VERDICTS = {Tone.LOOK: "look at this", Tone.BAD: "do not use"}
+_MENDED = "wrong as the files have it, right in the mended files"
 _COLOURS = {Severity.ERROR: "red", Severity.WARNING: "yellow"}
 
 
@@ -30,14 +31,15 @@ def finding_bullets(findings: Sequence[Finding], otherwise: str) -> Block:
 def verdict_blocks(findings: Sequence[Finding], good: str, command: str) -> list[Block]:
     """Return the verdict (``good`` where nothing was found), the findings, and what to type next.
 
-    The worst finding decides.
+    The worst finding decides, unless all were mended.
     """
     tone = Tone.GOOD
     text = good
     if findings:
         errors = any(finding.severity == Severity.ERROR for finding in findings)
-        tone = Tone.BAD if errors else Tone.LOOK
-        text = _VERDICTS[tone]
+        mended = all(finding.mended for finding in findings)
+        tone = Tone.BAD if errors and not mended else Tone.LOOK
+        text = _MENDED if mended else _VERDICTS[tone]
     blocks: list[Block] = [Notice(("Verdict: ", Strong(text), "."), tone)]
     if findings:
         blocks.append(finding_bullets(findings, ""))

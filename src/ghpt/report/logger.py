@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from lightning.fabric.loggers import TensorBoardLogger as EventsOnly
-from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.loggers import MLFlowLogger, TensorBoardLogger
+from lightning.pytorch.utilities.rank_zero import rank_zero_only
 from tensorboard.summary.writer import event_file_writer
 
 from ghpt.files import errors_name
@@ -70,6 +71,7 @@ class ForgivingTensorBoard(TensorBoardLogger):
         shown = {name: value for name, value in metrics.items() if name != "epoch"}
         super().log_metrics(shown, step)
 
+    @rank_zero_only
     @_forgiving
     def log_hyperparams(self, params: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
         """Write the run's row of hyper-parameters beside its metrics, which are curves already."""
@@ -77,3 +79,19 @@ class ForgivingTensorBoard(TensorBoardLogger):
 
     save = _forgiving(EventsOnly.save)
     finalize = _forgiving(TensorBoardLogger.finalize)
+
+
+def mlflow(
+    save_dir: str, experiment_name: str, run_name: str | None, tracking_uri: str | None
+) -> MLFlowLogger:
+    """Return Lightning's logger for MLflow, which by default writes ``mlflow.db`` in ``save_dir``.
+
+    MLflow takes folders, Lightning's default, no longer.
+    """
+    database = (Path(save_dir) / "mlflow.db").resolve().as_posix()
+    return MLFlowLogger(
+        experiment_name=experiment_name,
+        run_name=run_name,
+        tracking_uri=tracking_uri or f"sqlite:///{database}",
+        save_dir=save_dir,
+    )

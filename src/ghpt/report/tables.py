@@ -27,7 +27,7 @@ NAMES = {
     "view_weights": "view weights",
     "trajectory": "trajectory",
     "online": "trajectory, online",
-    "frame_learned": "key-point weights",
+    "frame_learned": "learned frames",
     "weighted_linear": "weighted linear",
     "ransac": "RANSAC",
     "adaptive_ransac": "adaptive RANSAC",

@@ -37,9 +37,10 @@ def commands_on(inputs: InputSettings, own: Mapping[str, object], output: Path) 
 
 def prediction_by(inputs: InputSettings, output: Path, **files: Path) -> str:
     """Return the command that predicts the same input by other ``files``, and writes beside
-    ``output``.
+    ``output``. A recording of a data set keeps its own.
     """
-    shown = {name: display_path(path) for name, path in files.items()}
+    used = files if inputs.keypoints else {}
+    shown = {name: display_path(path) for name, path in used.items()}
     given = given_settings(inputs) | shown
     return command_line("predict.py", given, f"{display_path(output)}_poses")
 

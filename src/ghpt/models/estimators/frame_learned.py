@@ -1,4 +1,4 @@
-"""Frames by learned key-point weights: one triangulation of each joint, by weights that ship."""
+"""Frames by two small models whose weights ship: of key points, then of joints in their pose."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from ghpt.errors import check
 from ghpt.geometry.triangulation import Triangulation, concatenate
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.predictors import observe_joints
+from ghpt.models.joint.problem import JointSubsets
 from ghpt.models.key_points.problem import KeyPoints, KeyPointWeights
 from ghpt.models.weights import load_shipped
 from ghpt.observations import Observations, PoseEstimate
@@ -23,15 +23,13 @@ _PAIRS_AT_ONCE = 2**18
 
 @dataclass(frozen=True)
 class FrameLearned(Estimator):
-    """Weights each key point by a small network that sees how it stands beside the others.
+    """Weights key points, and then what subsets of them make of each joint, by small networks.
 
-    ``weights``: of a model of ``ghpt/weights``. The first estimate is that of the model's own
+    ``key_points`` and ``joints``: of ``ghpt/weights``; without ``joints`` (None) the weighted
+    triangulation of the key points is the estimate. The first estimate is that of the model's own
     AdaptiveRansac, which also stands where the weights leave a joint without a point; a view counts
-    as one that made a joint as it does there.
-
-    ``trust``: in a frame whose views disagree as a whole (cameras that are off, much noise) the
-    logits are multiplied by the smallest threshold of RANSAC over that of the frame, to this power:
-    what a network says of single views is worth little there. 0: they never are.
+    as one that made a joint as it does there. Angles and conditions are those of the weighted
+    triangulation.
 
     The network knows the 17 joints, which are means of the ``skeleton``'s key points in the images.
     Those of them that are key points themselves are its own; all others have the first estimate.
@@ -39,12 +37,9 @@ class FrameLearned(Estimator):
 
     sort = "by weights that come with ghpt"
 
-    weights: str
-    trust: float
+    key_points: str
+    joints: str | None
     skeleton: Skeleton = HUMAN36M
-
-    def __post_init__(self) -> None:
-        check(self.trust >= 0, "trust", f"is {self.trust}", "It must be >= 0.")
 
     def for_skeleton(self, skeleton: Skeleton) -> FrameLearned:
         return replace(self, skeleton=skeleton)
@@ -71,16 +66,17 @@ class FrameLearned(Estimator):
 
     @torch.no_grad()
     def _triangulate(self, batch: Observations) -> Triangulation:
-        model = load_shipped(self.weights)
+        model = load_shipped(self.key_points)
         problem = self._problem
         start = problem.start.triangulate(batch)
         key_points = KeyPoints(batch, PoseEstimate(start.points, start.has_position))
         logits = model.scorer(problem.featurize(key_points))
-        threshold = problem.start.inlier_threshold(batch, start.points)
-        trust = (problem.start.threshold / threshold) ** self.trust
-        weights = (logits * trust[:, None]).softmax(dim=-1)
-        result = problem.triangulate(key_points, weights)
-        return result.with_fallback(result.ok, start)
+        result = problem.triangulate(key_points, logits.softmax(dim=-1))
+        weighted = result.with_fallback(result.ok, start)
+        if self.joints is None:
+            return weighted
+        points = _average_subsets(self.joints, batch, weighted)
+        return replace(weighted, points=points)
 
     def inlier_threshold(
         self, batch: Observations, points: Float[Tensor, "B J 3"]
@@ -89,7 +85,22 @@ class FrameLearned(Estimator):
 
     @property
     def _problem(self) -> KeyPointWeights:
-        problem = load_shipped(self.weights).problem
+        problem = load_shipped(self.key_points).problem
         if not isinstance(problem, KeyPointWeights):
-            raise TypeError(f"{self.weights} are no weights of key points")
+            raise TypeError(f"{self.key_points} are no weights of key points")
         return problem
+
+
+def _average_subsets(
+    joints: str, batch: Observations, context: Triangulation
+) -> Float[Tensor, "B J 3"]:
+    """Return each joint as the average of what subsets of the views make of it."""
+    model = load_shipped(joints)
+    problem = model.problem
+    if not isinstance(problem, JointSubsets):
+        raise TypeError(f"{joints} are no weights of joints")
+    pose = PoseEstimate(context.points, context.has_position)
+    keys = model.keys("frame_learned", batch)
+    hypotheses = problem.generate_around(batch, pose, model.hypotheses, keys)
+    weights = model.scorer(problem.featurize(hypotheses)).softmax(dim=-1)
+    return problem.aggregate(hypotheses, weights).points

@@ -14,11 +14,10 @@ from torch import Tensor
 
 from ghpt.geometry.cameras import camera_centre
 from ghpt.geometry.normal_equations import minors
+from ghpt.models.body import BONE_SHARES, UNIT, log_length, stature, trunk_axes
 from ghpt.observations import Observations, PoseEstimate
-from ghpt.skeleton import BONES, JOINT, JOINTS, MIRROR, PELVIS, THORAX
+from ghpt.skeleton import BONES, JOINTS, MIRROR
 
-UNIT = 0.005
-"""Of a stature: about the error of a good detector."""
 NAMES = (
     "valid",
     "residual",
@@ -47,33 +46,10 @@ NAMES = (
 )
 """Of the features, in their order."""
 
-_STATURE = 1700.0
-"""mm: of a person whose bones are not known."""
-_SHARES = {
-    frozenset(("ankle", "knee")): 0.246,
-    frozenset(("knee", "hip")): 0.245,
-    frozenset(("hip", "pelvis")): 0.074,
-    frozenset(("pelvis", "spine")): 0.139,
-    frozenset(("spine", "thorax")): 0.151,
-    frozenset(("thorax", "head_top")): 0.136,
-    frozenset(("head_top", "nose")): 0.079,
-    frozenset(("thorax", "shoulder")): 0.104,
-    frozenset(("shoulder", "elbow")): 0.172,
-    frozenset(("elbow", "wrist")): 0.146,
-}
-"""Lengths of bones in statures (ghpt.data.synthetic.body)."""
 _PARALLEL = 0.05
 """Sine of the angle between two rays below which they are near each other by chance."""
 
 
-def kind(joint: str) -> str:
-    """Return a joint's name without its side."""
-    return joint.removeprefix("right_").removeprefix("left_")
-
-
-KINDS = tuple(dict.fromkeys(kind(joint) for joint in JOINTS))
-"""The joints without their sides."""
-_BONE_SHARES = tuple(_SHARES[frozenset((kind(JOINTS[a]), kind(JOINTS[b])))] for a, b in BONES)
 _SIDES = tuple(float(name.startswith("left")) - float(name.startswith("right")) for name in JOINTS)
 
 PerKeyPoint = Float[Tensor, "B V J"]
@@ -123,7 +99,7 @@ def measure(observations: Observations, start: PoseEstimate) -> Geometry:
     x = (pixels[..., 0] - K[..., 0, 1, None] * y) / K[..., 0, 0, None]
     position = torch.stack((x, y), dim=-1)
     position = torch.where(valid[..., None], position, 0.0)
-    unit = UNIT * _stature(points, estimated)
+    unit = UNIT * stature(points, estimated)
     residual = position * depth[..., None] - in_camera[..., :2]
     residual = residual / unit[:, None, None, None]
     direction = torch.cat((position, torch.ones_like(position[..., :1])), dim=-1) @ R
@@ -146,7 +122,7 @@ def featurize(observations: Observations, start: PoseEstimate) -> Float[Tensor, 
     geometry = measure(observations, start)
     valid = geometry.valid
     views = valid.sum(1, keepdim=True)
-    residual = _log(geometry.residual.norm(dim=-1))
+    residual = log_length(geometry.residual.norm(dim=-1))
     confidence = observations.confidence.float().clamp(min=0.01, max=1.0).log()
     in_frame = _median(residual, valid, (1, 2))
     nearest, second = _ray_distances(geometry)
@@ -158,7 +134,7 @@ def featurize(observations: Observations, start: PoseEstimate) -> Float[Tensor, 
         _largest_of_others(residual, valid),
         in_frame,
         _median(residual, valid, (2,)),
-        _log(_without_common(geometry.residual, valid).norm(dim=-1)),
+        log_length(_without_common(geometry.residual, valid).norm(dim=-1)),
         freedom,
         nearest,
         second,
@@ -175,22 +151,6 @@ def featurize(observations: Observations, start: PoseEstimate) -> Float[Tensor, 
     ]
     stacked = torch.stack([feature.expand(valid.shape) for feature in features], dim=-1)
     return torch.where(valid[..., None], stacked, 0.0)
-
-
-def _log(length: Tensor) -> Tensor:
-    """Return the logarithm of a length in units; one far below a unit is none."""
-    return (length + 0.05).log()
-
-
-def _stature(points: Float[Tensor, "B J 3"], estimated: Bool[Tensor, "B J"]) -> Float[Tensor, " B"]:
-    """Return the stature that the median bone has, mm."""
-    start = [a for a, _ in BONES]
-    end = [b for _, b in BONES]
-    length = (points[:, start] - points[:, end]).norm(dim=-1)
-    complete = estimated[:, start] & estimated[:, end]
-    ratio = length / length.new_tensor(_BONE_SHARES)
-    median = torch.where(complete, ratio, torch.nan).nanmedian(-1).values
-    return median.nan_to_num(_STATURE).clamp(0.3 * _STATURE, 3 * _STATURE)
 
 
 def _mean(values: PerKeyPoint, valid: Mask, dim: int) -> PerKeyPoint:
@@ -238,7 +198,7 @@ def _ray_distances(geometry: Geometry) -> tuple[PerKeyPoint, PerKeyPoint]:
     between = geometry.centre[:, :, None] - geometry.centre[:, None]
     length = normal.norm(dim=-1).clamp(min=_PARALLEL)
     distance = (normal * between[..., None, :]).sum(-1).abs() / length
-    distance = _log(distance / geometry.unit[:, None, None, None])
+    distance = log_length(distance / geometry.unit[:, None, None, None])
     itself = torch.eye(views, dtype=torch.bool, device=valid.device)[..., None]
     other = valid[:, None] & ~itself
     distance = torch.where(other, distance, _STRANGE).clamp(max=_STRANGE)
@@ -284,21 +244,14 @@ def _beside_mirror(geometry: Geometry) -> PerKeyPoint:
     mirror = list(MIRROR)
     points = geometry.points[:, mirror] - geometry.points
     across = (points[:, None] @ geometry.R.mT)[..., :2] / geometry.unit[:, None, None, None]
-    return _log((geometry.residual - across).norm(dim=-1))
+    return log_length((geometry.residual - across).norm(dim=-1))
 
 
 def _camera_direction(geometry: Geometry) -> list[PerKeyPoint]:
     """Return the direction of the camera in the trunk's frame; 0 where there is no trunk."""
-    points = geometry.points
-    up = points[:, THORAX] - points[:, PELVIS]
-    across = points[:, JOINT["left_hip"]] - points[:, JOINT["right_hip"]]
-    needed = [PELVIS, THORAX, JOINT["left_hip"], JOINT["right_hip"]]
-    known = geometry.estimated[:, needed].all(-1)[:, None, None]
-    up = torch.nn.functional.normalize(up, dim=-1)
-    forward = torch.nn.functional.normalize(torch.linalg.cross(across, up), dim=-1)
-    left = torch.linalg.cross(up, forward)
+    axes, known = trunk_axes(geometry.points, geometry.estimated)
     direction = torch.nn.functional.normalize(geometry.centre, dim=-1)
-    axes = torch.where(known, torch.stack((forward, left, up), dim=1), 0.0)
+    axes = torch.where(known[:, None, None], axes, 0.0)
     ahead, aside, above = (direction @ axes.mT)[:, :, None].unbind(-1)
     side = aside.new_tensor(_SIDES)
     return [ahead, aside * side, above]
@@ -323,7 +276,7 @@ def _bone_errors(geometry: Geometry) -> list[PerKeyPoint]:
     length = bone.norm(dim=-1)
     complete = geometry.estimated[:, start] & geometry.estimated[:, end]
     unit = geometry.unit[:, None]
-    share = length.new_tensor(_BONE_SHARES)
+    share = length.new_tensor(BONE_SHARES)
     excess = torch.where(complete, length / unit - share / UNIT, 0.0)
     pull = excess[..., None] * bone / length.clamp(min=1.0)[..., None]
     total = torch.zeros_like(points)
@@ -340,4 +293,4 @@ def _bone_errors(geometry: Geometry) -> list[PerKeyPoint]:
     size_of_residual = geometry.residual.norm(dim=-1).clamp(min=0.1)
     along = (in_view * geometry.residual).sum(-1) / size_of_residual
     signed = along.sign() * (along.abs() + 1).log()
-    return [_log(error)[:, None], signed, _log(ends.clamp(min=0))[:, None]]
+    return [log_length(error)[:, None], signed, log_length(ends.clamp(min=0))[:, None]]

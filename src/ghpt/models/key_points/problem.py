@@ -15,11 +15,10 @@ from ghpt.geometry.triangulation import Triangulation, triangulate
 from ghpt.models.estimators.ransac import AdaptiveRansac
 from ghpt.models.key_points.features import NAMES, featurize, measure
 from ghpt.models.pose.problem import PoseProblem
+from ghpt.models.pose.robust_error import robust_error
 from ghpt.models.problem import Errors, Features, Hypotheses, Keys, Weights
 from ghpt.observations import Observations, PoseEstimate, Truth
 
-_SMALL = 10.0
-"""mm: the loss grows with the error below it, and with its root far above."""
 _FAR = 1e4
 """mm: no key point is farther from the truth than that."""
 
@@ -105,9 +104,5 @@ class KeyPointWeights(PoseProblem):
         return distance.flatten(1), usable.flatten(1).any(-1)
 
     def training_error(self, estimate: PoseEstimate, truth: Truth) -> Float[Tensor, " B"]:
-        """Return the mean over the joints of the root of 1 + distance / ``_SMALL``, less 1."""
-        difference = estimate.points - truth.points.double()
-        counted = estimate.estimated & truth.valid
-        square = torch.where(counted, difference.square().sum(-1), 1.0)
-        loss = torch.where(counted, (1 + square.sqrt() / _SMALL).sqrt() - 1, 0.0)
-        return loss.sum(-1) / counted.sum(-1).clamp_min(1)
+        """Return `robust_error`."""
+        return robust_error(estimate, truth)

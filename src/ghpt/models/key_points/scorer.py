@@ -1,4 +1,7 @@
-"""The network that scores each key point beside the others of its joint and of its view."""
+"""The network that scores each key point beside the others of its joint and of its view.
+
+It serves the hypotheses of joints as well: a row is a view, or what one subset of views gives.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from ghpt.errors import check
-from ghpt.models.key_points.features import KINDS, kind
+from ghpt.models.body import KINDS, kind
 from ghpt.models.scorer import Standardise
 from ghpt.skeleton import JOINTS
 
@@ -21,15 +24,19 @@ class KeyPointScorer(nn.Module):
 
     Each key point is seen alone, then beside the mean and the largest of what was made of the
     other views' and the mean of its own view's. ``width``: of all layers. ``clip``: features beyond
-    it say no more.
+    it say no more. ``limit``: the largest size of a logit, None for none; without one the weights
+    of averages collapse onto one hypothesis before anything is learned.
     """
 
     kinds: Tensor
 
-    def __init__(self, size: int, width: int, clip: float) -> None:
+    def __init__(self, size: int, width: int, clip: float, limit: float | None = None) -> None:
         super().__init__()
         hint = f"It must be 1 to {_LARGEST_WIDTH}."
         check(1 <= width <= _LARGEST_WIDTH, "model.scorer.width", f"is {width}", hint)
+        hint = "It must be > 0, or null for no limit."
+        check(limit is None or limit > 0, "model.scorer.limit", f"is {limit}", hint)
+        self.limit = limit
         self.standardise = Standardise(size, clip)
         self.standardise.fitted.fill_(True)  # the features are of order one as they are
         self.register_buffer("kinds", torch.tensor([KINDS.index(kind(j)) for j in JOINTS]), False)
@@ -54,8 +61,10 @@ class KeyPointScorer(nn.Module):
         context = self.of_joint(joint) + self.of_view(_mean(hidden, valid, 2))
         hidden = torch.relu(self.beside(hidden) + context)
         hidden = torch.relu(self.together(hidden))
-        logits = torch.where(valid, self.logit(hidden), _NOT_VALID)
-        return logits.flatten(1)
+        logits = self.logit(hidden)
+        if self.limit is not None:
+            logits = self.limit * torch.tanh(logits / self.limit)
+        return torch.where(valid, logits, _NOT_VALID).flatten(1)
 
 
 def _mean(

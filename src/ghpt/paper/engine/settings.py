@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ghpt.errors import check_positive
+
 
 @dataclass(frozen=True)
 class Overrides:
@@ -54,14 +56,32 @@ class Ablation:
 
 
 @dataclass(frozen=True)
+class Sequences:
+    """Runs of successive frames, in which time can tell something."""
+
+    stride: int
+    """Every so many frames of a recording a run begins."""
+    frames: int
+    """Of each run."""
+    tested: int
+    """Every so many frames of a run are compared with the truth."""
+
+    def __post_init__(self) -> None:
+        check_positive(stride=self.stride, frames=self.frames, tested=self.tested)
+
+
+@dataclass(frozen=True)
 class Robustness:
     """Sizes of the robustness curves; lengths are in the person's size in the image."""
 
     trained_on: str
-    stride: Mapping[str, int]
-    """Data set -> every so many frames are tested."""
+    sequences: Mapping[str, Sequences]
+    """h36m, panoptic -> which frames are estimated and tested."""
+    lasting: int
+    """Frames for which a mistake lasts that is not new in every frame."""
     outliers: tuple[float, ...]
     """Shares of the detections."""
+    lasting_outliers: tuple[float, ...]
     outliers_shortest: float
     outliers_longest: float
     noise: tuple[float, ...]
@@ -73,6 +93,13 @@ class Robustness:
     """Degrees."""
     shift: tuple[float, ...]
     """mm."""
+    flips: tuple[float, ...]
+    """Shares of the views."""
+    other_people: tuple[float, ...]
+    """Shares of the views."""
+    nearest: float
+    """Distance of another person, mm."""
+    farthest: float
 
 
 @dataclass(frozen=True)

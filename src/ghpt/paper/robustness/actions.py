@@ -14,16 +14,22 @@ from ghpt.config import Target, build, settings
 from ghpt.files import write_json
 from ghpt.metrics.pose_error import MPJPE, Kind
 from ghpt.models.checkpoint import LAST, load_model
+from ghpt.models.estimators.trajectory.estimator import Trajectory
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.problem import BaselineSettings
 from ghpt.observations import Labelled, Observations, PoseEstimate, Truth
+from ghpt.paper.engine.settings import Sequences
+from ghpt.paper.robustness.perturbation import Perturbation
+from ghpt.paper.robustness.runs import Runs, draw_runs
 from ghpt.skeleton import JOINTS
 
 KINDS: tuple[Kind, ...] = ("relative", "absolute")
 OF_POOL = ("weight", "average", "most", "best")
 """Selections of the model's pool; the best one looks at the truth."""
-LEARNED = (*OF_POOL, "view_weights", "frame_learned")
-"""Every estimator that is not classical."""
+TRAJECTORY = "trajectory"
+OURS = (TRAJECTORY, "frame_learned", "view_weights")
+"""What the paper lacks, to be compared with the classical estimators of single frames."""
+NOT_CLASSICAL = (*OF_POOL, *OURS)
 
 Estimator = Callable[[Any], Any]
 """From observations to an estimate, as the problem of the model has them."""
@@ -36,9 +42,13 @@ class CurveSettings:
     data: Target
     baselines: Mapping[str, Target]
     view_weights: Target
+    sequences: Mapping[str, int]
+    """`Sequences`."""
     seed: int
     perturbations: Sequence[Target | None]
     """None: the data as they are."""
+    trajectory: Target | None = None
+    """How successive frames are estimated together; None: not at all."""
     files: Mapping[str, Any] = field(default_factory=dict)
     """What identifies the files of a real data set."""
 
@@ -91,27 +101,46 @@ class LevelMetrics:
 def measure_curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
     """Measure all estimators on the data under each of the perturbations; see `CurveSettings`.
 
-    They are the model of the dependency ``model``, view weights and baselines. result.json:
-    `CurveContent`.
+    They are the model of the dependency ``model``, view weights, baselines and the trajectory.
+    result.json: `CurveContent`.
     """
     own = settings(CurveSettings, config)
     data = build(own.data, "data")
     data.setup("test")
-    frames = data.frames["test"]
+    runs = draw_runs(data.frames["test"].recordings, settings(Sequences, own.sequences))
     model, _ = load_model(dependencies["model"] / LAST, seed=own.seed)
     groups = BaselineSettings(own.baselines, {}, own.view_weights)
     estimate = all_estimators(model.eval(), model.problem.baselines(groups, model))
-    perturbations = build(own.perturbations, "perturbations")
-    levels = [LevelMetrics() for _ in perturbations]
-    for first in range(0, len(frames), data.batch_size):
-        batch = frames[range(first, min(first + data.batch_size, len(frames)))]
-        for metrics, perturbation in zip(levels, perturbations, strict=True):
-            observations = batch.observations
-            if perturbation is not None:
-                observations = perturbation(observations, own.seed)
-            metrics.update(estimate(Labelled(observations, batch.truth)), batch.truth)
-    content = CurveContent(len(frames), [metrics.compute() for metrics in levels])
+    trajectory = build(own.trajectory, "trajectory") if own.trajectory else None
+    levels = [
+        _measure_level(runs, perturbation, own.seed, estimate, trajectory, data.batch_size)
+        for perturbation in build(own.perturbations, "perturbations")
+    ]
+    content = CurveContent(int(runs.tested.sum()), levels)
     write_json(folder / "result.json", asdict(content))
+
+
+def _measure_level(
+    runs: Runs,
+    perturbation: Perturbation | None,
+    seed: int,
+    estimate: Callable[[Labelled[Observations, Truth]], dict[str, PoseEstimate]],
+    trajectory: Trajectory | None,
+    batch_size: int,
+) -> dict[str, LevelErrors]:
+    """Return the errors of all estimators in the frames of the runs that are tested."""
+    observations = runs.batch.observations
+    if perturbation is not None:
+        observations = perturbation(observations, seed)
+    tested = Labelled(observations, runs.batch.truth).rows(runs.tested)
+    metrics = LevelMetrics()
+    for first in range(0, len(tested), batch_size):
+        batch = tested.rows(slice(first, first + batch_size))
+        metrics.update(estimate(batch), batch.truth)
+    if trajectory is not None:
+        poses = runs.estimate(trajectory, observations).rows(runs.tested)
+        metrics.update({TRAJECTORY: poses}, tested.truth)
+    return metrics.compute()
 
 
 def all_estimators(

@@ -14,7 +14,8 @@ from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
 from ghpt.paper.robustness.actions import (
     KINDS,
-    LEARNED,
+    NOT_CLASSICAL,
+    OURS,
     CurveContent,
     CurveSettings,
     LevelErrors,
@@ -60,28 +61,29 @@ class Curve:
             for level in self.levels(setup)
             if level
         ]
-        return _curve_task(setup, self.name, self.data, perturbations)
+        return curve_task(setup, self.name, self.data, perturbations)
 
 
 def curve_tasks(setup: Setup, curves: Sequence[Curve]) -> dict[str, Task]:
     """Return the tasks of some curves by name, with that of the unperturbed data."""
     tasks = {curve.name: curve.task(setup) for curve in curves}
     if any(0 in curve.levels(setup) for curve in curves):
-        tasks[CLEAN] = _curve_task(setup, CLEAN, "h36m", [None])
+        tasks[CLEAN] = curve_task(setup, CLEAN, "h36m", [None])
     return tasks
 
 
-def _curve_task(
+def curve_task(
     setup: Setup, name: str, data: str, perturbations: Sequence[Mapping[str, Any] | None]
 ) -> Task:
     """Return the task that measures every estimator under each of the perturbations."""
     sizes = setup.sizes.robustness
-    stride = f"data.stride={sizes.stride[data]}"
-    whole = setup.configuration("test", data, *setup.overrides.test, stride)
+    whole = setup.configuration("test", data, *setup.overrides.test)
     config = CurveSettings(
         data=whole["data"],
         baselines=whole["baselines"],
         view_weights=whole["view_weights"],
+        sequences=asdict(sizes.sequences["h36m" if data == "h36m" else "panoptic"]),
+        trajectory=whole["trajectory"] and whole["trajectory"]["trajectory"],
         seed=setup.seed,
         perturbations=list(perturbations),
         files=whole.get("files", {}),
@@ -90,7 +92,7 @@ def _curve_task(
         "model": setup.training(sizes.trained_on),
         "data": setup.preparation(data, "test"),
     }
-    seconds = 2 + (5.0 if data == "h36m" else 3.5) * len(perturbations)
+    seconds = 2 + (10.0 if data == "h36m" else 8.0) * len(perturbations)
     name = f"robustness-{name}-seed{setup.seed}"
     return Task(name, ACTION, asdict(config), dependencies, seconds=seconds)
 
@@ -115,15 +117,28 @@ class CurveResult:
 
     @property
     def classical(self) -> list[str]:
-        return [name for name in self.errors["relative"] if name not in LEARNED]
+        return [name for name in self.errors["relative"] if name not in NOT_CLASSICAL]
+
+    @property
+    def ours(self) -> list[str]:
+        """Those of `OURS` that were measured."""
+        return [name for name in OURS if name in self.errors["relative"]]
 
     def mean(self, name: str, level: int, kind: str = "relative") -> float:
         """Return the mean error of an estimator at a level, mm."""
         return self.errors[kind][name][level].mean
 
     def lead(self, name: str, level: int) -> float:
-        """Return by what share an estimator's error is below that of the best classical one."""
+        """Return by what share an estimator's error is below that of the best classical one.
+
+        NaN where nothing was measured.
+        """
         return 1 - self.mean(name, level) / self.mean(self.best_classical(level), level)
+
+    def leads(self, name: str) -> dict[int, float]:
+        """Return the `lead` of an estimator at each level at which there is one."""
+        leads = {level: self.lead(name, level) for level in range(len(self.levels))}
+        return {level: lead for level, lead in leads.items() if math.isfinite(lead)}
 
     def best_classical(self, level: int) -> str:
         """Return the classical estimator with the smallest error at a level."""
@@ -143,18 +158,30 @@ def read_curve(results: Results, curve: Curve) -> CurveResult:
     if 0 in levels:
         for of_seed, clean in zip(seeds, _contents(results, CLEAN), strict=True):
             of_seed.insert(list(levels).index(0), clean.levels[0])
+    places = [curve.factor * level for level in levels]
+    return _as_result(seeds, places, contents[0].frames)
+
+
+def read_task(results: Results, name: str) -> CurveResult:
+    """Return the results of a task whose data are as they are."""
+    contents = _contents(results, name)
+    return _as_result([content.levels for content in contents], [0], contents[0].frames)
+
+
+def _as_result(
+    seeds: Sequence[Sequence[Mapping[str, LevelErrors]]], places: Sequence[Number], frames: int
+) -> CurveResult:
     errors = {str(kind): _spreads(seeds, kind) for kind in KINDS}
     coverage = []
-    for level in range(len(levels)):
+    for level in range(len(places)):
         shares = [
             estimator.coverage["relative"]
             for of_seed in seeds
             for estimator in of_seed[level].values()
         ]
         coverage.append((min(shares), max(shares)))
-    places = [curve.factor * level for level in levels]
     labels = [f"{place:g}" for place in places]
-    return CurveResult(labels, places, errors, coverage, contents[0].frames)
+    return CurveResult(labels, places, errors, coverage, frames)
 
 
 def _contents(results: Results, task: str) -> list[CurveContent]:

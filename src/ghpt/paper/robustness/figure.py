@@ -27,21 +27,32 @@ STYLES = {
     "view_weights": ("#000000", "-", "*"),
     "adaptive_ransac": ("#882255", (0, (5, 1, 1, 1)), "<"),
     "frame_learned": ("#117733", "-", "p"),
+    "trajectory": ("#CC3311", "-", "h"),
     "best": ("#999999", ":", "*"),
     "trained": ("#E69F00", "-.", "D"),
     "tested": ("#D55E00", "--", "s"),
 }
 LABELS = NAMES | {
     "weight": "the paper's selection",
+    "trajectory": "trajectories",
     "view_weights": "learned view weights",
-    "frame_learned": "learned key-point weights",
+    "frame_learned": "learned frames",
     "average": "average of its pool",
     "most": "best-scored of its pool",
     "best": "best of its pool (looks at the truth)",
 }
-WIDTHS = {"weight": 2.2, "view_weights": 2.6, "linear": 2.6, "ransac": 3.2, "adaptive_ransac": 4.0}
+WIDTHS = {
+    "weight": 2.2,
+    "trajectory": 2.6,
+    "frame_learned": 2.2,
+    "view_weights": 2.2,
+    "linear": 2.6,
+    "ransac": 3.2,
+    "adaptive_ransac": 4.0,
+}
 """Widths of the lines that others often lie upon, or that matter most."""
 OTHER_WIDTH = 1.4
+_IN_FRONT = ("weight", "trajectory", "frame_learned", "view_weights")
 ACROSS = 6.0
 """Largest ratio of the errors in a panel on a linear axis."""
 TICKS = (10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1000, 2000, 5000)
@@ -158,5 +169,5 @@ def _draw_line(axes: Axes, name: str, line: Line, label: str) -> None:
         linewidth=width,
         capsize=2,
         label=label,
-        zorder=5 - width / 4 + (name in ("weight", "view_weights")),
+        zorder=5 - width / 4 + (name in _IN_FRONT),
     )

@@ -48,10 +48,10 @@ def _coverage_text(low: float, high: float) -> str:
 
 
 def verdict(curve: Curve, result: CurveResult) -> str:
-    """Return where the view weights and the paper's selection stand at the levels of a curve.
+    """Return where our estimators and the paper's selection stand at the levels of a curve.
 
-    The view weights are set against the best classical estimator of each level; the paper's
-    selection against that, LO-RANSAC and its own pool.
+    Ours are set against the best classical estimator of each level; the paper's selection against
+    that, LO-RANSAC and its own pool.
     """
     ahead = [f"of all classical estimators at {_winning_levels(curve, result, result.classical)}"]
     if "lo_ransac" in result.classical:
@@ -59,7 +59,7 @@ def verdict(curve: Curve, result: CurveResult) -> str:
     most = _means_at_ends(result, "most")
     best = _means_at_ends(result, "best")
     sentences = [
-        _view_weights_text(curve, result),
+        *(_lead_text(curve, result, name) for name in result.ours),
         _selection_text(curve, result, 0),
         _selection_text(curve, result, result.last),
         f"It is ahead {', '.join(ahead)}.",
@@ -73,13 +73,9 @@ def _means_at_ends(result: CurveResult, name: str) -> str:
     return f"{result.mean(name, 0):.1f} and {result.mean(name, result.last):.1f}"
 
 
-def _view_weights_text(curve: Curve, result: CurveResult) -> str:
-    """Return wins, ties and losses over the measured levels, and the two ends."""
-    leads = {}
-    for level in range(len(result.levels)):
-        lead = result.lead("view_weights", level)
-        if math.isfinite(lead):
-            leads[level] = lead
+def _lead_text(curve: Curve, result: CurveResult, name: str) -> str:
+    """Return an estimator's wins, ties and losses over the measured levels, and the two ends."""
+    leads = result.leads(name)
     if not leads:
         return ""
     won = sum(lead > TIE for lead in leads.values())
@@ -87,15 +83,16 @@ def _view_weights_text(curve: Curve, result: CurveResult) -> str:
     tied = len(leads) - won - lost
     worst = min(leads, key=leads.__getitem__)
     best = max(leads, key=leads.__getitem__)
+    label = LABELS[name]
     return (
-        f"Against the best classical estimator of each of {len(leads)} levels the view weights win "
+        f"Against the best classical estimator of each of {len(leads)} levels the {label} win "
         f"{won}, tie {tied} and lose {lost}: "
-        f"from {margin(result, worst)} at {result.levels[worst]}{curve.unit} "
-        f"to {margin(result, best)} at {result.levels[best]}{curve.unit}."
+        f"from {margin(result, worst, name)} at {result.levels[worst]}{curve.unit} "
+        f"to {margin(result, best, name)} at {result.levels[best]}{curve.unit}."
     )
 
 
-def margin(result: CurveResult, level: int, name: str = "view_weights") -> str:
+def margin(result: CurveResult, level: int, name: str) -> str:
     """Return by what share an estimator leads the best classical one.
 
     For example ``+2.8 % (24.0 mm, adaptive RANSAC 24.7)``.

@@ -130,7 +130,7 @@ class LagWindow:
         """What the frames say on their own."""
         self.as_given = np.arange(joints)
         self.order: Int[Array, "K V J"] = np.broadcast_to(self.as_given, self.given.used.shape)
-        self.seen = self.given.used.any(1)
+        self.seen = np.asarray(self.given.used.any(1))
         self.residual = self.given.residuals(self.points)
         """[K V J]: the lengths of the residuals, mm at the body's depth."""
         self.squares = np.zeros((0, joints))

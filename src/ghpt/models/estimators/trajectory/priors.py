@@ -59,10 +59,24 @@ class MotionPrior:
         check_positive(**{name: getattr(self, name) for name in self.__annotations__})
         check(self.least <= self.most, "least", "is above most", "Exchange them.")
 
-    def initial(self, axis: TimeAxis, joints: int) -> Float[Tensor, "J T"]:
-        """Return the deviation of second differences before there is an estimate, mm."""
-        shape = (joints, len(axis.joined))
-        return torch.full(shape, self.first * axis.scale**2, dtype=torch.float64)
+    def initial(
+        self, start: Float[Tensor, "3 J T"], placed: Bool[Tensor, "J T"], axis: TimeAxis
+    ) -> Float[Tensor, "J T"]:
+        """Return the deviation of second differences before there is an estimate, mm.
+
+        ``start``: single frames' points where ``placed``. Where most joints jump, the recording has
+        been cut or the person has been thrown: there the deviation is that jump.
+        """
+        known = placed[:, :-2] & placed[:, 1:-1] & placed[:, 2:]
+        inside = _inside(axis.joined)[1:-1] & known
+        length = torch.linalg.vector_norm(start.diff(n=2, dim=-1), dim=0)
+        jump = torch.zeros_like(axis.joined, dtype=torch.float64)
+        jump[1:-1] = torch.where(inside, length, torch.nan).nanmedian(0).values.nan_to_num(0.0)
+        usual = jump[jump > 0]
+        limit = _JUMP * float(usual.median()) if len(usual) else 0.0
+        deviation = torch.full_like(jump, self.first * axis.scale**2)
+        deviation = torch.where(jump > limit, torch.maximum(deviation, jump), deviation)
+        return deviation.expand(placed.shape).clone()
 
     def adapt(self, points: Float[Tensor, "3 J T"], axis: TimeAxis) -> Float[Tensor, "J T"]:
         """Return the deviation of second differences around each frame of an estimate, mm."""
@@ -101,6 +115,8 @@ class MotionPrior:
         return TimeCoupling(own, near, far)
 
 
+_JUMP = 4.0
+"""Of the usual second difference of the median joint: from there on it is a jump."""
 _TINY = 1e-5
 """Of the velocity prior's precision: keeps the matrix of what nobody sees positive definite."""
 

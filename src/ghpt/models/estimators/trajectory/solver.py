@@ -171,7 +171,7 @@ class _Rounds:
         self.near = solver.bones.near(self.both_placed, frames.axis)
         self.tolerance = solver.tolerance
         self.given = body
-        self.deviation = solver.motion.initial(frames.axis, joints)
+        self.deviation = solver.motion.initial(frames.start, frames.placed, frames.axis)
         self.seen = frames.rows.used.any(0)
         self.points = self._join_start()
         self.body = body or self._measure(self.points)
