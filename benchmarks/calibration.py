@@ -12,7 +12,7 @@ the person goes in the whole take, after a similarity: the mean distance. ``s`` 
 
 Settings: ``draws=4`` ``rig=h36m`` ``detector=human36m,field``
 ``recordings=spread-80,successive-600``
-``outliers=0,0.1`` ``split=test`` (``validation``: where settings may be chosen) ``peers=`` (words
+``outliers=0,0.1`` ``split=test`` (``validation``: where settings are chosen) ``peers=`` (words
 that the names contain; none: all) ``caliscope_filter=2.5,10`` ``threads=1``.
 """
 

@@ -12,8 +12,9 @@ aniposelib is the PyTorch one, and is left out where it is not installed. Pose2S
 written anew from its publication, without the exchange of sides (off by default there).
 
 Settings: ``takes=8`` ``split=test`` ``detector=human36m`` ``conditions=as it is,outliers 10 % w``
-(none: real recordings alone) ``tau=10`` (aniposelib's threshold, pixels) ``pose2sim=15``
-(Pose2Sim's) ``folder=`` (none: synthetic data alone).
+(none: real recordings alone) ``tau=10,20`` (aniposelib's thresholds, pixels: its default, and the
+best on the validation split) ``pose2sim=15,10`` (the same of Pose2Sim) ``folder=`` (none: synthetic
+data alone).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -69,23 +71,30 @@ def ours() -> dict[str, Method]:
     def whole(batch: Observations, rate_hz: float) -> PoseEstimate:
         return trajectory.at_rate(batch, rate_hz).fit_to(batch).complete(batch)
 
-    return {
-        "ghpt, adaptive RANSAC": lambda batch, rate_hz: frame(batch),
-        "ghpt, trajectory": whole,
-    }
+    return {"ghpt, adaptive RANSAC": by_frame(frame), "ghpt, trajectory": whole}
 
 
-def theirs(tau: float, largest_error: float) -> dict[str, Method]:
-    """Return the peers that can be run."""
+def theirs(taus: list[float], largest_errors: list[float]) -> dict[str, Method]:
+    """Return the peers that can be run, with each of their thresholds."""
     methods: dict[str, Method] = {}
     if installed("aniposelib-pytorch"):
-        methods["aniposelib, linear"] = lambda batch, rate_hz: anipose_linear(batch)
-        methods["aniposelib, MSAC"] = lambda batch, rate_hz: anipose_msac(batch, tau)
-    methods["Pose2Sim's exclusion"] = lambda batch, rate_hz: pose2sim(batch, largest_error)
-    methods["the same, filled and filtered"] = lambda batch, rate_hz: pose2sim_filtered(
-        batch, rate_hz, largest_error
-    )
+        methods["aniposelib, linear"] = by_frame(anipose_linear)
+        for tau in taus:
+            methods[f"aniposelib, MSAC {tau:g} px"] = by_frame(partial(anipose_msac, tau=tau))
+    for limit in largest_errors:
+        name = f"Pose2Sim's exclusion {limit:g} px"
+        methods[name] = by_frame(partial(pose2sim, largest_error=limit))
+        methods[f"{name}, filtered"] = partial(pose2sim_filtered, largest_error=limit)
     return methods
+
+
+def by_frame(estimate: Callable[[Observations], PoseEstimate]) -> Method:
+    """Return a method for which the rate does not matter."""
+
+    def method(batch: Observations, rate_hz: float) -> PoseEstimate:
+        return estimate(batch)
+
+    return method
 
 
 def score_synthetic(method: Method, batches: list[Observations], truths: list[Recorded]) -> Score:
@@ -146,12 +155,13 @@ def main() -> None:
         split="test",
         detector="human36m",
         conditions="as it is,outliers 10 % w",
-        tau=10.0,
-        pose2sim=15.0,
+        tau="10,20",
+        pose2sim="15,10",
         folder="",
     )
     torch.set_num_threads(1)
-    methods = ours() | theirs(wanted["tau"], wanted["pose2sim"])
+    thresholds = ([float(x) for x in wanted[name].split(",")] for name in ("tau", "pose2sim"))
+    methods = ours() | theirs(*thresholds)
     detector = Detector(**configuration(f"detector/{wanted['detector']}")["detector"])
     every = list(takes("h36m", wanted["split"], 0))
     chosen = np.linspace(0, len(every) - 1, wanted["takes"]).astype(int)
