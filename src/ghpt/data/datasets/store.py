@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -24,6 +25,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.observations import LabelledRecording
 from ghpt.skeleton import JOINTS
 
+_log = logging.getLogger(__name__)
 FORMAT = "ghpt recordings"
 VERSION = 2
 
@@ -149,6 +151,7 @@ def prepare(
     folder = root / f"{key['name']}-{fingerprint}"
     if not folder.exists():
         sweep_temporaries(root)
+        _log.info("Preparing the recordings of %s, once for all runs, in %s.", key["name"], root)
         write_store(folder, make(), provenance | {"key": key})
     return open_store(folder)
 
