@@ -157,6 +157,7 @@ class PredictSettings(InputSettings):
         return {name: value for name, value in values.items() if value != _DEFAULTS[name]}
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
             count = getattr(self, name)
             check(count >= 1, name, f"is {count}", "Give 1 or more.")
