@@ -12,6 +12,7 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import islice
 from pathlib import Path
 
 import hydra
@@ -39,14 +40,21 @@ def compose(overrides: list[str]) -> dict:
 
 
 def synthetic(
-    camera_check: CameraCheck, names: list[str], frames: int, take: int
+    camera_check: CameraCheck,
+    names: list[str],
+    splits: list[str],
+    detector: str | None,
+    frames: int,
+    take: int,
 ) -> Iterator[tuple[str, Case]]:
     """The middle ``frames`` frames of ``take`` recordings of each arrangement, over all of its
-    subjects.
+    subjects in the splits; ``detector``: None for each arrangement's own.
     """
+    own = [f"detector@data.synthetic.detector={detector}"] if detector else []
     for name in names:
-        for split in ("train", "validation", "test"):
-            data = build(compose([f"data={name}", f"data.evaluate={split}"])["data"], "data")
+        for split in splits:
+            words = [f"data={name}", f"data.evaluate={split}", *own]
+            data = build(compose(words)["data"], "data")
             made = {"source": data.source, "split": split}
             stored = prepare(
                 data.cache,
@@ -80,6 +88,8 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--data", nargs="*", default=["h36m", "cmu1", "cmu2", "cmu3", "cmu4"])
+    parser.add_argument("--splits", nargs="*", default=["train", "validation", "test"])
+    parser.add_argument("--detector", help="another than each arrangement's own: field")
     parser.add_argument("--frames", type=int, default=200, help="of each recording")
     parser.add_argument("--take", type=int, default=1, help="recordings of each subject")
     parser.add_argument("--limit", type=int, default=1 << 30, help="recordings of all")
@@ -88,9 +98,8 @@ def main() -> None:
     parser.add_argument("--real", type=Path, help="folder with pose2sim_single and caliscope")
     options = parser.parse_args()
     camera_check = build(compose([])["camera_check"], "camera_check")
-    cases = list(synthetic(camera_check, options.data, options.frames, options.take))[
-        : options.limit
-    ]
+    wanted = (options.data, options.splits, options.detector, options.frames, options.take)
+    cases = list(islice(synthetic(camera_check, *wanted), options.limit))
     if options.real:
         cases += real(camera_check, options.real)
     table: dict[str, Counter] = defaultdict(Counter)

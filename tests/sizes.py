@@ -39,7 +39,7 @@ KILLED_PREDICTIONS = _size(4, 200)
 """B3: kills of a prediction."""
 PREDICTED_FRAMES = _size(500, 100_000)
 """B3: frames of that prediction."""
-TRAINING_STEPS = _size(240, 20_000)
+TRAINING_STEPS = _size(120, 20_000)
 """E3: steps of a long training."""
 STREAMED_FRAMES = _size(12_000, 1_000_000)
 """E2: frames of a prediction whose memory stays flat."""

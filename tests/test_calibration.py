@@ -17,6 +17,7 @@ from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import matrix_to_vector, nearest_rotation, vector_to_matrix
 from ghpt.metrics.relative_pose import rotation_deg, translation_deg
+from ghpt.models.estimators.classical import person_scale
 from rigs_with_people import calibration, people, relative
 from scenes import labelled_pairs
 
@@ -114,6 +115,21 @@ def test_uncertainty_is_the_size_of_the_error():
     z = torch.stack(z)
     assert 0.7 < z.square().mean().sqrt() < 1.4
     assert (z.abs() < 2).double().mean() > 0.88
+
+
+def test_errors_that_last_are_in_the_uncertainty():
+    z = []
+    for seed in range(3):
+        scene = people(frames=30, noise=0.003, seed=seed)
+        generator = torch.Generator().manual_seed(seed)
+        bias = torch.randn(scene.key_points.shape[1:], generator=generator, dtype=torch.float64)
+        size = person_scale(scene.key_points, scene.valid)
+        lasting = 0.02 * size[..., None, None] * bias
+        estimate = replace(scene, key_points=scene.key_points + lasting).calibrate(CALIBRATE)
+        variance = estimate.covariance.diagonal(dim1=-2, dim2=-1)
+        z.append(free_error(estimate, scene.cameras) / variance.sqrt())
+        assert estimate.evidence.lasting > 0.2
+    assert 0.5 < torch.stack(z).square().mean().sqrt() < 1.8
 
 
 def problem(views=3, seed=0):

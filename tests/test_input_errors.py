@@ -7,6 +7,7 @@ import pytest
 from hydra._internal.utils import get_args_parser
 
 from composed import CONF
+from ghpt.api import default_settings
 from ghpt.commands.overrides import Source, check_overrides, expand_home, parse_options
 from ghpt.config import check_type
 from ghpt.data.formats.camera_files import read_cameras
@@ -137,3 +138,8 @@ def test_a_missing_package_is_said_by_its_own_name():
     with pytest.raises(GhptConfigError, match=r"x needs some-package.*pip install some-package"):
         writer.check_installed("x")
     Writer("poses.x", print, module="json", package="json").check_installed("x")
+
+
+def test_cameras_without_key_points_are_no_wish_for_synthetic_people():
+    with pytest.raises(GhptConfigError, match="keypoints"):
+        default_settings(cameras="Calib.toml")

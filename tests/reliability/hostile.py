@@ -152,6 +152,54 @@ def deeplabcut(folder: Path) -> Path:
     return folder / "a.h5"
 
 
+def sleap_labels(folder: Path) -> Path:
+    import h5py
+
+    nodes = [{"id": k} for k in range(17)]
+    names = [{"name": name} for name in SKELETONS["coco_17"]]
+    text = json.dumps({"nodes": names, "skeletons": [{"nodes": nodes}]})
+    whole = ("instance_id", "frame_id", "frame_idx", "video", "from_predicted", "track")
+    rows = np.zeros(3, [(name, "<i8") for name in (*whole, "point_id_start", "point_id_end")])
+    rows["instance_id"] = rows["frame_id"] = rows["frame_idx"] = np.arange(3)
+    rows["from_predicted"] = rows["track"] = -1
+    rows["point_id_start"] = np.arange(3) * 17
+    rows["point_id_end"] = rows["point_id_start"] + 17
+    points = np.zeros(51, [("x", "<f8"), ("y", "<f8"), ("score", "<f8"), ("visible", "?")])
+    points["x"], points["y"], points["score"] = np.tile(BODY.T, 3)
+    points["visible"] = True
+    instances = np.zeros(3, [*rows.dtype.descr, ("instance_type", "u1")])
+    for name in rows.dtype.names or ():
+        instances[name] = rows[name]
+    instances["instance_type"] = 1
+    for view in ("a", "b"):
+        with h5py.File(folder / f"{view}.slp", "w") as file:
+            file.create_group("metadata").attrs["json"] = np.bytes_(text.encode())
+            file["frames"] = rows
+            file["instances"] = instances
+            file["points"] = points
+            file["pred_points"] = points
+    return folder / "a.slp"
+
+
+def deeplabcut_csv(folder: Path) -> Path:
+    names = SKELETONS["coco_17"]
+    head = ["scorer" + ",net" * 51, "bodyparts" + "".join(f",{name}" * 3 for name in names)]
+    head.append("coords" + ",x,y,likelihood" * 17)
+    rows = [",".join([str(t), *map(str, BODY.ravel().tolist())]) for t in range(3)]
+    for view in ("a", "b"):
+        (folder / f"{view}.csv").write_text("\n".join([*head, *rows]) + "\n", "utf-8")
+    return folder / "a.csv"
+
+
+def sleap_csv(folder: Path) -> Path:
+    names = [f"{name}.{of}" for name in SKELETONS["coco_17"] for of in ("x", "y", "score")]
+    head = ",".join(["track", "frame_idx", "instance.score", *names])
+    rows = [f"who,{t},0.5,{','.join(map(str, BODY.ravel().tolist()))}" for t in range(3)]
+    for view in ("a", "b"):
+        (folder / f"{view}.csv").write_text("\n".join([head, *rows]) + "\n", "utf-8")
+    return folder / "a.csv"
+
+
 def caliscope(folder: Path) -> Path:
     rows = [
         f"{t},{port},{t},0.5,{k},{x},{y},,"
@@ -459,6 +507,9 @@ FORMATS: dict[str, Format] = {
     "yolo": Format(yolo, read_key_points, mutate_text),
     "sleap": Format(sleap, read_key_points, mutate_records),
     "deeplabcut": Format(deeplabcut, read_key_points, mutate_records),
+    "sleap_labels": Format(sleap_labels, read_key_points, mutate_records),
+    "deeplabcut_csv": Format(deeplabcut_csv, read_key_points, mutate_text),
+    "sleap_csv": Format(sleap_csv, read_key_points, mutate_text),
     "caliscope": Format(
         caliscope, lambda folder: read_key_points(folder / "xy.csv", "coco_17"), mutate_text
     ),

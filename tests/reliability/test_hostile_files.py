@@ -32,11 +32,13 @@ FORMATS = (
     "colmap",
     "opencap",
     "camera_json",
+    "deeplabcut_csv",
+    "sleap_csv",
 )
-HDF5 = ("sleap", "deeplabcut")
+HDF5 = ("sleap", "deeplabcut", "sleap_labels")
 """Read by h5py, which is an extra."""
 GROUPS = (FORMATS[:8], FORMATS[8:13], FORMATS[13:])
-TABLES = ("caliscope", "toml", "yaml", "yolo")
+TABLES = ("caliscope", "toml", "yaml", "yolo", "deeplabcut_csv", "sleap_csv")
 """Cut between two lines they are whole, and shorter."""
 
 

@@ -108,6 +108,7 @@ class CalibrateSettings(InputSettings):
     seed: int
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         frames = self.evaluated_frames
         check(frames >= 1, "evaluated_frames", f"is {frames}", "Give 1 or more.")
         if self.image_size is not None:

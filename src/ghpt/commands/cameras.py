@@ -82,6 +82,7 @@ class CamerasSettings(InputSettings):
     seed: int
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.spoil is None:
             return
         hint = "Leave it out, or leave out keypoints."

@@ -5,8 +5,7 @@ It is people's own files, or one recording of a data set.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from ghpt.calibration.check.units import decide_unit
 from ghpt.commands.outputs import OutputSettings
-from ghpt.config import Target, build, settings, suggest
+from ghpt.config import Target, build, suggest
 from ghpt.data.datasets.store import prepare
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.contents import explain_cameras, explain_key_points
@@ -57,11 +56,10 @@ class InputSettings(OutputSettings):
     recording: str | None
     data: Target
 
-
-def input_settings(config: Mapping[str, Any]) -> InputSettings:
-    """Return the input's part of a command's plain configuration."""
-    names = {field.name for field in fields(InputSettings)}
-    return settings(InputSettings, {name: config[name] for name in names if name in config})
+    def __post_init__(self) -> None:
+        """Refuse cameras without key points: nobody means to see synthetic people by them."""
+        if self.cameras and not self.keypoints:
+            raise GhptConfigError("keypoints", "is missing", "Name the folder: keypoints=pose/")
 
 
 def own_cameras(inputs: InputSettings, example: str) -> CameraSet:

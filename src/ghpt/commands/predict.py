@@ -59,6 +59,7 @@ from ghpt.models.estimators.flips import LeftRightFlips
 from ghpt.models.estimators.joint_means import JointMeans, all_joints, human_joints
 from ghpt.models.estimators.predictors import Classical, Estimate, Learned, Predictor
 from ghpt.models.estimators.trajectory.predictor import TrajectoryPredictor
+from ghpt.models.estimators.trajectory.priors import NOMINAL_RATE
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, Reconstruction
@@ -92,6 +93,7 @@ _FEW_JOINTS = (
     "%s: the key points give too few of the 17 joints by name: the size of the person, the cameras "
     "and exchanged sides are not checked (docs/skeletons.md)."
 )
+_UNKNOWN_RATE = "%s: the frame rate is unknown; %g Hz are assumed of its motion (rate_hz=60, say)."
 _log = logging.getLogger(__name__)
 
 
@@ -155,6 +157,7 @@ class PredictSettings(InputSettings):
         return {name: value for name, value in values.items() if value != _DEFAULTS[name]}
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
             count = getattr(self, name)
             check(count >= 1, name, f"is {count}", "Give 1 or more.")
@@ -316,6 +319,8 @@ def _predict_person(
     )
     if settings.smooth and estimator.name in (TRAJECTORY, ONLINE):
         _log.info("smooth: a trajectory is smooth already; it is filtered once more.")
+    if sequence.rate_hz is None and estimator.name in (TRAJECTORY, ONLINE):
+        _log.info(_UNKNOWN_RATE, sequence.title, NOMINAL_RATE)
     joints = joints_of(settings, sequence.skeleton)
     about = _about(sequence, joints, estimator, gaps, setup.origin)
     if settings.markers:

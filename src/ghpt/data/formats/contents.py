@@ -16,6 +16,8 @@ _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 _KEY_POINTS = (".h5", ".hdf5", ".slp", ".csv", ".npz", ".npy", ".json", ".txt")
 _WORDS = (b"keypoints", b'"people"', b'"instance', b"sync_index", b"scorer,", b"NUMPY", b"\x89HDF")
 """Of which one is at the begin of a file of key points, but for archives."""
+_SETTINGS = ("skeleton", "session", "rate_hz", "format", "least_confidence")
+"""Of which an error says something, whatever the format is."""
 _LOOKED_AT = 200
 """Files and folders of a folder that are looked at."""
 _DETECT = (
@@ -45,7 +47,7 @@ def explain_key_points(
         exchanged = cameras is not None and _looks_like_key_points(cameras)
         hint = "Exchange keypoints= and cameras=." if exchanged else "Name it as cameras=."
         return GhptDataError(path, "", problem, hint)
-    return error if named else _with_format(error, path)
+    return error if named or error.field in _SETTINGS else _with_format(error, path)
 
 
 def explain_cameras(error: GhptDataError, path: Path, key_points: Path | None) -> GhptDataError:

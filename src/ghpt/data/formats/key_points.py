@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from ghpt.config import suggest
 from ghpt.data.formats.authors_npy import is_authors_file, read_authors
 from ghpt.data.formats.caliscope import is_caliscope, read_caliscope
 from ghpt.data.formats.csv_tracks import (
@@ -73,9 +74,8 @@ def read_key_points(
     rate = None if rate_hz is None else frame_rate(path, rate_hz)
     wanted = None if skeleton is None else find_skeleton(path, skeleton)
     if format is not None and format not in FORMATS:
-        raise GhptDataError(
-            path, "format", f"there is no format {format!r}", f"Choose from {', '.join(FORMATS)}."
-        )
+        problem = f"there is no format {format!r}"
+        raise GhptDataError(path, "format", problem, suggest(format, FORMATS))
     source = Source(path, skeleton, session, format)
     form = format or format_of(path)
     if session is not None and form in _ONE_RECORDING:

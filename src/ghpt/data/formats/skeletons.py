@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ghpt.config import CONF, read_yaml, settings
+from ghpt.config import CONF, read_yaml, settings, suggest
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptConfigError, GhptDataError
 from ghpt.skeleton import JOINTS, Skeleton, make_skeleton
@@ -96,7 +96,7 @@ def find_skeleton(where: object, skeleton: str) -> Skeleton:
     known = _known_skeletons()
     if name not in known:
         problem = f"there is no skeleton {skeleton!r}"
-        hint = f"Choose from {', '.join(known)}, or name a yaml of your own."
+        hint = f"{suggest(name, known)} Or name a yaml of your own."
         raise GhptDataError(where, "skeleton", problem, hint)
     return known[name]
 

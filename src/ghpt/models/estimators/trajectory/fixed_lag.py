@@ -137,10 +137,11 @@ class Group:
         band = band.reshape(-1, band.shape[-1])
         vector = right[::-1].reshape(-1).copy()
         if prior is not None:
-            row, column = _lower(6 * joints)
-            start = len(band) - 6 * joints
-            band[start + column, row - column] += prior.matrix[row, column]
-            vector[start:] += prior.right
+            size = 6 * joints
+            source, target = _lower(size, band.shape[1])
+            oldest = band[-size:].reshape(-1)
+            oldest[target] += prior.matrix.reshape(-1)[source]
+            vector[-size:] += prior.right
         factor, info = lapack.dpbtrf(band.T, lower=1, overwrite_ab=1)
         if info:
             raise ArithmeticError(f"the normal matrix is not positive definite ({info})")
@@ -167,7 +168,7 @@ class Group:
         vector[old] += right[0].reshape(-1)
         second = np.repeat(terms.second[0], 3)
         first = np.repeat(terms.first[0], 3)
-        place = np.arange(size)
+        flat = matrix.reshape(-1)
         for one, other, value in (
             (0, 0, second),
             (1, 1, 4 * second + first),
@@ -176,9 +177,9 @@ class Group:
             (0, 2, second),
             (1, 2, -2 * second - first),
         ):
-            matrix[one * size + place, other * size + place] += value
-            if one != other:
-                matrix[other * size + place, one * size + place] += value
+            for row, column in {(one, other), (other, one)}:
+                begin = size * (3 * size * row + column)
+                flat[begin : begin + 3 * size * size : 3 * size + 1][:size] += value
         factor, info = lapack.dpotrf(matrix[old, old], lower=1)
         if info:
             raise ArithmeticError(f"the normal matrix is not positive definite ({info})")
@@ -206,6 +207,7 @@ _DIAGONAL = (0, 1, 2)
 
 
 @lru_cache(maxsize=8)
-def _lower(size: int) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
+def _lower(size: int, width: int) -> tuple[Int[Array, " n"], Int[Array, " n"]]:
+    """Return where the lower triangle of a matrix is in it, and in a band of so many columns."""
     row, column = np.tril_indices(size)
-    return row, column
+    return row * size + column, column * width + row - column

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 
+from ghpt.geometry.cameras import Cameras
 from ghpt.models.estimators.confidence import LEAST_CONFIDENCE
 from ghpt.models.estimators.trajectory.estimator import Trajectory
 from ghpt.models.estimators.trajectory.fixed_lag import Factored, Group, Prior, WindowTerms
@@ -267,7 +268,7 @@ class LagWindow:
         return points
 
     def _rig(self, frame: Frame) -> Rig:
-        if self.frames and frame.cameras is self.frames[-1].cameras:
+        if self.frames and _are_equal(frame.cameras, self.frames[-1].cameras):
             return self.rigs[-1]
         return Rig.of(frame.cameras, self.origin, self.size)
 
@@ -432,6 +433,13 @@ class LagWindow:
         start = candidates[merit.argmax(0), self.as_given]
         alone = np.where(alone_merit[:, None] > 0, alone, start)
         return start, Alone(alone[None], placed[None], alone_merit[None])
+
+
+def _are_equal(one: Cameras, other: Cameras) -> bool:
+    if one is other:
+        return True
+    pairs = ((one.t, other.t), (one.R, other.R), (one.K, other.K))
+    return all(torch.equal(*pair) for pair in pairs)
 
 
 def _lengths(vectors: Float[Array, "*B 3"]) -> Float[Array, "*B"]:
