@@ -5,6 +5,7 @@ import json
 import re
 import sys
 import zipfile
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import MagicMock
@@ -95,13 +96,21 @@ def in_c3d(path: Path) -> np.ndarray:
     return file["data"]["points"][:3].transpose(2, 1, 0) + origin
 
 
+def unpacked(packed: dict) -> np.ndarray:
+    """The numbers of an array in the page, which counts them in steps of half a millimetre."""
+    content = np.frombuffer(zlib.decompress(base64.b64decode(packed["data"])), np.uint8)
+    low, high = content.reshape(2, -1, packed["row"]).astype(np.uint16)
+    steps = np.cumsum(low + 256 * high, axis=0, dtype=np.uint16)
+    return packed["offset"] + packed["step"] * steps
+
+
 def in_html(path: Path) -> np.ndarray:
     text = (path / "poses.html").read_text(encoding="utf-8")
     data = json.loads(re.search(r'application/json">(.*?)</script>', text, re.DOTALL)[1])
-    points = np.frombuffer(base64.b64decode(data["points"]), "<f4").reshape(FRAMES, 17, 3)
+    points = unpacked(data["points"]).reshape(FRAMES, 17, 3)
     stated = re.search(r"zero is at \((.*?)\) mm", data["about"])
     origin = [float(x) for x in stated[1].split(",")] if stated else [0.0, 0.0, 0.0]
-    return points.astype(float) @ np.array(data["axes"]).T + origin
+    return points @ np.array(data["axes"]).T + origin
 
 
 READERS = {

@@ -96,7 +96,7 @@ def sleap_labels(h5py, path):
     instances["point_id_end"] = instances["point_id_start"] + len(NAMES)
     instances[10] = (10, 0, 4, 1, 9, 0, len(NAMES))
     by_hand = predicted[9].copy()
-    frames = np.zeros(5, [("frame_id", "i8"), ("frame_idx", "i8"), ("video", "i8")])
+    frames = np.zeros(5, [("frame_id", "u8"), ("frame_idx", "u8"), ("video", "u4")])
     frames["frame_id"], frames["frame_idx"] = np.arange(5), np.arange(5) + 2
     with h5py.File(path, "w") as file:
         metadata = {"nodes": names, "skeletons": [{"nodes": nodes}]}

@@ -15,7 +15,6 @@ import children
 import memory
 import sizes
 
-
 TENSORBOARD = "ghpt.report.logger.ForgivingTensorBoard"
 
 

@@ -112,15 +112,18 @@ def _labels(content: Any) -> Tracks:
     names = _node_names(content)
     corrected = instances["from_predicted"][instances["from_predicted"] >= 0]
     instances = instances[~np.isin(instances["instance_id"], corrected)]
-    number = np.full(int(frames["frame_id"].max(initial=-1)) + 1, -1)
-    number[frames["frame_id"]] = frames["frame_idx"]
+    order = np.argsort(frames["frame_id"])
+    place = np.searchsorted(frames["frame_id"], instances["frame_id"], sorter=order)
+    own = frames[order[place]]
+    if (own["frame_id"] != instances["frame_id"]).any():
+        raise ValueError("an instance is of no frame")
+    frame = own["frame_idx"].astype(np.int64)
     predicted = instances["instance_type"] == 1
     values = np.full((len(instances), len(names), 3), np.nan)
-    for table, own in (("points", ~predicted), ("pred_points", predicted)):
-        values[own] = _instance_points(_array(content, table, "V"), instances[own], len(names))
+    for table, rows in (("points", ~predicted), ("pred_points", predicted)):
+        values[rows] = _instance_points(_array(content, table, "V"), instances[rows], len(names))
     if float(content["metadata"].attrs.get("format_id", 1.0)) < _CENTRES:
         values[..., :2] -= 0.5
-    frame = number[instances["frame_id"]].astype(np.int64)
     track = instances["track"].astype(np.int64)
     return Tracks(np.unique(frames["frame_idx"]).astype(np.int64), frame, track, values, names)
 
