@@ -112,7 +112,7 @@ def workplace(folder: Path) -> Path:
     points = walk()[:FRAMES]
     pixels = project(rig.cameras, points)[0].numpy()
     pixels = pixels + np.random.default_rng(0).normal(0, 1, pixels.shape)
-    for name in ("pose", "walk", "run"):
+    for name in ("pose", "walk", "run", "openpose"):
         write_openpose(folder / name, rig, pixels)
     valid = np.ones(pixels.shape[:-1], bool)
     given = SinglePerson(
@@ -125,7 +125,8 @@ def workplace(folder: Path) -> Path:
         valid,
         50.0,
     )
-    write_person(folder / "points.npz", given)
+    for name in ("points.npz", "blazepose.npz"):
+        write_person(folder / name, given)
     R, t = rig.cameras.R[:1].expand(4, 3, 3), rig.cameras.t[:1].expand(4, 3)
     write_pose2sim(folder / "intrinsics.toml", replace(rig, R=R, t=t), {})
     for name in ("Calib.toml", "Calib_qualisys.toml"):
