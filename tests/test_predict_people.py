@@ -103,8 +103,8 @@ def test_the_player_shows_everybody(everybody):
 HEADS = """
 const fs = require("fs"), p = require(process.argv[1]);
 const page = fs.readFileSync(process.argv[2], "utf8");
-const data = p.load(/application\\/json">(.*?)<\\/script>/s.exec(page)[1]);
-console.log(JSON.stringify(p.heads(data, p.drawn(data, 0).joints).map(head => head.person)));
+p.load(/application\\/json">(.*?)<\\/script>/s.exec(page)[1]).then(data =>
+  console.log(JSON.stringify(p.heads(data, p.drawn(data, 0).joints).map(head => head.person))));
 """
 
 

@@ -210,10 +210,11 @@ class Predictor:
         rig.check_calibrated("cameras")
         about = _about(self.estimator.name, JOINTS, rig.names, rate_hz and float(rate_hz))
         online = predictor.stream(rate_hz)
+        has_lens = bool(rig.distortion.any())
         number = 0
         for values in frames:
             points = _frames_of_joints(values, len(rig))
-            batch = _observe(points, rig)
+            batch = _observe(points, rig, has_lens)
             batch = replace(batch, index=batch.index + number)
             number += len(points)
             for frame in frames_of(batch):
@@ -369,12 +370,18 @@ def _estimate(
     return fitted.predict(source, rows, batch, torch.device("cpu"), lambda frames: None)
 
 
-def _observe(points: KeyPoints, rig: CameraSet) -> Observations:
-    """Return observations of ideal pinholes, without what the lens cannot show."""
+def _observe(points: KeyPoints, rig: CameraSet, has_lens: bool = True) -> Observations:
+    """Return observations of ideal pinholes, without what the lens cannot show.
+
+    ``has_lens``: False where the rig is known to be of ideal pinholes, which saves time.
+    """
     pixels = torch.from_numpy(points.pixels)
     frames, views, joints, _ = pixels.shape
     by_view = pixels.transpose(0, 1).reshape(views, frames * joints, 2)
-    ideal, possible = undistort(by_view, rig.K, rig.distortion)
+    ideal = by_view
+    possible = torch.ones(by_view.shape[:-1], dtype=torch.bool)
+    if has_lens:
+        ideal, possible = undistort(by_view, rig.K, rig.distortion)
     shape = (views, frames, joints)
     return Observations(
         index=torch.arange(frames),

@@ -5,7 +5,8 @@ const FILLED = 2, LAST_HUMAN = 17, MISSING = 65535;
 // What Python packed: base64 of a deflated block of 16-bit numbers, low bytes before high ones, each number's
 // difference from the frame before. The numbers count steps from an offset.
 async function unpack(packed) {
-  const bytes = Uint8Array.from(atob(packed.data), letter => letter.charCodeAt(0));
+  const letters = atob(packed.data), bytes = new Uint8Array(letters.length);
+  for (let i = 0; i < bytes.length; i++) bytes[i] = letters.charCodeAt(i);
   const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
   const halves = new Uint8Array(await new Response(stream).arrayBuffer());
   const count = halves.length / 2, numbers = new Uint16Array(count), row = packed.row;
