@@ -216,7 +216,8 @@ def _sort_people(
     Raises GhptDataError for people of different numbers of joints, or too many of them.
     """
     for number, person in found:
-        count, expected = len(person.joints), len(found[0][1].joints)
+        count = len(person.joints)
+        expected = len(found[0][1].joints)
         if count != expected:
             problem = (
                 f"frame {number} has a person of {count} joints, frame {found[0][0]} of {expected}"
