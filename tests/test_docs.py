@@ -326,10 +326,9 @@ def test_the_commands_and_the_code_of_a_page_run(
                 attempt(runner, command, page, models)
         elif block.language == "console":  # of a cluster, several processes or minutes
             for command in documented.commands_of(block):
-                if command.script in MAINS:
-                    check_overrides(
-                        Source(runner.conf, Path(command.script).stem), settings_of(command)
-                    )
+                name = Path(command.script).stem
+                if (ROOT / "conf" / f"{name}.yaml").is_file():
+                    check_overrides(Source(runner.conf, name), settings_of(command))
                 else:
                     check_arguments(command, monkeypatch)
     for command in documented.inline_commands(page):

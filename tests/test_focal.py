@@ -154,7 +154,12 @@ def test_cameras_that_do_not_share_a_focal_length_are_named(walk):
 
 
 @pytest.mark.parametrize(
-    "words", [["image_size=[1920]"], ["image_size=[1920,-1]"], ["image_size=[9,9]", "cameras=x"]]
+    "words",
+    [
+        ["image_size=[1920]"],
+        ["image_size=[1920,-1]"],
+        ["image_size=[9,9]", "cameras=x", "keypoints=y"],
+    ],
 )
 def test_an_image_size_that_is_none_is_refused(words):
     with pytest.raises(GhptConfigError, match="image_size"):

@@ -40,8 +40,8 @@ def classical(estimator=M, reject=None):
 
 
 def learned(reject=None):
-    config = yaml.safe_load((Path(__file__).parents[1] / "conf/model/pose.yaml").read_text())
-    scorer = partial(Scorer, **{k: v for k, v in config["scorer"].items() if not k.startswith("_")})
+    config = yaml.safe_load((Path(__file__).parents[1] / "conf/scorer/pose.yaml").read_text())
+    scorer = partial(Scorer, **{k: v for k, v in config.items() if not k.startswith("_")})
     loss = StochasticLoss(alpha=1.0, beta=0.0, gamma=0.0, relative_errors=True)
     model = StochasticEstimator(
         PoseTriangulation(True, True),

@@ -11,7 +11,7 @@ import hostile
 
 from ghpt.errors import GhptDataError
 
-BINARY = ("npz", "npy", "freemocap", "colmap", "opencap", "sleap", "deeplabcut")
+BINARY = ("npz", "npy", "freemocap", "colmap", "opencap", "sleap", "sleap_labels", "deeplabcut")
 TEXTS = [name for name in hostile.FORMATS if name not in BINARY]
 ENCODED = {
     "UTF-8 with a mark": lambda text: b"\xef\xbb\xbf" + text.encode(),

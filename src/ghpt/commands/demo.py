@@ -21,6 +21,8 @@ from ghpt.commands.overrides import Source, compose
 from ghpt.config import CONF, plain, suggest
 from ghpt.config import settings as typed_settings
 from ghpt.data.formats.camera_writers import write_pose2sim
+from ghpt.data.formats.own_npz import write_key_points
+from ghpt.data.points import KeyPoints
 from ghpt.data.synthetic.actions import action_names
 from ghpt.data.synthetic.body import stature
 from ghpt.data.synthetic.detector import Detector
@@ -28,7 +30,6 @@ from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import check
 from ghpt.export import WRITERS
-from ghpt.files import atomic_write
 from ghpt.geometry.lens import distort
 from ghpt.skeleton import JOINTS
 
@@ -133,16 +134,14 @@ def _record(settings: DemoSettings, files: DemoResult) -> float:
     seen = distort(ideal.flatten(1, 2), rig.cameras.K, rig.distortion).reshape(ideal.shape)
     pixels = seen.transpose(0, 1).numpy()
     pixels[~found.valid] = np.nan
+    points = KeyPoints(
+        pixels=pixels.astype(np.float32),
+        confidence=found.confidence.astype(np.float32),
+        valid=found.valid,
+    )
     files.key_points.parent.mkdir(parents=True, exist_ok=True)
-    with atomic_write(files.key_points) as handle:
-        np.savez(
-            handle,
-            key_points=pixels.astype(np.float32),
-            confidence=found.confidence.astype(np.float32),
-            views=rig.names,
-            joints=JOINTS,
-            rate_hz=settings.rate_hz,
-        )
+    numbers = np.arange(frames)
+    write_key_points(files.key_points, rig.names, JOINTS, numbers, points, settings.rate_hz)
     write_pose2sim(files.cameras, rig, {})
     return stature(truth)
 

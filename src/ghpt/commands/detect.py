@@ -18,10 +18,11 @@ from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import as_started, display_path, shell_override
 from ghpt.commands.outputs import Files, OutputSettings, input_paths
+from ghpt.data.formats.own_npz import write_key_points
 from ghpt.data.formats.skeletons import SKELETONS
+from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptConfigError, GhptDataError, check
 from ghpt.extras import check_installed
-from ghpt.files import atomic_write
 
 KEY_POINTS = "key_points.npz"
 _ENDINGS = (".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v")
@@ -206,15 +207,11 @@ def write_views(result: DetectResult) -> None:
         points[: len(view), number] = view.key_points
         confidence[: len(view), number] = view.confidence
     names = [view.name for view in views]
-    with atomic_write(result.path) as handle:
-        np.savez(
-            handle,
-            key_points=points,
-            confidence=confidence,
-            views=names,
-            joints=_JOINTS,
-            rate_hz=views[0].rate_hz,
-        )
+    valid = np.asarray(np.isfinite(points).all(-1))
+    found = KeyPoints(points, confidence, valid)
+    write_key_points(
+        result.path, names, _JOINTS, np.arange(length), found, rate_hz=views[0].rate_hz
+    )
 
 
 def _say_next(result: DetectResult) -> None:

@@ -7,7 +7,7 @@ from ghpt.models.predictions import Predictions
 from ghpt.report.document import Document, Table
 from ghpt.report.report import Metrics, Report
 from ghpt.report.tables import NONE, title
-from ghpt.report.tensorboard import write_hyperparameters, write_parts, write_text, write_weights
+from ghpt.report.tensorboard import log_document, write_hyperparameters, write_parts, write_weights
 
 _CHUNK = 2048
 
@@ -31,7 +31,7 @@ def write_error_events(
     return write_parts(
         folder,
         {
-            "the table": lambda writer: write_text(writer, error_document(metrics)),
+            "the table": lambda writer: log_document(writer, error_document(metrics)),
             "the weights": lambda writer: write_weights(writer, summaries),
             "the hyper-parameters": lambda writer: write_hyperparameters(
                 writer, predictions.meta, metrics, "error"

@@ -14,7 +14,7 @@ from ghpt.report.pair_figures import rig_figure
 from ghpt.report.pair_tables import pair_report_document, pair_summary_document
 from ghpt.report.report import Report
 from ghpt.report.tables import Metrics, title
-from ghpt.report.tensorboard import write_hyperparameters, write_parts, write_text, write_weights
+from ghpt.report.tensorboard import log_document, write_hyperparameters, write_parts, write_weights
 
 SHOWN = ("weight", "rig")
 """The estimates in the figure of the rig, where they are; the draw is chosen by the first."""
@@ -28,7 +28,7 @@ def write_pair_events(folder: str | Path, predictions: PairPredictions, metrics:
         write_hyperparameters(writer, predictions.meta, metrics, "E_3D")
 
     parts = {
-        "the tables": lambda writer: write_text(writer, pair_report_document(metrics)),
+        "the tables": lambda writer: log_document(writer, pair_report_document(metrics)),
         "the weights": lambda writer: _write_weights(writer, predictions),
         "the rig": lambda writer: _write_rig(writer, predictions, metrics),
         "the hyper-parameters": hyperparameters,

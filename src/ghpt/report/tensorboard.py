@@ -50,7 +50,7 @@ def write_events(folder: str | Path, predictions: PosePredictions, metrics: Metr
         write_hyperparameters(writer, predictions.meta, metrics, "mpjpe_relative")
 
     parts = {
-        "the tables": lambda writer: write_text(writer, report_document(metrics)),
+        "the tables": lambda writer: log_document(writer, report_document(metrics)),
         "the weights": lambda writer: _write_weights(writer, predictions),
         "the skeletons": lambda writer: _write_skeletons(writer, predictions, metrics),
         "the pose prior": lambda writer: _write_pose_prior(writer, metrics),
@@ -130,7 +130,7 @@ def _write_pose_prior(writer: SummaryWriter, metrics: Metrics) -> None:
         writer.add_image(f"pose_prior/{subject}", image(figure), 0, dataformats="HWC")
 
 
-def write_text(writer: SummaryWriter, document: Document) -> None:
+def log_document(writer: SummaryWriter, document: Document) -> None:
     """Write a report as text, which TensorBoard renders."""
     writer.add_text("report", render_markdown(document), 0)
 

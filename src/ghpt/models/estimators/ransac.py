@@ -31,8 +31,9 @@ from ghpt.randomness import key, uniform
 class Ransac(ConfidenceWeighted):
     """For each joint the pair of views whose point has the most inliers, then the inliers together.
 
-    Among equals the pair is taken whose inliers have the most confidence and the least residuals: a
-    detector that gives every joint guesses those that it does not see, with little confidence.
+    Among equals the pair with the least residuals is taken; where confidence says something, the
+    one whose inliers have the most of it as well: a detector that gives every joint guesses those
+    that it does not see, with little confidence.
 
     ``threshold``: an inlier's largest reprojection error, as a fraction of the person's scale in
     that view. ``pairs``: where the views make more pairs than this, so many random ones are tried
@@ -56,12 +57,13 @@ class Ransac(ConfidenceWeighted):
         scale = person_scale(batch.key_points, batch.valid)
         pairs = self._pairs(batch)
         weights = self.confidence_weights(batch)
+        trust = _trust(weights, batch.valid)
 
         def solve(rows: slice) -> Triangulation:
             candidates = _Candidates(
                 cameras=select_frames(rig, rows),
                 key_points=batch.key_points[rows],
-                confidence=batch.confidence[rows],
+                trust=trust[rows],
                 valid=batch.valid[rows],
                 scale=scale[rows],
                 pairs=pairs[rows],
@@ -170,7 +172,7 @@ class _Candidates:
         self,
         cameras: Cameras,
         key_points: Float[Tensor, "B V J 2"],
-        confidence: Float[Tensor, "B V J"],
+        trust: Float[Tensor, "B V J"],
         valid: Bool[Tensor, "B V J"],
         scale: Float[Tensor, "B V"],
         pairs: Bool[Tensor, "B P J V"],
@@ -183,7 +185,7 @@ class _Candidates:
         )
         points, ok = triangulate_subsets(each, key_points, valid, pairs)
         self.valid = valid.permute(1, 2, 0)
-        self.confidence = _relative_confidence(confidence, valid).permute(1, 2, 0)
+        self.trust = trust.permute(1, 2, 0)
         self.system = System(cameras, key_points, self.valid)
         scale = scale.double().clamp(min=1e-12)
         square = scale.mT[:, None] ** 2
@@ -212,16 +214,16 @@ class _Candidates:
     ) -> Bool[Tensor, "V J B"]:
         """Return the views within the frame's threshold of each joint's best point.
 
-        The best point has the most of them, and among equals the greatest sum of confidence times
-        what is left of the threshold. ``rows``: of some of the frames.
+        The best point has the most of them, and among equals the greatest sum of trust times what
+        is left of the threshold. ``rows``: of some of the frames.
         """
         residual = self.residual if rows is None else self.residual[..., rows]
-        confidence = self.confidence if rows is None else self.confidence[..., rows]
+        trusts = self.trust if rows is None else self.trust[..., rows]
         # what divides equals sums up to less than one more inlier
         share = 1 / (len(residual) + 1)
         slope = share / thresholds
         score = torch.zeros_like(residual[0])
-        for of_view, trust in zip(residual, confidence, strict=True):
+        for of_view, trust in zip(residual, trusts, strict=True):
             loss = share * (1 - trust) + trust * (of_view * slope)
             score = score + torch.where(of_view <= thresholds, 1 - loss, 0.0)
         best = score.argmax(0).expand(len(residual), 1, -1, -1)
@@ -255,9 +257,7 @@ class _Candidates:
         return robust.with_fallback(robust.ok, linear)
 
 
-def _relative_confidence(
-    confidence: Float[Tensor, "B V J"], valid: Bool[Tensor, "B V J"]
-) -> Float[Tensor, "B V J"]:
-    """Return each view's confidence as a share of the most confident view's of the joint."""
-    known = torch.where(valid, confidence.nan_to_num(0.0).clamp(min=0), 0.0)
+def _trust(weight: Float[Tensor, "B V J"], valid: Bool[Tensor, "B V J"]) -> Float[Tensor, "B V J"]:
+    """Return each view's weight as a share of the largest one of the joint's views."""
+    known = torch.where(valid, weight, 0.0)
     return known / known.amax(1, keepdim=True).clamp(min=1e-12)
