@@ -199,15 +199,18 @@ def _rig_lines(result: CalibrationResult) -> list[Text]:
 def _evidence_line(evidence: Evidence) -> str:
     """Return a sentence on what the recording is worth."""
     needed = evidence.frames_for(_WANTED_DEG)
-    enough = "which is enough"
+    enough = f"That is enough for rotations to ± {_WANTED_DEG}°."
     if needed is None:
-        enough = "no number of frames is enough in which people turn no more than here"
+        enough = (
+            f"For rotations to ± {_WANTED_DEG}° people must turn more: no number of frames like "
+            "these is enough."
+        )
     elif needed > evidence.frames:
-        enough = f"about {needed} like these would do"
+        enough = f"Rotations to ± {_WANTED_DEG}° take about {needed} frames like these."
+    worth = f"{evidence.independent:.0f} independent one" + "s" * (evidence.independent >= 1.5)
     return (
-        f"Evidence: {evidence.used} of {evidence.frames} frames, worth "
-        f"{evidence.independent:.0f} independent ones, in which people turn by "
-        f"{evidence.turned_deg:.0f}°; for rotations to ± {_WANTED_DEG}° {enough}."
+        f"Evidence: {evidence.used} of {evidence.frames} frames, worth {worth}, in which people "
+        f"turn by {evidence.turned_deg:.0f}°. {enough}"
     )
 
 
