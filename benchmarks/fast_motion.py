@@ -29,7 +29,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from trajectory import Recorded, recorded
 
 from ghpt.api import default_settings
-from ghpt.commands.predict import build_estimator
+from ghpt.commands.prediction.estimator import build_estimator
 from ghpt.config import CONF, build
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import Take, takes

@@ -34,7 +34,7 @@ from trajectory import CONDITIONS, Recorded, recorded
 
 import ghpt
 from ghpt.api import default_settings
-from ghpt.commands.predict import build_estimator
+from ghpt.commands.prediction.estimator import build_estimator
 from ghpt.config import build
 from ghpt.data.people.persons import person_sequence
 from ghpt.data.synthetic.detector import Detector

@@ -25,7 +25,7 @@ from jaxtyping import Bool, Float
 from omegaconf import OmegaConf
 
 from ghpt.api import default_settings
-from ghpt.commands.predict import build_estimator
+from ghpt.commands.prediction.estimator import build_estimator
 from ghpt.config import CONF, build
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.recordings import Take, takes

@@ -20,9 +20,10 @@ import hydra
 import numpy as np
 import torch
 
-from ghpt.commands.predict import PredictSettings, predict
+from ghpt.commands.predict import predict
 from ghpt.commands.prediction.report import comparison_table
 from ghpt.commands.prediction.result import PredictionResult
+from ghpt.commands.prediction.settings import PredictSettings
 from ghpt.config import plain, settings
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.export import read_reconstruction

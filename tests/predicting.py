@@ -15,7 +15,8 @@ from torch import Tensor
 
 from composed import CONF as CONF
 from composed import compose
-from ghpt.commands.predict import PredictSettings, predict
+from ghpt.commands.predict import predict
+from ghpt.commands.prediction.settings import PredictSettings
 from ghpt.config import settings
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.people.sequence import Sequence

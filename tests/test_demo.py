@@ -11,7 +11,7 @@ import pytest
 from composed import compose
 from ghpt.commands import demo, detect
 from ghpt.commands.calibrate import CalibrateSettings
-from ghpt.commands.predict import PredictSettings
+from ghpt.commands.prediction.settings import PredictSettings
 from ghpt.config import settings
 from ghpt.data.formats.camera_files import read_cameras
 from ghpt.data.formats.key_points import read_key_points

@@ -10,7 +10,7 @@ import torch
 
 import ghpt
 from ghpt.api import default_settings
-from ghpt.commands.predict import build_estimator
+from ghpt.commands.prediction.estimator import build_estimator
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.state import State

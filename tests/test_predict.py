@@ -14,6 +14,7 @@ import sizes
 from composed import compose
 from ghpt.commands import predict as module
 from ghpt.commands.predict import COMMAND, predict
+from ghpt.commands.prediction import sequences
 from ghpt.config import build
 from ghpt.data.formats.camera_writers import write_pose2sim
 from ghpt.data.synthetic.rigs import human36m_rig
@@ -425,7 +426,7 @@ def test_a_full_disk_is_named_and_the_next_run_goes_on(tmp_path, limit, file):
 
 
 def test_a_recording_of_a_data_set_is_a_demonstration(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "recording_sequence", lambda _: sequence_of(30))
+    monkeypatch.setattr(sequences, "recording_sequence", lambda _: sequence_of(30))
     numbers = numbers_of(config("compare=[linear,ransac]", "evaluated_frames=10"), tmp_path / "out")
     assert numbers["source"] == "synthetic"
     assert set(numbers["evaluation"]["estimators"]) >= {"linear", "ransac"}

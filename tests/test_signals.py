@@ -18,6 +18,7 @@ from ghpt.commands import predict as prediction
 from ghpt.commands.app import Command
 from ghpt.commands.cameras import CamerasSettings
 from ghpt.commands.outputs import Files
+from ghpt.commands.prediction import sequences
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.data.people.sequence import Sequence
 from ghpt.models.estimators.classical import Linear
@@ -140,7 +141,7 @@ def test_pycolmap_is_imported_in_one_place():
 def predict_to(folder, patch):
     """Predict 250 frames in 5 shards into the folder."""
     patch.setattr(sys, "argv", ["predict.py"])
-    patch.setattr(prediction, "recording_sequence", lambda _: sequence_of(250))
+    patch.setattr(sequences, "recording_sequence", lambda _: sequence_of(250))
     origin_of = {"ghpt": "0", "commit": "", "command": ""}
     patch.setattr(prediction, "provenance", lambda seed: origin_of | {"seed": seed})
     settings = config("estimator=linear", "shard_frames=50", "batch=25", "formats=[npz,csv]")

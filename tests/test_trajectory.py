@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ghpt.api import default_settings
-from ghpt.commands.predict import build_estimator
+from ghpt.commands.prediction.estimator import build_estimator
 from ghpt.data.synthetic.recordings import draw_motion
 from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.geometry.cameras import Cameras, project

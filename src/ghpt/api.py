@@ -49,7 +49,7 @@ from ghpt.skeleton import JOINTS
 
 if TYPE_CHECKING:
     from ghpt.calibration.findings import Finding
-    from ghpt.commands.predict import PredictSettings
+    from ghpt.commands.prediction.settings import PredictSettings
     from ghpt.models.estimators.predictors import Classical, FrameSource
     from ghpt.models.estimators.predictors import Predictor as FittablePredictor
 
@@ -145,7 +145,7 @@ class Predictor:
     def __init__(
         self, checkpoint: str | Path | None = None, trust: Sequence[str] = (), **changes: Any
     ) -> None:
-        from ghpt.commands.predict import build_estimator
+        from ghpt.commands.prediction.estimator import build_estimator
 
         path = None if checkpoint is None else str(checkpoint)
         self.settings = default_settings(ckpt=path, trust=list(trust), **changes)
@@ -166,7 +166,7 @@ class Predictor:
         GhptDataError.
         """
         from ghpt.commands.inputs import resolve_unit
-        from ghpt.commands.predict import joints_of, needed_key_points
+        from ghpt.commands.prediction.sequences import joints_of, needed_key_points
 
         rig = as_camera_set(cameras)
         people = as_detections(key_points, rig, confidence, rate_hz)
@@ -356,7 +356,7 @@ class _ArraySource:
 
 def default_settings(**changes: Any) -> PredictSettings:
     """Return the settings of conf/predict.yaml with some changed."""
-    from ghpt.commands.predict import PredictSettings
+    from ghpt.commands.prediction.settings import PredictSettings
 
     return settings(PredictSettings, _defaults("predict") | changes)
 

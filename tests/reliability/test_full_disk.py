@@ -14,6 +14,7 @@ from tensorboard.summary.writer.record_writer import RecordWriter
 import ghpt.commands.test as testing
 import sizes
 from ghpt.commands import predict as prediction
+from ghpt.commands.prediction import sequences
 from ghpt.commands.prediction.shards import MANIFEST, Shards
 from ghpt.commands.train import COMMAND
 from ghpt.models.checkpoint import read_checkpoint
@@ -74,7 +75,7 @@ def test_command(typed, conf, tmp_path, train_command, blank_figures):
 
 @pytest.fixture
 def predict_command(typed, tmp_path, monkeypatch):
-    monkeypatch.setattr(prediction, "recording_sequence", lambda _: sequence_of(400))
+    monkeypatch.setattr(sequences, "recording_sequence", lambda _: sequence_of(400))
     words = (
         "estimator=linear",
         "shard_frames=100",

@@ -8,26 +8,21 @@ import logging
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-import torch
 
 from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.commands.app import Command
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
-    InputSettings,
-    own_cameras,
-    own_people,
     own_title,
-    recording_sequence,
-    resolve_unit,
 )
 from ghpt.commands.outputs import Files, check_apart, input_paths
 from ghpt.commands.prediction.beside import compared_poses, find_videos
 from ghpt.commands.prediction.camera_check import check_cameras
+from ghpt.commands.prediction.estimator import PoseEstimator, build_estimator
 from ghpt.commands.prediction.gaps import OWN, Gaps, apply_gaps, gap_frames
 from ghpt.commands.prediction.next_commands import commands_on
 from ghpt.commands.prediction.page import PicturedPerson, limbs_of, write_page
@@ -35,6 +30,8 @@ from ghpt.commands.prediction.pictures import write_pictures
 from ghpt.commands.prediction.report import report_document, summary_document, verdict_document
 from ghpt.commands.prediction.result import PersonSummary, PredictionResult
 from ghpt.commands.prediction.run import RunSettings, predict_shards
+from ghpt.commands.prediction.sequences import joints_of, open_sequences
+from ghpt.commands.prediction.settings import ONLINE, TRAJECTORY, PredictSettings
 from ghpt.commands.prediction.shards import Shards
 from ghpt.commands.prediction.statistics import (
     Evaluation,
@@ -43,32 +40,24 @@ from ghpt.commands.prediction.statistics import (
 )
 from ghpt.commands.prediction.verdict import Judge, Level, Measures
 from ghpt.commands.prediction.world import World, choose_world
-from ghpt.commands.time import clock_of, people_in_one_time
-from ghpt.config import Target, build, suggest
-from ghpt.data.people.retimed import retime
+from ghpt.config import build
 from ghpt.data.people.sequence import Sequence
-from ghpt.data.people.stored import open_stored, stored_sequence
-from ghpt.errors import GhptCheckpointError, GhptDataError, check
+from ghpt.errors import GhptDataError, check
 from ghpt.export import WRITERS, Chunks, Evidence, Scene, find_marker_set
 from ghpt.export.scene import images_of, origin_note
 from ghpt.files import remove, sweep_temporaries, write_json
 from ghpt.geometry.cameras import CameraSet
-from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Estimator
-from ghpt.models.estimators.flips import LeftRightFlips
-from ghpt.models.estimators.joint_means import JointMeans, all_joints, human_joints
-from ghpt.models.estimators.predictors import Classical, Estimate, Learned, Predictor
+from ghpt.models.estimators.joint_means import JointMeans
+from ghpt.models.estimators.predictors import Estimate, Predictor
 from ghpt.models.estimators.trajectory.predictor import TrajectoryPredictor
 from ghpt.models.estimators.trajectory.priors import NOMINAL_RATE
-from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, Reconstruction
 from ghpt.report.course import sample_course
 from ghpt.report.course_figure import ViewCourse
 from ghpt.report.markdown import write_markdown
-from ghpt.report.tables import NAMES
 from ghpt.report.terminal import print_document
-from ghpt.skeleton import Skeleton
 
 _REPORTS = ("prediction.json", "report.md", "report.html")
 SHARDS = ".shards"
@@ -78,115 +67,8 @@ _OWN_FORMATS = tuple(name for name in ("npz", "csv", "trc", "c3d", "html") if na
 _TIMED_FORMATS = ("trc", "c3d")
 _NOT_OF_SHARDS = ("command", "seed")
 """What shards do not depend on; where an estimator draws by the seed, its identity holds it."""
-_LEAST_FRAMES = 10
-"""Of a person beside the first, seen by two views: fewer tell nothing of the noise."""
-_DEFAULTS = {
-    "person": None,
-    "ckpt": None,
-    "joints": "detector",
-    "world": "cameras",
-    "floor": None,
-    "markers": None,
-}
-"""Of conf/predict.yaml, which the commands to type next repeat where they are others."""
-_FEW_JOINTS = (
-    "%s: the key points give too few of the 17 joints by name: the size of the person, the cameras "
-    "and exchanged sides are not checked (docs/skeletons.md)."
-)
 _UNKNOWN_RATE = "%s: the frame rate is unknown; %g Hz are assumed of its motion (rate_hz=60, say)."
 _log = logging.getLogger(__name__)
-
-
-TRAJECTORY = "trajectory"
-"""The estimator of all frames together."""
-ONLINE = "online"
-"""The same while they are recorded."""
-_ALIASES = {"frame": "adaptive_ransac"}
-"""Other names of baselines."""
-
-
-@dataclass(frozen=True)
-class PredictorSettings:
-    """How key points become joints: frame by frame, by a checkpoint's model, or together."""
-
-    classical: Target
-    learned: Target
-    trajectory: Target
-    online: Target
-
-
-@dataclass(frozen=True, kw_only=True)
-class PredictSettings(InputSettings):
-    """The settings of predict.py."""
-
-    videos: str | None
-    person: int | None
-    joints: Literal["detector", "human36m"]
-    ckpt: str | None
-    trust: list[str]
-    hypotheses: int | None
-    estimator: str
-    lag: float
-    fill: int | str | None
-    interpolation: str | None
-    smooth: float | None
-    formats: list[str] | None
-    trc: dict[str, Any]
-    markers: str | None
-    world: Literal["cameras", "people", "first"]
-    floor: list[str] | None
-    compare: list[str]
-    evaluated_frames: int
-    shard_frames: int
-    batch: int
-    progress_bar: bool
-    baselines: dict[str, Target]
-    trainer: dict[str, Any]
-    flips: bool
-    predictor: PredictorSettings
-    view_weights: Target
-    fitted_frames: int
-    camera_check: Target
-    verdict: Target
-    strict: bool
-    seed: int
-
-    def non_defaults(self) -> dict[str, object]:
-        """Return what says whose joints are written how, where it is not the default."""
-        values = {name: getattr(self, name) for name in _DEFAULTS}
-        return {name: value for name, value in values.items() if value != _DEFAULTS[name]}
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        for name in ("evaluated_frames", "fitted_frames", "shard_frames", "batch"):
-            count = getattr(self, name)
-            check(count >= 1, name, f"is {count}", "Give 1 or more.")
-        if not self.ckpt:
-            names = (TRAJECTORY, ONLINE, *_ALIASES, *self.baselines)
-            _check_exists("estimator", self.estimator, dict.fromkeys(names))
-        for name in self.compare:
-            _check_exists("compare", name, self.baselines)
-        for name in self.formats or ():
-            _check_exists("formats", name, WRITERS)
-            WRITERS[name].check_installed(name)
-
-
-def _check_exists(key: str, name: str, existing: Mapping[str, object]) -> None:
-    check(name in existing, key, f"there is no {name!r}", suggest(name, existing))
-
-
-@dataclass(frozen=True)
-class PoseEstimator:
-    """The estimator of a prediction."""
-
-    name: str
-    text: str
-    """In words, for people."""
-    predictor: Predictor
-    flips: LeftRightFlips | None
-    weights: torch.nn.Module | None
-    identity: dict[str, Any]
-    """What its results depend on, as plain data."""
 
 
 def files(settings: PredictSettings) -> Files:
@@ -419,162 +301,6 @@ def summary(result: PredictionResult | None) -> str:
     return f"{result.data}: {frames}, {observed}, {result.verdict.level.words}"
 
 
-def build_estimator(settings: PredictSettings) -> PoseEstimator:
-    """Return the estimator of the checkpoint's model, or without one the classical estimator.
-
-    Raises GhptCheckpointError for a model that does not predict poses.
-    """
-    if settings.ckpt:
-        return _learned_estimator(settings, settings.ckpt)
-    name = _ALIASES.get(settings.estimator, settings.estimator)
-    if name == TRAJECTORY:
-        text = "the trajectory of the whole recording (no ckpt was given)"
-        group = _with_exchange(settings, settings.predictor.trajectory)
-        return _trajectory(settings, TRAJECTORY, text, group)
-    if name == ONLINE:
-        text = f"the trajectory with a lag of {settings.lag:g} s (no ckpt was given)"
-        online = dict(settings.predictor.online)
-        own = _with_exchange(settings, online["settings"]) | {"lag_s": settings.lag}
-        return _trajectory(settings, ONLINE, text, online | {"settings": own})
-    group = _with_flips(settings, settings.predictor.classical)
-    baseline = settings.baselines[name]
-    factory = build(group, "predictor.classical")
-    estimator: Estimator = build(baseline, f"baselines.{name}")
-    predictor: Classical = factory(estimator=estimator)
-    shown = NAMES.get(name, name.replace("_", " "))
-    return PoseEstimator(
-        name=name,
-        text=f"{shown}, {estimator.sort} (no ckpt was given)",
-        predictor=predictor,
-        flips=predictor.flips,
-        weights=None,
-        identity=group | {"estimator": baseline},
-    )
-
-
-def _with_exchange(settings: PredictSettings, group: Target) -> dict[str, Any]:
-    """Return what holds a trajectory, without exchanged sides if none are looked for."""
-    if settings.flips:
-        return dict(group)
-    trajectory = dict(group["trajectory"])
-    solver = dict(trajectory["solver"]) | {"exchange": None}
-    return dict(group) | {"trajectory": trajectory | {"solver": solver}}
-
-
-def _trajectory(
-    settings: PredictSettings, name: str, text: str, group: dict[str, Any]
-) -> PoseEstimator:
-    flips: LeftRightFlips | None = build(settings.predictor.classical["flips"], "flips")
-    return PoseEstimator(
-        name=name,
-        text=text,
-        predictor=build(group, f"predictor.{name}"),
-        flips=flips if settings.flips else None,
-        weights=None,
-        identity=group,
-    )
-
-
-def _learned_estimator(settings: PredictSettings, ckpt: str) -> PoseEstimator:
-    changes = {"hypotheses": settings.hypotheses, "seed": settings.seed}
-    model, trained = load_model(ckpt, settings.trust, **changes)
-    if not isinstance(model.problem, PoseTriangulation):
-        problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
-        raise GhptCheckpointError(ckpt, problem, "Give one that train.py model=pose wrote.")
-    view_weights = build(settings.view_weights, "view_weights")(model)
-    group = _with_flips(settings, settings.predictor.learned)
-    predictor: Learned = build(group, "predictor.learned")(view_weights=view_weights)
-    data = trained["provenance"].get("data", "unknown")
-    return PoseEstimator(
-        name="view_weights",
-        text=f"the learned model of {Path(ckpt).name}, trained on {data}",
-        predictor=predictor,
-        flips=predictor.flips,
-        weights=model,
-        identity=group
-        | {
-            "view_weights": settings.view_weights,
-            "ckpt_sha256": hashlib.sha256(Path(ckpt).read_bytes()).hexdigest(),
-            "hypotheses": model.hypotheses,
-            "seed": settings.seed,
-        },
-    )
-
-
-def _with_flips(settings: PredictSettings, group: Target) -> dict[str, Any]:
-    return dict(group) if settings.flips else dict(group) | {"flips": None}
-
-
-def open_sequences(settings: PredictSettings, camera_check: CameraCheck) -> list[Sequence]:
-    """Return who is predicted: the people in the user's own key points, or a recording of the data
-    set.
-
-    The most visible person comes first, and tells the unit of length.
-    """
-    if not settings.keypoints:
-        return [recording_sequence(settings)]
-    found = _files_sequences(settings, camera_check)
-    sequences = [needed_key_points(settings, sequence) for sequence in found]
-    first = sequences[0]
-    first.cameras.check_calibrated(first.source)
-    first = resolve_unit(first, camera_check.consensus, ask=True)
-    return [replace(sequence, cameras=first.cameras) for sequence in sequences]
-
-
-def needed_key_points(settings: PredictSettings, sequence: Sequence) -> Sequence:
-    """Return the sequence of those key points that the joints of the files are made of.
-
-    Raises GhptDataError where the 17 joints are needed, and the detector gives too few of them.
-    """
-    skeleton = sequence.skeleton
-    if settings.ckpt or settings.joints == "human36m":
-        skeleton.require_joints(sequence.source)
-    if not skeleton.has_joints:
-        _log.warning(_FEW_JOINTS, sequence.source)
-    if settings.joints == "detector":
-        return sequence
-    parts = np.flatnonzero(skeleton.joint_weights.any(0))
-    return sequence.select_key_points(parts.tolist())
-
-
-def _files_sequences(settings: PredictSettings, camera_check: CameraCheck) -> list[Sequence]:
-    cameras = own_cameras(settings, "Calib.toml")
-    cameras.check_calibrated(str(settings.cameras))
-    if settings.format in (None, "npz") and settings.session is None:
-        path = str(settings.keypoints)
-        least = settings.least_confidence
-        stored = open_stored(path, settings.skeleton, settings.rate_hz, least)
-        if stored is not None:
-            title = own_title(settings)
-            sequence = stored_sequence(stored, cameras, settings.match, settings.views, title)
-            return [retime(sequence, clock_of(settings.time, sequence, camera_check.time))]
-    people = own_people(settings)
-    found = people_in_one_time(settings, people, cameras, settings.person, camera_check.time)
-    if settings.person is None:
-        return _long_enough(found)
-    crowded = people.crowded_frames()
-    if crowded:
-        words = ", ".join(f"{count} frames of {view}" for view, count in crowded.items())
-        _log.warning("Several people are in %s: person %d is followed.", words, settings.person)
-    return found
-
-
-def _long_enough(found: list[Sequence]) -> list[Sequence]:
-    """Return the first person, and those of the others who can be predicted, with their numbers."""
-    frames = [int((each.detected().valid.any(-1).sum(1) >= 2).sum()) for each in found]
-    kept = [each for each, count in zip(found, frames, strict=True) if count >= _LEAST_FRAMES]
-    left_out = sum(count < _LEAST_FRAMES for count in frames[1:])
-    if left_out:
-        text = "Left out: %d more, of whom each is seen by two views in fewer than %d frames."
-        _log.warning(text, left_out, _LEAST_FRAMES)
-    if len(kept) < 2:
-        return found[:1]
-    if frames[0] < _LEAST_FRAMES:
-        kept = [found[0], *kept]
-    names = enumerate(kept)
-    return [replace(each, title=f"{each.title}, person {number}") for number, each in names]
-
-
 def _interpolation(estimator: PoseEstimator) -> str:
     return OWN if estimator.name == TRAJECTORY else "pchip"
 
@@ -589,11 +315,6 @@ def _choose_world(
     cameras = sequence.cameras.cameras
     total = len(sequence)
     return choose_world(settings.world, settings.floor, cameras, about.joints, chunks, total)
-
-
-def joints_of(settings: PredictSettings, skeleton: Skeleton) -> JointMeans:
-    """Return the joints of the files."""
-    return human_joints(skeleton) if settings.joints == "human36m" else all_joints(skeleton)
 
 
 def _fit(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:
