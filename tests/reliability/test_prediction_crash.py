@@ -14,6 +14,7 @@ import pytest
 
 import sizes
 from ghpt.commands import predict as command
+from ghpt.commands.prediction import sequences
 from ghpt.commands.prediction.shards import MANIFEST
 from predicting import config, sequence_of
 
@@ -23,7 +24,7 @@ OUTPUTS = ("poses.npz", "poses.csv", "poses.trc", "prediction.json", "report.md"
 
 
 def predict(output: Path, frames: int, settings: dict) -> None:
-    command.recording_sequence = lambda _: sequence_of(frames)
+    sequences.recording_sequence = lambda _: sequence_of(frames)
     command.predict(settings, output)
 
 

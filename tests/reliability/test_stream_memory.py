@@ -13,7 +13,7 @@ def child(output: str, frames: int) -> None:
     the most that was held, MiB.
     """
     from ghpt.commands import predict as command
-    from ghpt.commands.prediction import run
+    from ghpt.commands.prediction import run, sequences
     from predicting import config, sequence_of
 
     held = []
@@ -25,7 +25,7 @@ def child(output: str, frames: int) -> None:
         held.append(memory.private_memory())
 
     run.Shards.write = measured
-    command.recording_sequence = lambda _: sequence_of(frames)
+    sequences.recording_sequence = lambda _: sequence_of(frames)
     words = ("estimator=linear", "shard_frames=2000", "batch=1000", "formats=[npz,csv]")
     command.predict(config(*words), Path(output))
     third = len(held) // 3
