@@ -11,7 +11,8 @@ import torch
 import sizes
 from composed import calibrate_settings, cameras_settings
 from ghpt.calibration.findings import Finding
-from ghpt.commands.calibrate import check_reference, open_case
+from ghpt.commands.calibration.beside import check_reference
+from ghpt.commands.calibration.case import open_case
 from ghpt.commands.cameras import own_subject
 from ghpt.commands.predict import predict
 from ghpt.config import build

@@ -28,7 +28,7 @@ from ghpt.calibration.check.recording_time import in_one_time
 from ghpt.calibration.check.setup import Setup, setup_of
 from ghpt.calibration.findings import Finding
 from ghpt.commands.app import Command
-from ghpt.commands.calibrate import people_findings
+from ghpt.commands.calibration.case import people_findings
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
