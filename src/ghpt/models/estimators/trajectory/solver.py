@@ -37,6 +37,10 @@ _COUNTS = 0.05
 """Weight from which a key point says that a joint is seen."""
 _EARLIER = 20.0
 """By how much the tolerance of rounds before the last is larger."""
+_SURE = 0.5
+"""Robust weight from which a key point agrees with the estimate beyond doubt."""
+_SURE_VIEWS = 3
+"""So many of a joint's say where it is whatever bones say; two wrong ones may agree by chance."""
 _USUAL = 0.75
 """Quantile of a joint's accelerations that are expected where they are not seen."""
 _START_DEVIATION = 10.0
@@ -138,6 +142,7 @@ class TrajectorySolver:
         state = _Rounds(self, frames, skeleton, body)
         for number, kernel in enumerate(self.kernels):
             state.update(kernel, adapt=number in (2, 4), with_bones=False)
+        state.measure_change()
         for number, kernel in enumerate(self.bone_kernels):
             if number in (0, 2):
                 state.exchange_sides()
@@ -178,6 +183,8 @@ class _Rounds:
         self.deviation = solver.motion.initial(frames.start, frames.placed, frames.axis)
         self.seen = frames.rows.used.any(0)
         self.crossed = frames.placed
+        self.sure = torch.zeros_like(frames.placed)
+        self.change = torch.zeros_like(frames.start[0, :1])
         self.points = self._join_start()
         self.body = body or self._measure(self.points)
 
@@ -199,6 +206,7 @@ class _Rounds:
         counts = (counted > _COUNTS) & self.rows.used
         self.seen = counts.any(0)
         self.crossed = counts.sum(0) >= 2
+        self.sure = ((robust > _SURE) & self.rows.used).sum(0) >= _SURE_VIEWS
         self.precision = counted / scale.square()
         blocks, right = self.rows.sums(self.precision)
         self.observed = blocks.clone()
@@ -243,8 +251,22 @@ class _Rounds:
 
     def _bone_terms(self) -> BoneTerms:
         direction, _ = self._directions(self.points)
-        precision = self.near * self.body.precision[:, None]
-        return BoneTerms(self.ends, direction, precision)
+        precision = self.body.precision[:, None]
+        told = self.near * precision / (1 + precision * self.change)
+        return BoneTerms(self.ends, direction, told)
+
+    def measure_change(self) -> None:
+        """Measure where views agree that a bone has another length than usual."""
+        start, end = self.ends
+        _, lengths = self._directions(self.points)
+        body = self.body
+        self.change = self.solver.bones.changes(
+            lengths,
+            self.sure[start] & self.sure[end],
+            body.length,
+            body.precision,
+            self.frames.axis,
+        )
 
     def _join_start(self) -> Float[Tensor, "3 J T"]:
         """Return the start with what is missing in it carried over through time."""
