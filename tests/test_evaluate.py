@@ -143,7 +143,7 @@ def test_form_is_the_documented_one(tmp_path):
             "upper_leg",
             "lower_leg",
         }
-    assert len(NAMES) == 17
+    assert len(NAMES) == 16
 
 
 def test_without_damaged_only_where_there_are_damaged_takes(tmp_path):

@@ -44,7 +44,6 @@ class TestSettings(OutputSettings):
     """Frames of a pair of cameras; None: as many as in training."""
     data: Target
     trainer: Target
-    view_weights: Target | None = None
     baselines: Target = field(default_factory=dict)
     camera_baselines: Target = field(default_factory=dict)
     trajectory: Target | None = None
@@ -53,9 +52,7 @@ class TestSettings(OutputSettings):
 
     def estimators(self) -> BaselineSettings:
         """Return what is tested beside the model."""
-        return BaselineSettings(
-            self.baselines, self.camera_baselines, self.view_weights, self.trajectory
-        )
+        return BaselineSettings(self.baselines, self.camera_baselines, self.trajectory)
 
 
 @dataclass(frozen=True)

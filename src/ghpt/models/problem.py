@@ -58,8 +58,6 @@ class BaselineSettings:
     """Classical estimators of poses."""
     camera_baselines: Target
     """Classical estimators of relative camera poses."""
-    view_weights: Target | None = None
-    """How a model of poses weights the views; None: not at all."""
     trajectory: Target | None = None
     """How whole recordings are estimated; None: not at all."""
 

@@ -24,7 +24,6 @@ NAMES = {
     "h36m": "Human3.6M",
     "panoptic": "Panoptic",
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
-    "view_weights": "view weights",
     "trajectory": "trajectory",
     "online": "trajectory, online",
     "frame_learned": "learned frames",
@@ -54,8 +53,8 @@ _CAPTION = (
     "6 j: rel, elbows wrists knees; cov: joints estimated; diff: rel to paper",
 )
 _MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
-_PER_ACTION = ("weight", "average", "best", "view_weights", "linear", "ransac")
-_BOLD = ("weight", "view_weights", "frame_learned")
+_PER_ACTION = ("weight", "average", "best", "frame_learned", "linear", "ransac")
+_BOLD = ("weight", "frame_learned")
 
 Metrics = Mapping[str, Any]
 """The content of metrics.json."""

@@ -35,7 +35,7 @@ from ghpt.report.tables import (
 
 SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
-_FINAL = ("weight", "average", "view_weights", "trajectory", "rig")
+_FINAL = ("weight", "average", "frame_learned", "trajectory", "rig")
 """The estimates whose errors stand beside the hyper-parameters, where there are such."""
 _SAMPLE = 50
 """Blocks of `_BLOCK` frames, evenly over the run, that histograms and the figure are made of."""

@@ -67,7 +67,6 @@ class PredictSettings(InputSettings):
     trainer: dict[str, Any]
     flips: bool
     predictor: PredictorSettings
-    view_weights: Target
     fitted_frames: int
     camera_check: Target
     verdict: Target

@@ -29,7 +29,6 @@ NAMES = (
     "random",
     "best",
     "worst",
-    "view_weights",
     "trajectory",
     "frame_learned",
     "linear",
@@ -39,7 +38,7 @@ NAMES = (
     "m_estimator",
     "lo_ransac",
 )
-"""The order of every table: the selections, the learned view weights, then the baselines."""
+"""The order of every table: the selections, then the other estimators."""
 
 _CHUNK = 2048
 

@@ -161,13 +161,3 @@ class PoseTriangulation(PoseProblem):
         points = hypotheses.points
         estimated = hypotheses.estimated[:, None].expand(points.shape[:-1])
         return PoseEstimate(points, estimated)
-
-    def baselines(
-        self, settings: BaselineSettings, model: Any
-    ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
-        """Return view weights, where there are settings for them, and the rest."""
-        learned: dict[str, Callable[[Observations], PoseEstimate]] = {}
-        if settings.view_weights:
-            view_weights = build(settings.view_weights, "view_weights")
-            learned["view_weights"] = view_weights(model)
-        return learned | dict(super().baselines(settings, model))
