@@ -28,7 +28,6 @@ from ghpt.calibration.check.recording_time import in_one_time
 from ghpt.calibration.check.setup import Setup, setup_of
 from ghpt.calibration.findings import Finding
 from ghpt.commands.app import Command
-from ghpt.commands.calibration.case import people_findings
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
 from ghpt.commands.inputs import (
@@ -190,8 +189,6 @@ def own_subject(settings: CamerasSettings, camera_check: CameraCheck) -> Subject
     clock = clock_of(settings.time, sequence, camera_check.time)
     timed = in_one_time(retime(sequence, clock), camera_check)
     evidence = gather(timed.sequence, camera_check.frames, camera_check.shift)
-    for finding in people_findings(people):
-        _log.warning(finding.text)
     key_points = Path(str(settings.keypoints)).resolve().name
     return Subject(
         title=f"{Path(str(settings.cameras)).name} with {key_points}",
