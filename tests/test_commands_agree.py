@@ -127,7 +127,7 @@ CALISCOPE = ("caliscope/xy_HOLISTIC.csv", "caliscope/camera_array.toml")
 
 @pytest.mark.parametrize(
     ("points", "cameras", "expected"),
-    sizes.representatives([(*POSE2SIM, {("moved", ("cam03",))})], [(*CALISCOPE, set())]),
+    sizes.representatives([(*POSE2SIM, {("moved", ("cam01", "cam03"))})], [(*CALISCOPE, set())]),
 )
 def test_the_commands_agree_on_real_recordings(points, cameras, expected, shared_data, tmp_path):
     words = (f"keypoints={shared_data / points}", f"cameras={shared_data / cameras}", "rate_hz=30")

@@ -13,7 +13,7 @@ from ghpt.calibration.intrinsics import IntrinsicsEstimation
 from ghpt.calibration.mistakes import SEVERAL_PEOPLE
 from ghpt.calibration.rig import RigCalibration
 from ghpt.calibration.uncertainty import LensErrors
-from ghpt.calibration.whose import one_person
+from ghpt.calibration.whose import same_people
 from ghpt.commands.calibration.settings import CalibrateSettings
 from ghpt.commands.inputs import (
     own_cameras,
@@ -41,10 +41,12 @@ class Crowd:
     match: dict[Name, Name] | None
     views: list[Name] | None
 
-    def follow(self, cameras: CameraSet, calibration: RigCalibration, seed: int) -> Sequence:
-        """Return one person, the same in all views, whose cameras need no extrinsics."""
+    def follow(self, cameras: CameraSet, calibration: RigCalibration, seed: int) -> list[Sequence]:
+        """Return people who are the same in all views, the surest first; cameras need no
+        extrinsics.
+        """
         tracks = self.tracks(cameras)
-        return one_person(tracks, calibration.pairs, calibration.noise, seed)
+        return same_people(tracks, calibration.pairs, calibration.noise, seed)
 
     def among(self, cameras: CameraSet, placed: list[int]) -> list[Sequence]:
         """Return everybody whom some calibrated cameras tell apart, the most visible first."""
@@ -144,8 +146,8 @@ def of_one_person(case: Case, calibration: RigCalibration, seed: int) -> Case:
     if case.crowd is None:
         return case
     given = case.evidence
-    found = case.crowd.follow(given.cameras, calibration, seed)
-    evidence = replace(given, points=found.points)
+    surest = case.crowd.follow(given.cameras, calibration, seed)[0]
+    evidence = replace(given, points=surest.points)
     joints = evidence.as_joints()
     return replace(case, evidence=evidence, sequence=replace(case.sequence, points=joints.points))
 

@@ -82,13 +82,16 @@ def solve_rig(
 def _from_everybody(
     case: Case, calibration: RigCalibration, seed: int
 ) -> tuple[tuple[Sequence, ...], RigEstimate]:
-    """Return the rig from the person who was followed, or from everybody whom that rig tells apart
+    """Return the rig from the people who were followed, or from everybody whom that rig tells apart
     in the key points of all detectors; and who it was.
     """
-    followed = (case.evidence,)
-    estimate = calibrate_people(calibration, followed, seed, lenses=case.lenses)
     cameras = case.evidence.cameras
     in_one_time = cameras.clock is None or cameras.clock.is_synchronised
+    followed: tuple[Sequence, ...] = (case.evidence,)
+    if case.crowd is not None and in_one_time:
+        # who stands in one place shows no rig: whoever else is there adds what is lacking
+        followed = tuple(case.crowd.follow(cameras, calibration, seed))
+    estimate = calibrate_people(calibration, followed, seed, lenses=case.lenses)
     if case.crowd is not None and in_one_time:
         estimate = _with_all_views(case.evidence, case.crowd, estimate, calibration, seed)
     whole = estimate.converged and bool(estimate.calibrated.all())
