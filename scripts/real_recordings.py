@@ -65,7 +65,7 @@ def main(folder: Path, words: list[str]) -> None:
         found = {}
         with tempfile.TemporaryDirectory() as output:
             runs = {estimator: [f"estimator={estimator}"] for estimator in ESTIMATORS}
-            runs |= {"view_weights": words} if words else {}
+            runs |= {"weight": words} if words else {}
             for estimator, more in runs.items():
                 found[estimator] = poses(
                     [*given, *more, "formats=[npz]", "evaluated_frames=1"], Path(output)

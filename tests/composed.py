@@ -16,7 +16,7 @@ from hydra._internal.config_loader_impl import ConfigLoaderImpl
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig
 
-from ghpt.commands.calibrate import CalibrateSettings
+from ghpt.commands.calibration.settings import CalibrateSettings
 from ghpt.commands.cameras import CamerasSettings
 from ghpt.config import plain, settings
 

@@ -18,7 +18,8 @@ from blank import blank_figures
 from composed import calibrate_settings, cameras_settings
 from ghpt.calibration.comparison import rig_difference
 from ghpt.calibration.findings import Severity
-from ghpt.commands.calibrate import COMMAND, calibrate, files, people_findings
+from ghpt.commands.calibrate import COMMAND, calibrate, files
+from ghpt.commands.calibration.case import people_findings
 from ghpt.commands.cameras import check_cameras
 from ghpt.commands.outputs import OutputFolder
 from ghpt.data.formats.camera_files import read_cameras

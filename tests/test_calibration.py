@@ -9,6 +9,7 @@ import torch
 
 import sizes
 from ghpt.calibration.baseline import RigBaseline
+from ghpt.calibration.moved import RigChange
 from ghpt.calibration.normal_matrix import linearise
 from ghpt.calibration.observations import choose_frames, observe, reweight
 from ghpt.calibration.resection import PlacedRig
@@ -130,6 +131,22 @@ def test_errors_that_last_are_in_the_uncertainty():
         z.append(free_error(estimate, scene.cameras) / variance.sqrt())
         assert estimate.evidence.lasting > 0.2
     assert 0.5 < torch.stack(z).square().mean().sqrt() < 1.8
+
+
+def test_the_camera_that_moved_is_told_where_the_people_determine_it():
+    scene = people(frames=40)
+    estimate = scene.calibrate(CALIBRATE)
+    turn = vector_to_matrix(torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64))
+    R = scene.cameras.R.clone()
+    t = scene.cameras.t.clone()
+    R[2] = turn @ R[2]
+    t[2] = turn @ t[2]
+    moved = Cameras(scene.cameras.K, R, t)
+    change = RigChange.of(estimate, moved)
+    assert change.suspects(2) == (2,)
+    assert set(change.suspects(1)) == {1, 2}  # whoever is accused, the one that moved is named
+    vague = replace(estimate, joint_covariance=1e6 * estimate.joint_covariance)
+    assert set(RigChange.of(vague, moved).suspects(2)) == {0, 1, 2, 3}
 
 
 def problem(views=3, seed=0):

@@ -166,6 +166,11 @@ def test_a_setting_without_a_default_is_needed():
         settings(Camera, {key: value for key, value in CAMERA.items() if key != "name"})
 
 
+def test_settings_that_are_gone_are_named():
+    with pytest.raises(GhptConfigError, match=r"^view_weights\.power: is gone"):
+        rename_settings(["data=h36m", "view_weights.power=4"])
+
+
 def test_settings_by_their_former_names_are_understood():
     given = ["doctor.shift=20", "swaps=false", "model.spread=1", "-m", "output=a/doctor.x=1"]
     expected = ["camera_check.shift=20", "flips=false", "model.logit_std_cap=1", "-m"]

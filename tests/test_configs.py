@@ -109,7 +109,7 @@ def test_every_test_configuration_builds(data):
 def test_the_adaptive_ransac_of_the_tables_is_everyone_s():
     config = compose("predict")
     users = (
-        config["view_weights"]["consensus"],
+        config["predictor"]["learned"]["average"]["consensus"],
         *(config["predictor"][kind]["flips"]["estimator"] for kind in ("classical", "learned")),
     )
     assert all(settings == config["baselines"]["adaptive_ransac"] for settings in users)

@@ -10,7 +10,7 @@ import pytest
 
 from composed import compose
 from ghpt.commands import demo, detect
-from ghpt.commands.calibrate import CalibrateSettings
+from ghpt.commands.calibration.settings import CalibrateSettings
 from ghpt.commands.prediction.settings import PredictSettings
 from ghpt.config import settings
 from ghpt.data.formats.camera_files import read_cameras

@@ -86,7 +86,7 @@ def relative(values: dict, name: str) -> np.ndarray:
 
 def test_numbers_equal_numpy_on_the_same_arrays(tmp_path):
     values = content()
-    metrics = evaluate_poses(predictions(tmp_path, values))
+    metrics = evaluate_poses(predictions(tmp_path, values)).plain()
     recording = values["recording"].numpy()
     for name, numbers in metrics["selections"].items():
         errors = relative(values, name)
@@ -110,12 +110,13 @@ def test_numbers_equal_numpy_on_the_same_arrays(tmp_path):
 
 
 def test_form_is_the_documented_one(tmp_path):
-    metrics = evaluate_poses(predictions(tmp_path, content()))
+    metrics = evaluate_poses(predictions(tmp_path, content())).plain()
     assert list(metrics) == [
         "format_version",
         "data",
         "source",
         "split",
+        "problem",
         "frames",
         "seed",
         "provenance",
@@ -143,19 +144,19 @@ def test_form_is_the_documented_one(tmp_path):
             "upper_leg",
             "lower_leg",
         }
-    assert len(NAMES) == 17
+    assert len(NAMES) == 16
 
 
 def test_without_damaged_only_where_there_are_damaged_takes(tmp_path):
-    metrics = evaluate_poses(predictions(tmp_path, content(takes=3), takes=TAKES[1:]))
+    metrics = evaluate_poses(predictions(tmp_path, content(takes=3), takes=TAKES[1:])).plain()
     assert all("without_damaged" not in numbers for numbers in metrics["selections"].values())
 
 
 def test_chunks_do_not_matter(tmp_path, monkeypatch):
     opened = predictions(tmp_path, content())
-    whole = evaluate_poses(opened)
+    whole = evaluate_poses(opened).plain()
     monkeypatch.setattr("ghpt.models.pose.evaluation._CHUNK", 7)
-    for name, numbers in evaluate_poses(opened)["selections"].items():
+    for name, numbers in evaluate_poses(opened).plain()["selections"].items():
         for mean in MEANS:
             assert numbers[mean] == pytest.approx(whole["selections"][name][mean], rel=1e-12)
 
@@ -163,7 +164,7 @@ def test_chunks_do_not_matter(tmp_path, monkeypatch):
 def test_nothing_to_measure_is_null_and_never_nan(tmp_path):
     values = content()
     values["truth"] = replace(values["truth"], valid=torch.zeros(60, 17, dtype=torch.bool))
-    metrics = evaluate_poses(predictions(tmp_path, values))
+    metrics = evaluate_poses(predictions(tmp_path, values)).plain()
     write_json(tmp_path / "metrics.json", metrics)
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     weight = metrics["selections"]["weight"]
@@ -176,6 +177,6 @@ def test_leaving_hard_joints_out_shows_in_the_coverage(tmp_path):
     full = values["estimates"]["worst"]
     hard = torch.linalg.vector_norm(full.points - values["truth"].points, dim=-1) > 60
     values["estimates"]["weight"] = PoseEstimate(full.points, full.estimated & ~hard)
-    selections = evaluate_poses(predictions(tmp_path, values))["selections"]
+    selections = evaluate_poses(predictions(tmp_path, values)).plain()["selections"]
     assert selections["weight"]["mpjpe_absolute"] < selections["worst"]["mpjpe_absolute"]
     assert selections["weight"]["coverage"] < selections["worst"]["coverage"]

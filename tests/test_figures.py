@@ -15,6 +15,7 @@ from ghpt.models.pose.schema import POSES, PoseSample, PoseTables
 from ghpt.models.predictions import PredictionWriter, open_predictions, with_nan
 from ghpt.observations import PoseEstimate, Recording, Truth
 from ghpt.report import figures
+from ghpt.report.tables import pose_priors, title
 from ghpt.report.tensorboard import SHOWN, write_events
 from ghpt.skeleton import JOINT, JOINTS, PELVIS
 
@@ -119,34 +120,33 @@ def test_skeletons_say_the_3d_error_and_draw_what_is_there():
 
 
 def test_pose_prior_bars_show_each_value(tmp_path):
-    _, metrics = run(tmp_path)
-    figure = figures.pose_prior_bars(metrics, "S9")
+    _, measured = run(tmp_path)
+    priors = pose_priors(measured, "S9")
+    figure = figures.pose_prior_bars(priors, "S9", title(measured.run))
     (axes,) = figure.axes
     heights = [[bar.get_height() for bar in container] for container in axes.containers]
     names = [container.get_label() for container in axes.containers]
     assert names == ["weight", "most", "least", "random"]
     for name, bars in zip(names, heights, strict=True):
-        assert bars == [metrics["selections"][name]["pose_prior"]["S9"][part] for part in PARTS]
+        assert bars == [priors[name][part] for part in PARTS]
     assert "synthetic" in axes.get_title()
     assert figures.image(figure).std() > 10
 
 
-def test_pose_prior_bars_without_a_value_are_drawn(tmp_path):
-    _, metrics = run(tmp_path)
-    for numbers in metrics["selections"].values():
-        numbers["pose_prior"]["S9"] = dict.fromkeys(PARTS)
-    assert figures.image(figures.pose_prior_bars(metrics, "S9")).shape[2] == 3
+def test_pose_prior_bars_without_a_value_are_drawn():
+    priors = {"weight": dict.fromkeys(PARTS)}
+    assert figures.image(figures.pose_prior_bars(priors, "S9", "a run")).shape[2] == 3
 
 
 def test_events_hold_the_numbers_of_metrics_json(tmp_path):
-    predictions, metrics = run(tmp_path)
+    predictions, measured = run(tmp_path)
     before = "matplotlib.pyplot" in sys.modules
-    assert write_events(tmp_path / "events", predictions, metrics) == 0
+    assert write_events(tmp_path / "events", predictions, measured) == 0
     assert ("matplotlib.pyplot" in sys.modules) == before
     events = EventAccumulator(str(tmp_path / "events"), size_guidance={"images": 0}).Reload()
     tags = events.Tags()
     (scalar,) = events.Scalars("test/weight")
-    wanted = metrics["selections"]["weight"]["mpjpe_relative"]
+    wanted = measured.selections["weight"].means.relative
     assert scalar.value == pytest.approx(wanted, rel=1e-6)
     assert all(tag.startswith("test/") for tag in tags["scalars"])
     assert tags["tensors"] == ["report/text_summary"]
@@ -160,7 +160,7 @@ def test_data_without_truth_still_make_events(tmp_path):
 
 
 def test_failures_are_counted_said_once_and_stop_nothing(tmp_path, monkeypatch, caplog):
-    predictions, metrics = run(tmp_path)
+    predictions, measured = run(tmp_path)
 
     def broken(*_):
         raise OSError("no space left")
@@ -168,10 +168,10 @@ def test_failures_are_counted_said_once_and_stop_nothing(tmp_path, monkeypatch, 
     monkeypatch.setattr("ghpt.report.tensorboard.skeletons", broken)
     monkeypatch.setattr("ghpt.report.tensorboard.pose_prior_bars", broken)
     with caplog.at_level(logging.WARNING, "ghpt"):
-        assert write_events(tmp_path / "events", predictions, metrics) == 2
+        assert write_events(tmp_path / "events", predictions, measured) == 2
     (record,) = caplog.records
     assert "no space left" in record.getMessage()
     events = EventAccumulator(str(tmp_path / "events")).Reload()
     assert "test/weight" in events.Tags()["scalars"]  # what comes after the failing parts is there
     (tmp_path / "file").write_text("")
-    assert write_events(tmp_path / "file" / "events", predictions, metrics) > 0
+    assert write_events(tmp_path / "file" / "events", predictions, measured) > 0

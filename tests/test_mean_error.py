@@ -67,7 +67,7 @@ def stored(folder, labels, processes=1):
 
 
 def test_the_mean_error_is_over_the_frames_that_can_be_compared(tmp_path):
-    metrics = mean_errors(stored(tmp_path, truth()), distance)
+    metrics = mean_errors(stored(tmp_path, truth()), distance).plain()
     assert metrics["problem"] == "point"
     assert metrics["frames"] == FRAMES
     assert metrics["selections"]["weight"]["error"] == pytest.approx(3, rel=1e-6)
@@ -77,7 +77,7 @@ def test_the_mean_error_is_over_the_frames_that_can_be_compared(tmp_path):
 
 
 def test_without_a_truth_there_is_no_error(tmp_path):
-    metrics = mean_errors(stored(tmp_path, truth(valid=False)), distance)
+    metrics = mean_errors(stored(tmp_path, truth(valid=False)), distance).plain()
     assert metrics["selections"]["weight"] == {"error": None, "coverage": 0.0}
 
 
@@ -89,9 +89,9 @@ def test_several_processes_write_the_file_of_one(tmp_path):
 
 def test_the_report_has_a_row_for_each_estimator(tmp_path):
     predictions = stored(tmp_path, truth())
-    metrics = mean_errors(predictions, distance)
-    assert REPORT.write_events(tmp_path / "events", predictions, metrics) == 0
-    for document in (REPORT.summary(metrics), REPORT.document(metrics)):
+    measured = mean_errors(predictions, distance)
+    assert REPORT.write_events(tmp_path / "events", predictions, measured) == 0
+    for document in (REPORT.summary(measured), REPORT.document(measured)):
         (table,) = document.blocks
         assert [row[:2] for row in table.rows] == [("weight", "3.0"), ("mine", "4.0")]
 

@@ -56,7 +56,7 @@ def child(folder: str, frames: int) -> None:
             time.sleep(0.005)
 
     threading.Thread(target=watch, daemon=True).start()
-    metrics = toys.run_test(config, Path(folder) / str(frames)).metrics
+    metrics = toys.run_test(config, Path(folder) / str(frames)).measured.plain()
     print(json.dumps({"peak": peak[0], "frames": metrics["frames"]}))
 
 

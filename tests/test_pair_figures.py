@@ -92,14 +92,14 @@ def test_the_figure_is_of_a_draw_that_is_median(tmp_path):
 
 
 def test_events_hold_the_numbers_of_metrics_json(tmp_path):
-    predictions, metrics = run(tmp_path)
+    predictions, measured = run(tmp_path)
     before = "matplotlib.pyplot" in sys.modules
-    assert write_pair_events(tmp_path / "events", predictions, metrics) == 0
+    assert write_pair_events(tmp_path / "events", predictions, measured) == 0
     assert ("matplotlib.pyplot" in sys.modules) == before
     events = EventAccumulator(str(tmp_path / "events"), size_guidance={"images": 0}).Reload()
     tags = events.Tags()
     (scalar,) = events.Scalars("test/weight")
-    assert scalar.value == pytest.approx(metrics["selections"]["weight"]["E_3D"], rel=1e-6)
+    assert scalar.value == pytest.approx(measured.selections["weight"].headline, rel=1e-6)
     assert all(tag.startswith("test/") for tag in tags["scalars"])
     assert tags["tensors"] == ["report/text_summary"]
     assert set(tags["images"]) == {"rig"}
@@ -108,17 +108,17 @@ def test_events_hold_the_numbers_of_metrics_json(tmp_path):
 
 
 def test_failures_are_counted_said_once_and_stop_nothing(tmp_path, monkeypatch, caplog):
-    predictions, metrics = run(tmp_path)
+    predictions, measured = run(tmp_path)
 
     def broken(*_):
         raise OSError("no space left")
 
     monkeypatch.setattr("ghpt.report.pair_tensorboard.rig_figure", broken)
     with caplog.at_level(logging.WARNING, "ghpt"):
-        assert write_pair_events(tmp_path / "events", predictions, metrics) == 1
+        assert write_pair_events(tmp_path / "events", predictions, measured) == 1
     (record,) = caplog.records
     assert "no space left" in record.getMessage()
     events = EventAccumulator(str(tmp_path / "events")).Reload()
     assert "test/weight" in events.Tags()["scalars"]  # what comes after the failing part is there
     (tmp_path / "file").write_text("")
-    assert write_pair_events(tmp_path / "file" / "events", predictions, metrics) > 0
+    assert write_pair_events(tmp_path / "file" / "events", predictions, measured) > 0

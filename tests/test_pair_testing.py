@@ -54,7 +54,7 @@ def settings(checkpoint: Path, **changes: Any) -> dict[str, Any]:
 
 def test_files_table_and_events(checkpoint, tmp_path, capsys):
     result = toys.run_test(settings(checkpoint), tmp_path)
-    metrics = result.metrics
+    metrics = result.measured.plain()
     assert json.loads((tmp_path / "metrics.json").read_text()) == metrics
     assert (metrics["problem"], metrics["frames"], metrics["draws"]) == ("camera", 8, 2)
     assert list(metrics["selections"]) == [*AGGREGATIONS, "eight_point"]
@@ -94,7 +94,7 @@ def test_every_estimate_has_the_length_that_the_problem_s_scale_gives(checkpoint
 
 def test_another_number_of_frames_can_be_tested(checkpoint, tmp_path):
     result = toys.run_test(settings(checkpoint, frames=20, hypotheses=4), tmp_path)
-    assert result.metrics["frames"] == 20
+    assert result.measured.run.frames == 20
     with pytest.raises(GhptConfigError, match="is 'many', not an integer"):
         toys.run_test(settings(checkpoint, frames="many"), tmp_path)
 
@@ -111,6 +111,6 @@ def test_the_same_bytes_twice(checkpoint, tmp_path):
 def test_baselines_of_the_other_problem_are_not_built(checkpoint, tmp_path):
     other = {"linear": {"_target_": "no.such.Class"}}
     result = toys.run_test(settings(checkpoint, baselines=other), tmp_path)
-    assert "linear" not in result.metrics["selections"]
+    assert "linear" not in result.measured.selections
     with pytest.raises(GhptConfigError, match="camera_baselines: is 3, not a"):
         toys.run_test(settings(checkpoint, camera_baselines=3), tmp_path)

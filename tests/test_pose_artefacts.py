@@ -10,7 +10,7 @@ import pytest
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.paper.engine.artefact import Comparison, Results, Spread
-from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
+from ghpt.paper.pose import base_dataset, generalization, other_systems
 from ghpt.paper.pose import figures as pose_figures
 from ghpt.paper.published import (
     GENERALIZATION,
@@ -25,10 +25,10 @@ SETUP = setup()
 REAL = setup(roots={"human36m": "/data/human36m", "panoptic": "/data/panoptic"})
 ARTEFACTS = {
     i.label: i
-    for part in (generalization, other_systems, base_dataset, pose_figures, view_weights)
+    for part in (generalization, other_systems, base_dataset, pose_figures)
     for i in part.ARTEFACTS
 }
-ESTIMATORS = (*AGGREGATIONS, "view_weights", *base_dataset.BASELINES)
+ESTIMATORS = (*AGGREGATIONS, "frame_learned", *base_dataset.BASELINES)
 PRIOR = {"weight": 1e-3, "best": 1.1e-3, "average": 2e-3}
 
 
@@ -194,66 +194,24 @@ def test_the_pose_prior_claims_follow_the_numbers():
     assert list(good.figures) == ["pose-prior"]
 
 
-def test_other_systems_have_view_weights_of_the_novel_arrangements_beside_them():
-    def view_weights(name, metrics):
-        train, test = name.split(" on ")
-        metrics["selections"]["view_weights"]["mpjpe_relative"] = 99.0 if train == test else 20.0
+def test_other_systems_have_estimators_of_the_same_detections_beside_them():
+    def change(name, metrics):
+        metrics["selections"]["frame_learned"]["mpjpe_relative"] = 20.0
 
-    body = markdown(ARTEFACTS["sota-comparison"].section(Fake(view_weights)))
-    (row,) = (line for line in body.splitlines() if line.startswith("| view weights"))
+    body = markdown(ARTEFACTS["sota-comparison"].section(Fake(change)))
+    (row,) = (line for line in body.splitlines() if line.startswith("| learned frames"))
     assert row.split("|")[3].strip() == "20.0"
     assert any(line.startswith("| adaptive RANSAC on our detections") for line in body.splitlines())
 
 
-@pytest.mark.parametrize(
-    ("task", "error", "holds"),
-    [
-        ("", 0.0, [True, True, True]),
-        (
-            "cmu2 on h36m",
-            28.0,
-            [True, False, True],
-        ),  # better than the paper's 33.4 mm, worse than RANSAC's 27.4
-        ("cmu1 on cmu3", 26.0, [False, True, True]),  # worse than the paper's 24.9 mm
-        ("cmu4 on cmu1", 41.0, [False, True, False]),
-    ],
-)
-def test_view_weights_are_set_beside_the_papers_selection_and_the_best_classical_estimator(
-    task, error, holds
-):
-    def change(name, metrics):
-        metrics["selections"]["view_weights"]["mpjpe_relative"] = error if name == task else 20.0
-
-    section = ARTEFACTS["view-weights"].section(Fake(change))
-    assert [claim.holds for claim in section.claims] == holds
-    assert {claim.section for claim in section.claims} == {"not in the paper"}
-    rows = [
-        [text.strip() for text in line.split("|")[1:-1]]
-        for line in markdown(section).splitlines()[2:]
-    ]
-    assert len(rows) == 2 + 2 * 5
-    assert rows[-1] == [
-        "H36M, the paper's selection",
-        "33.50",
-        "33.40",
-        "31.00",
-        "32.50",
-        "29.10",
-        "RANSAC 27.40",
-    ]
-    assert rows[-2][:2] == ["H36M, view weights", "20.00"]
-    assert not section.comparisons
-
-
-def test_every_test_has_view_weights_but_those_of_other_splits():
+def test_only_tests_on_the_own_arrangement_have_other_estimators_beside_the_model():
     grid = generalization.grid(SETUP)
-    assert all(task.config["view_weights"] for task in grid.values())
     assert {name for name, task in grid.items() if task.config["baselines"]} == {
         f"{data} on {data}" for data in generalization.ARRANGEMENTS
     }
     limitation = ARTEFACTS["limitation-table"].tasks(SETUP)
-    assert not limitation["train"].config["view_weights"]
-    assert limitation["test"].config["view_weights"]
+    assert not limitation["train"].config["baselines"]
+    assert limitation["test"].config["baselines"]
 
 
 def test_hyperparameters_are_those_of_the_configuration():

@@ -242,14 +242,12 @@ def test_a_trained_model_predicts_and_says_so(command, tmp_path):
         *words(tmp_path, points_file(tmp_path)),
         f"ckpt={ckpt}",
         "hypotheses=6",
-        "view_weights.power=2.5",
         "compare=[linear]",
     )
     assert status == 0, errors
     assert "pose.ckpt, trained on toys" in said
     about, found = result(tmp_path)
-    assert about.estimator == "view_weights"
-    assert about.provenance["settings"]["view_weights"]["power"] == 2.5
+    assert about.estimator == "weight"
     assert about.provenance["settings"]["hypotheses"] == 6
     assert float((found.points.double() - walk()[:40]).norm(dim=-1).max()) < 4
     assert found.score.abs().sum() > 0

@@ -10,11 +10,11 @@ from ghpt.config import build
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.estimators.classical import Linear, MEstimator, WeightedLinear, person_scale
 from ghpt.models.estimators.lo_ransac import LoRansac
+from ghpt.models.estimators.pool_average import PoolAverage
 from ghpt.models.estimators.predictors import Classical, Learned, observe_joints
 from ghpt.models.estimators.ransac import AdaptiveRansac, Ransac
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.estimators.uncertainty import UncertaintyModel
-from ghpt.models.estimators.view_weights import ViewWeights
 from ghpt.models.loss import StochasticLoss
 from ghpt.models.module import StochasticEstimator
 from ghpt.models.pose.problem import PoseTriangulation
@@ -57,7 +57,7 @@ def learned(reject=None):
     )
     model.fit_statistics(iter([random_scene(0, frames=20).batch()]))
     consensus = AdaptiveRansac(threshold=0.02, pairs=64, seed=0, adapt=5.0, quantile=0.55, rounds=4)
-    return Learned(ViewWeights(model, consensus, power=1.5), QUALITY, None, reject)
+    return Learned(PoolAverage(model, consensus), QUALITY, None, reject)
 
 
 def single(batch):
@@ -100,16 +100,17 @@ def test_the_learned_model_gives_the_truth_of_exact_key_points_and_its_score():
     assert (result.score != 0).all()
 
 
-def test_the_learned_prediction_is_that_of_the_view_weights():
+def test_the_learned_prediction_is_the_average_of_the_pool():
     batch = random_scene(2, frames=3, views=5).noisy(4, 0).batch()
     predictor = learned()
-    weighed, result = predictor.view_weights.weigh(batch), predictor(batch)
-    assert torch.equal(result.points, weighed.triangulation.points)
-    assert torch.equal(result.views, weighed.views)
+    averaged, result = predictor.average.estimate(batch), predictor(batch)
+    expected = averaged.pool.estimate().points.double()
+    torch.testing.assert_close(result.points, expected, rtol=0, atol=1e-3)
+    assert torch.equal(result.views, averaged.views)
     torch.testing.assert_close(
-        result.score, (weighed.pool.weights() * weighed.pool.logits).sum(-1), rtol=0, atol=1e-6
+        result.score, (averaged.pool.weights() * averaged.pool.logits).sum(-1), rtol=0, atol=1e-6
     )
-    found = QUALITY(batch, weighed.triangulation.points, weighed.views)
+    found = QUALITY(batch, averaged.triangulation.points, averaged.views)
     torch.testing.assert_close(result.covariance, found.covariance.float())
 
 
@@ -117,7 +118,7 @@ def test_displaced_key_points_spoil_the_average_of_the_hypotheses_and_not_the_le
     scene = random_scene(10, frames=40, views=5).noisy(2, 0)
     batch = Outliers(0.05, 0.1, 0.5)(scene.batch(), 0)
     predictor = learned()
-    model = predictor.view_weights.model
+    model = predictor.average.model
     pool = model.sample(batch, "average")
     result = sound(predictor(batch), batch)
     ours, average = (
@@ -294,7 +295,7 @@ def test_the_configuration_builds_both_and_each_finds_the_recordings_noise():
     size = person_scale(scene.key_points, batch.valid).mean()
     for made in (
         build(config["classical"], "predictor.classical")(estimator=estimator),
-        build(config["learned"], "predictor.learned")(view_weights=learned().view_weights),
+        build(config["learned"], "predictor.learned")(average=learned().average),
     ):
         assert made(batch).has_position.all()
         assert made.fit_to(batch).uncertainty.noise == pytest.approx(float(2 / size), rel=0.3)

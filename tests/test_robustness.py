@@ -62,20 +62,6 @@ BASELINES = {
         "seed": 0,
     },
 }
-VIEW_WEIGHTS = {
-    "_target_": "ghpt.models.estimators.view_weights.ViewWeights",
-    "_partial_": True,
-    "power": 1.5,
-    "consensus": {
-        "_target_": "ghpt.models.estimators.ransac.AdaptiveRansac",
-        "threshold": 0.02,
-        "pairs": 64,
-        "seed": 0,
-        "adapt": 5.0,
-        "quantile": 0.55,
-        "rounds": 4,
-    },
-}
 
 
 @pytest.fixture(scope="module")
@@ -92,7 +78,7 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., list[dic
         more = {"shortest": 0.1, "longest": 0.5} if name == "Outliers" else {}
         target = f"ghpt.paper.robustness.perturbation.{name}"
         perturbations = [{"_target_": target, setting: v, **more} if v else None for v in values]
-        config = {"data": data, "view_weights": VIEW_WEIGHTS, "baselines": BASELINES, "seed": 0}
+        config = {"data": data, "baselines": BASELINES, "seed": 0}
         config |= {"perturbations": perturbations, "sequences": SEQUENCES}
         out = folder / name
         out.mkdir(exist_ok=True)
@@ -109,7 +95,6 @@ def test_outliers_hurt_linear_and_averages_and_lo_ransac_far_less(measured):
     for level in (some, many):
         assert level["lo_ransac"]["relative"] < 0.5 * level["linear"]["relative"]
         assert level["m_estimator"]["relative"] < level["linear"]["relative"]
-        assert level["view_weights"]["relative"] < 0.5 * level["weight"]["relative"]
     for level in (clean, some, many):
         assert level["linear"]["coverage"]["relative"] == pytest.approx(1, abs=1e-3)
 
@@ -208,7 +193,7 @@ def equal(seed: int, task: str, level: int) -> dict[str, float]:
         "average": 32.0,
         "most": 33.0,
         "best": 20.0,
-        "view_weights": 29.0,
+        "frame_learned": 29.0,
         "trajectory": 25.0,
         "linear": 30.0,
         "lo_ransac": 31.0,
@@ -222,7 +207,7 @@ def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
             "average": 40.0,
             "most": 30.0,
             "best": 15.0,
-            "view_weights": 24.0,
+            "frame_learned": 24.0,
             "trajectory": 24.0,
             "linear": 42.0,
             "lo_ransac": 25.0,
@@ -246,11 +231,11 @@ def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
     assert "20.5 ± 0.7" in markdown(found)
     assert "**25.0 ± 0.0**" not in markdown(found)
     assert (
-        "Against the best classical estimator of each of 3 levels the learned view weights "
+        "Against the best classical estimator of each of 3 levels the learned frames "
         "win 1, tie 0 and lose 2: from -140.0 % (120.0 mm, LO-RANSAC 50.0) at 10 % "
         "to +4.0 % (24.0 mm, LO-RANSAC 25.0) at 0 %." in markdown(found)
     )
-    papers, ours, _ = found.claims
+    papers, ours, *_ = found.claims
     assert not papers.holds
     assert "20.5 to 102.5 mm" in papers.evidence
     assert not ours.holds
@@ -260,7 +245,7 @@ def test_a_curve_says_where_the_learned_one_wins_and_loses(tmp_path: Path):
 
 def test_equal_errors_are_called_equal_and_coverage_is_told(tmp_path: Path):
     found = section("robustness-views", equal, tmp_path)
-    assert "view weights win 2, tie 0 and lose 0" in markdown(found)
+    assert "learned frames win 2, tie 0 and lose 0" in markdown(found)
     assert "is level with the best classical estimator, linear (30.0 mm), and" in markdown(found)
     assert (
         "It is ahead of all classical estimators at no level, of LO-RANSAC at every level."
@@ -280,7 +265,7 @@ def test_every_figure_has_every_estimator_and_says_which_data(label: str, tmp_pa
         assert {line.get_label() for line in axes.containers} == {
             "the paper's selection",
             "average of its pool",
-            "learned view weights",
+            "learned frames",
             "trajectories",
             "linear",
             "LO-RANSAC",

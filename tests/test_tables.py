@@ -4,7 +4,8 @@ import pytest
 from rich.console import Console
 
 from ghpt.metrics.pose_prior import PARTS
-from ghpt.models.pose.evaluation import NAMES
+from ghpt.models.measured import Measured, TestRun
+from ghpt.models.pose.evaluation import NAMES, PoseMeans, PoseNumbers
 from ghpt.paper import published as paper
 from ghpt.report.markdown import render_markdown
 from ghpt.report.tables import (
@@ -17,40 +18,28 @@ from ghpt.report.tables import (
 )
 from ghpt.report.terminal import print_document
 
-MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
 
-
-def metrics(data="h36m", source="synthetic", split="test", trained="h36m", value=30.0) -> dict:
-    numbers = {
-        "mpjpe_absolute": 1234.56,
-        "mpjpe_relative": value,
-        "mpjpe_aligned": 22.0,
-        "mpjpe_6_joints": None,
-        "coverage": 0.99876,
-        "per_joint": {},
-        "per_action": {"Eating": 29.0, "WalkingTogether": None},
-        "pose_prior": {"S9": dict.fromkeys(PARTS, 0.00123), "S11": dict.fromkeys(PARTS)},
-        "without_damaged": dict.fromkeys(MEANS, 28.25),
-    }
+def measured(data="h36m", source="synthetic", split="test", trained="h36m", value=30.0):
+    numbers = PoseNumbers(
+        means=PoseMeans(1234.56, value, 22.0, None),
+        coverage=0.99876,
+        per_joint={},
+        per_action={"Eating": 29.0, "WalkingTogether": None},
+        pose_prior={"S9": dict.fromkeys(PARTS, 0.00123), "S11": dict.fromkeys(PARTS)},
+        without_damaged=PoseMeans(28.25, 28.25, 28.25, 28.25),
+    )
     provenance = {
         "ghpt": "0.1.0",
         "commit": "abc",
         "checkpoint": "last.ckpt",
         "training": {"data": trained, "source": source},
     }
-    return {
-        "data": data,
-        "source": source,
-        "split": split,
-        "frames": 100,
-        "seed": 0,
-        "provenance": provenance,
-        "selections": dict.fromkeys(NAMES, numbers),
-    }
+    run = TestRun(data, source, split, frames=100, seed=0, provenance=provenance)
+    return Measured(run, dict.fromkeys(NAMES, numbers))
 
 
 def report(**changes) -> str:
-    return render_markdown(report_document(metrics(**changes)))
+    return render_markdown(report_document(measured(**changes)))
 
 
 def cells(values: dict) -> dict[str, dict[str, str]]:
@@ -86,20 +75,20 @@ def test_papers_tables_agree_with_each_other():
 
 
 def test_paper_values_only_where_the_paper_has_them():
-    h36m = cells(metrics())
+    h36m = cells(measured())
     assert h36m["weight"]["paper"] == "29.1"
     assert h36m["weight"]["difference"] == "+3.1 %"
     assert h36m["RANSAC"]["paper"] == "27.4"
     assert h36m["linear"]["paper"] == h36m["linear"]["difference"] == "–"
-    across = cells(metrics(trained="cmu3"))
+    across = cells(measured(trained="cmu3"))
     assert across["weight"]["paper"] == "31.0"
     assert across["most"]["paper"] == "–"  # printed for training on Human3.6M only
     assert across["random"]["paper"] == "45.0"  # needs no training
-    panoptic = cells(metrics(data="cmu3", trained="cmu1"))
+    panoptic = cells(measured(data="cmu3", trained="cmu1"))
     assert panoptic["weight"]["paper"] == "24.9"
     assert panoptic["most"]["paper"] == "25.0"
-    assert all(row["paper"] == "–" for row in cells(metrics(split="validation")).values())
-    assert all(row["paper"] == "–" for row in cells(metrics(data="mine", trained=None)).values())
+    assert all(row["paper"] == "–" for row in cells(measured(split="validation")).values())
+    assert all(row["paper"] == "–" for row in cells(measured(data="mine", trained=None)).values())
 
 
 def test_synthetic_is_never_mistaken_for_real():
@@ -127,7 +116,7 @@ def test_report_fits_100_columns_and_every_row_has_every_column():
 
 def test_terminal_table_fits_80_columns():
     buffer = io.StringIO()
-    document = summary_document(metrics(data="cmu4", trained="cmu2"))
+    document = summary_document(measured(data="cmu4", trained="cmu2"))
     print_document(document, Console(file=buffer, width=80, color_system=None))
     lines = buffer.getvalue().splitlines()
     assert "synthetic Panoptic CMU4" in " ".join(lines)

@@ -17,6 +17,7 @@ from ghpt.geometry.cameras import Cameras, project
 from ghpt.geometry.state import State
 from ghpt.models.estimators.trajectory.disjoint import DisjointTest, square_distances
 from ghpt.models.estimators.trajectory.groups import body_groups, spanning_bones
+from ghpt.models.estimators.trajectory.inverse import tridiagonal_inverse
 from ghpt.models.estimators.trajectory.normal_matrix import (
     UPPER,
     ConjugateGradients,
@@ -161,6 +162,19 @@ def test_one_view_supports_a_joint_that_is_observed_near_by(fitted, batch, truth
     before = part.covariance[40:55, wrist, [0, 3, 5]].sum(-1).mean()
     within = part.covariance[list(gap), wrist][:, [0, 3, 5]].sum(-1).mean()
     assert within > 1.5 * before
+
+
+def test_what_one_view_sees_for_long_is_as_uncertain_as_it_is_wrong(fitted, batch, truth):
+    """A bone fits at two depths along a ray, and an estimate that nothing contradicts is smooth."""
+    gap = slice(30, 78)
+    hidden = hide(batch, range(30, 78), slice(None), (1, 2, 3))
+    part = predict_rows(fitted, Source(hidden))
+    carried = part.state[gap] == State.SUPPORTED
+    assert carried.float().mean() > 0.95
+    variance = part.covariance[gap][carried][:, [0, 3, 5]].double()
+    assert variance.min() > 0
+    offset = (part.points - truth)[gap][carried]
+    assert (offset.norm(dim=-1) / variance.sum(-1).sqrt()).max() < 7
 
 
 def test_what_a_detector_guesses_with_little_confidence_spoils_nothing(fitted, batch, truth):
@@ -308,6 +322,24 @@ def test_the_solver_solves_the_equations():
         limit = ConjugateGradients(tolerance=1e-10, iterations=500)
         found = solve(equations, BONES, groups, torch.zeros_like(right), limit)
         assert torch.allclose(found.reshape(size), expected, atol=1e-7)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 12])
+def test_blocks_of_an_inverse_are_those_of_the_whole_inverse(count):
+    generator = torch.Generator().manual_seed(count)
+    size = 3
+    matrix = torch.zeros(count, size, count, size, dtype=torch.float64)
+    rows = torch.randn(count, 2 * size, size, generator=generator, dtype=torch.float64)
+    for block, two in enumerate(rows.unbind()):
+        ends = (block, min(block + 1, count - 1))
+        for one, part in zip(ends, two.split(size), strict=True):
+            for other, beside in zip(ends, two.split(size), strict=True):
+                matrix[one, :, other] += part @ beside.T + torch.eye(size) * (one == other)
+    at = torch.arange(count)
+    inverse = torch.linalg.inv(matrix.flatten(2).flatten(0, 1)).view_as(matrix)
+    diagonal, upper = tridiagonal_inverse(matrix[at, :, at], matrix[at[:-1], :, at[1:]])
+    torch.testing.assert_close(diagonal, inverse[at, :, at])
+    torch.testing.assert_close(upper, inverse[at[:-1], :, at[1:]])
 
 
 def test_groups_are_small_and_no_bone_joins_two_of_one_half():

@@ -1,11 +1,11 @@
-"""A view that shows people whom the other views already tell apart."""
+"""People told apart before the cameras are calibrated, and in a view that comes later."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ghpt.calibration.whose import attach_views
+from ghpt.calibration.whose import attach_views, combine, same_people
 from ghpt.data.people.pooled import among_cameras
 from ghpt.data.people.sequence import KeyPointArrays, Sequence
 from ghpt.data.points import KeyPoints
@@ -56,3 +56,14 @@ def test_a_view_is_attached_to_the_person_whom_it_shows(walkers):
     np.testing.assert_array_equal(own[person].valid[:, 3], true.valid[:, 3])
     seen = true.valid[:, 3]
     np.testing.assert_array_equal(own[person].pixels[:, 3][seen], true.pixels[:, 3][seen])
+
+
+def test_people_are_the_same_in_all_views_whoever_each_view_puts_first(walkers):
+    calibrate = calibration()
+    tracks = [combine(walkers, choice) for choice in ((0, 1, 1, 0), (1, 0, 0, 1))]
+    found = same_people(tracks, calibrate.pairs, calibrate.noise, 0)
+    own = [person.undistorted().pixels for person in found]
+    order = np.argsort([abs(pixels - walkers[0].undistorted().pixels).max() for pixels in own])
+    assert len(found) == 2
+    for person, walker in zip(order, walkers, strict=True):
+        np.testing.assert_array_equal(own[person], walker.undistorted().pixels)

@@ -239,7 +239,9 @@ def calibrate_rig(
     GhptDataError where no rig can be found.
     """
     from ghpt.calibration.millimetres import read_scale
-    from ghpt.commands.calibrate import CalibrateSettings, Case, solve_rig
+    from ghpt.commands.calibration.case import Case
+    from ghpt.commands.calibration.settings import CalibrateSettings
+    from ghpt.commands.calibration.solution import solve_rig
 
     defaults = _defaults("calibrate")
     scale = defaults["scale"] | {"height": height}

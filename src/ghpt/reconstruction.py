@@ -26,7 +26,7 @@ class About:
     source: str
     """``synthetic`` or the path of the key points."""
     estimator: str
-    """``view_weights`` of a checkpoint, or a classical estimator's name."""
+    """``weight`` of a checkpoint, or a classical estimator's name."""
     joints: tuple[str, ...]
     camera_names: tuple[str, ...]
     rate_hz: float | None

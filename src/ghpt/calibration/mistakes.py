@@ -398,6 +398,13 @@ MOVED = Mistake(
     "calibrate it again",
     fitted=True,
 )
+MOVED_ONE_OF = Mistake(
+    "moved",
+    "one of {cameras} is not where the file has it, and the people in view do not tell which: key "
+    "points of {camera} lie as if it were rotated by {value:.1f}°, and moving another explains "
+    "them as well",
+    "calibrate the rig again, or let somebody walk and turn before it",
+)
 OFF = Mistake(
     "off",
     "{camera} does not agree with the others, and no mistake that is known explains it",

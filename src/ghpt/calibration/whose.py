@@ -1,4 +1,4 @@
-"""Which of the people whom each view follows by itself is one person: told by essential matrices,
+"""Which of the people whom each view follows by itself are one person: told by essential matrices,
 before any extrinsics are known.
 """
 
@@ -25,26 +25,39 @@ _CLEARLY = 0.05
 """By how much larger the mean share of inliers must be for other tracks than the first of each
 view to be taken.
 """
+_AS_WELL = 0.9
+"""Share of the first person's agreement that another's tracks must reach to be taken for one."""
 
 
-def one_person(tracks: list[Sequence], pairs: PairEstimation, noise: float, seed: int) -> Sequence:
-    """Return the sequence of one person, made of one track of each view.
+def same_people(
+    tracks: list[Sequence], pairs: PairEstimation, noise: float, seed: int
+) -> list[Sequence]:
+    """Return the sequences of people, each made of one track of each view, the surest first.
 
     ``tracks``: the k-th holds the k-th most prominent person of each view, who need not be the
-    same. Of all choices the one is taken whose key points agree with an essential matrix in the
-    largest mean share over all pairs of views; the first of each view, unless others are clearly
-    better.
+    same.
+
+    1. Of all choices the one is taken whose key points agree with an essential matrix in the
+       largest mean share over all pairs of views; the first of each view, unless others are clearly
+       better.
+    2. The next person is the best choice of the other tracks, as long as they agree about as well.
     """
     if len(tracks) < 2:
-        return tracks[0]
+        return tracks[:1]
     share = _shares(tracks, pairs, noise, seed)
-    views = share.shape[0]
-    first = (0,) * views
-    choices = [_ascend(share, track) for track in range(len(tracks))]
-    best = max(choices, key=lambda choice: _mean(share, choice))
+    first = (0,) * share.shape[0]
+    best = _best_choice(share)
     if _mean(share, best) < _mean(share, first) + _CLEARLY:
         best = first
-    return combine(tracks, best)
+    choices = [best]
+    least = _AS_WELL * _mean(share, best)
+    for _ in tracks[1:]:
+        share = _without(share, best)
+        best = _best_choice(share)
+        if _mean(share, best) < least:
+            break
+        choices.append(best)
+    return [combine(tracks, choice) for choice in choices]
 
 
 def attach_views(
@@ -151,6 +164,21 @@ class _Observed:
 def _mean(share: Float[Tensor, "V P V P"], choice: tuple[int, ...]) -> float:
     pairs = combinations(range(len(choice)), 2)
     return float(torch.stack([share[a, choice[a], b, choice[b]] for a, b in pairs]).mean())
+
+
+def _best_choice(share: Float[Tensor, "V P V P"]) -> tuple[int, ...]:
+    choices = [_ascend(share, track) for track in range(share.shape[1])]
+    return max(choices, key=lambda choice: _mean(share, choice))
+
+
+def _without(share: Float[Tensor, "V P V P"], choice: tuple[int, ...]) -> Float[Tensor, "V P V P"]:
+    """Return the shares of the tracks that a choice leaves; 0 of those that it took."""
+    left = share.clone()
+    views = torch.arange(len(choice))
+    taken = torch.tensor(choice)
+    left[views, taken] = 0.0
+    left[:, :, views, taken] = 0.0
+    return left
 
 
 def _ascend(share: Float[Tensor, "V P V P"], track: int) -> tuple[int, ...]:

@@ -35,6 +35,11 @@ _FORMER_NAMES = {
     "model.spread": "model.logit_std_cap",
 }
 """Settings by the names that scripts for earlier versions, or others of their kind, give."""
+_GONE = {
+    "view_weights": "Leave it out: estimator=frame_learned does better, and ckpt= is the paper's "
+    "estimate."
+}
+"""What stands in for settings of earlier versions that no longer exist."""
 
 
 @dataclass(frozen=True)
@@ -114,10 +119,16 @@ def spread_seeds(words: Sequence[str]) -> list[str]:
 
 
 def rename_settings(words: Sequence[str]) -> list[str]:
-    """Return the words of a command line with today's names of settings."""
+    """Return the words of a command line with today's names of settings.
+
+    Raises GhptConfigError for settings that are gone.
+    """
     renamed = []
     for word in words:
         key, equals, value = word.partition("=")
+        group = key.lstrip("+~").split(".")[0]
+        if equals and group in _GONE:
+            raise GhptConfigError(key, "is gone", _GONE[group])
         for former, name in _FORMER_NAMES.items():
             if equals and (key == former or key.startswith(f"{former}.")):
                 key = name + key.removeprefix(former)

@@ -28,7 +28,7 @@ from ghpt.paper.engine.pool import perform_all
 from ghpt.paper.engine.settings import DataFolders, Overrides, Sizes
 from ghpt.paper.engine.setup import Setup
 from ghpt.paper.engine.tasks import Task
-from ghpt.paper.pose import base_dataset, generalization, other_systems, view_weights
+from ghpt.paper.pose import base_dataset, generalization, other_systems
 from ghpt.paper.pose import figures as pose_figures
 from ghpt.paper.robustness import curves as robustness
 from ghpt.paper.robustness import sets
@@ -42,7 +42,6 @@ _PARTS = (
     base_dataset,
     pose_figures,
     camera_tables,
-    view_weights,
     sets,
     ablations,
     robustness,

@@ -18,6 +18,7 @@ from ghpt.errors import GhptCheckpointError
 from ghpt.files import sweep_temporaries, write_json
 from ghpt.models.checkpoint import load_model
 from ghpt.models.collect import CollectPredictions
+from ghpt.models.measured import Measured, Number
 from ghpt.models.predictions import Predictions, open_predictions
 from ghpt.models.problem import BaselineSettings, Problem
 from ghpt.provenance import provenance
@@ -44,7 +45,6 @@ class TestSettings(OutputSettings):
     """Frames of a pair of cameras; None: as many as in training."""
     data: Target
     trainer: Target
-    view_weights: Target | None = None
     baselines: Target = field(default_factory=dict)
     camera_baselines: Target = field(default_factory=dict)
     trajectory: Target | None = None
@@ -53,9 +53,7 @@ class TestSettings(OutputSettings):
 
     def estimators(self) -> BaselineSettings:
         """Return what is tested beside the model."""
-        return BaselineSettings(
-            self.baselines, self.camera_baselines, self.view_weights, self.trajectory
-        )
+        return BaselineSettings(self.baselines, self.camera_baselines, self.trajectory)
 
 
 @dataclass(frozen=True)
@@ -66,13 +64,13 @@ class TestResult:
 
     problem: Problem
     predictions: Predictions[Any, Any, Any]
-    metrics: dict[str, Any]
-    """The content of metrics.json."""
+    measured: Measured[Any]
 
     @property
     def error(self) -> float | None:
-        """The problem's headline number under ``weight``, mm; None where nothing was compared."""
-        return self.metrics["selections"]["weight"][self.problem.headline]
+        """The headline number under ``weight``, mm; None where nothing was compared."""
+        error: Number = self.measured.selections["weight"].headline
+        return error
 
 
 def files(settings: TestSettings) -> Files:
@@ -104,9 +102,9 @@ def test(settings: TestSettings, output: Path) -> TestResult | PeopleResult | No
         return None
     report = result.problem.report()
     page = output / "report.md"
-    write_markdown(page, report.document(result.metrics))
-    report.write_events(output, result.predictions, result.metrics)
-    print_document(report.summary(result.metrics))
+    write_markdown(page, report.document(result.measured))
+    report.write_events(output, result.predictions, result.measured)
+    print_document(report.summary(result.measured))
     _log.info("Report: %s, beside it metrics.json and predictions.npz.", display_path(page))
     _log.info("Figures: tensorboard --logdir %s", display_path(output))
     return result
@@ -161,9 +159,9 @@ def measure(settings: TestSettings, output: Path) -> TestResult | None:
     if not trainer.is_global_zero:
         return None
     predictions = open_predictions(collect.path, problem.schema)
-    metrics = problem.metrics(predictions)
-    write_json(output / "metrics.json", metrics)
-    return TestResult(problem, predictions, metrics)
+    measured = problem.metrics(predictions)
+    write_json(output / "metrics.json", measured.plain())
+    return TestResult(problem, predictions, measured)
 
 
 def summary(result: TestResult | PeopleResult | None) -> str:
@@ -173,7 +171,7 @@ def summary(result: TestResult | PeopleResult | None) -> str:
     if isinstance(result, PeopleResult):
         return result.words
     error = NONE if result.error is None else f"{result.error:.1f} mm"
-    return f"{title(result.metrics)}: {error}"
+    return f"{title(result.measured.run)}: {error}"
 
 
 COMMAND = Command(name="test", settings=TestSettings, task=test, summary=summary, files=files)

@@ -13,7 +13,16 @@ import torch
 from torch import Tensor
 
 from ghpt.errors import GhptConfigError
-from ghpt.export.scene import Evidence, Scene, bones_of, origin_note, side_of, title
+from ghpt.export.scene import (
+    Evidence,
+    Scene,
+    bones_of,
+    origin_note,
+    side_of,
+    title,
+    to_z_up,
+    upward,
+)
 from ghpt.export.stream import Chunks, extent, local_points, part
 from ghpt.files import atomic_write
 from ghpt.geometry.cameras import Cameras, project
@@ -26,6 +35,13 @@ _COLOUR = {"left": 0x0072B2FF, "right": 0xD55E00FF, "middle": 0x333333FF}
 _PALE = 0x00000080
 """Taken off a colour where a joint is filled: half transparent."""
 _GREY = 0x99999966
+_WORLD = "world"
+_RAYS = "world/rays"
+_HYPOTHESES = "world/hypotheses"
+_ERROR = "error_px"
+_SHARES = (3, 2)
+"""Of the window's width: the 3D view, and the images beside it."""
+_VIEW_COLUMNS = 2
 
 
 def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = None) -> None:
@@ -33,12 +49,14 @@ def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = 
 
     Missing joints are absent, filled ones pale. ``scene`` adds cameras and rays, and with evidence
     key points, reprojections and hypotheses. The viewer has float32, so all is relative to
-    ``about.origin``, which the recording's name tells.
+    ``about.origin``, which the recording's name tells. The viewer opens with the 3D view beside the
+    cameras' images, and the error below; rays and hypotheses are hidden until they are asked for.
 
     Raises GhptConfigError without the package.
     """
     try:
         import rerun as rr
+        import rerun.blueprint as rrb
     except ImportError as error:
         hint = "Install it (pip install rerun-sdk), or leave rerun out."
         raise GhptConfigError("rerun", "needs rerun-sdk", hint) from error
@@ -53,6 +71,8 @@ def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = 
         recording.send_recording_name(" · ".join(filter(None, names)))
         if scene is not None:
             _log_cameras(rr, recording, about, scene.cameras)
+        recording.send_blueprint(_layout(rr, rrb, about, scene))
+        up = torch.zeros(3, dtype=torch.float64)
         for chunk, evidence in zip(chunks(), _evidence(scene), strict=False):
             for start in range(0, len(chunk), _PIECE):
                 stop = start + _PIECE
@@ -60,8 +80,38 @@ def write_rerun(path: Path, about: About, chunks: Chunks, scene: Scene | None = 
                 piece = replace(piece, points=local_points(about, piece))
                 own = None if evidence is None else evidence.part(start, stop)
                 _PieceLog(rr, recording, about, piece).log(scene, own)
+                up = up + upward(about.joints, piece)
+        recording.log(_WORLD, _up_axis(rr, up), static=True)
         recording.flush()
         recording.disconnect()
+
+
+def _layout(rr: Any, rrb: Any, about: About, scene: Scene | None) -> Any:
+    """Return the layout of the viewer: as the page's, 3D on the left and the images beside it."""
+    hidden = rrb.EntityBehavior(visible=False)
+    overrides = {_RAYS: hidden, _HYPOTHESES: hidden}
+    space = rrb.Spatial3DView(origin=_WORLD, name="3D", overrides=overrides)
+    images = []
+    if scene is not None:
+        for name in about.camera_names:
+            images.append(rrb.Spatial2DView(origin=_image_path(rr, name), name=name))
+    top = space
+    if images:
+        grid = rrb.Grid(*images, grid_columns=_VIEW_COLUMNS, name="views")
+        top = rrb.Horizontal(space, grid, column_shares=_SHARES)
+    error = rrb.TimeSeriesView(origin=_ERROR, name="mean reprojection error, px")
+    timeline = rrb.TimePanel(state="collapsed", timeline="time" if about.rate_hz else "frame")
+    panels = (rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
+    whole = rrb.Vertical(top, error, row_shares=(5, 1))
+    return rrb.Blueprint(whole, *panels, timeline, auto_views=False)
+
+
+def _up_axis(rr: Any, up: Tensor) -> Any:
+    """Return the viewer's name of the world's axis nearest to ``up``."""
+    z = to_z_up(up)[2]
+    axis = int(z.abs().argmax())
+    direction = "DOWN" if z[axis] < 0 else "UP"
+    return getattr(rr.ViewCoordinates, f"RIGHT_HAND_{'XYZ'[axis]}_{direction}")
 
 
 def _evidence(scene: Scene | None) -> Iterator[Evidence | None]:
@@ -132,14 +182,14 @@ class _PieceLog:
         observed = self.piece.is_measured
         total = torch.where(observed, self.piece.error, 0.0).sum(1)
         mean = total / observed.sum(1)
-        self._send("error_px", self.rr.Scalars.columns(scalars=mean.double().numpy()))
+        self._send(_ERROR, self.rr.Scalars.columns(scalars=mean.double().numpy()))
 
     def _hypotheses(self, hypotheses: Tensor) -> None:
         origin = torch.tensor(self.about.origin, dtype=torch.float64)
         pool = hypotheses.flatten(1, 2).double() - origin
         finite = finite_vectors(pool)
         colours = torch.full_like(pool[..., 0], _GREY)
-        self._points(self.rr.Points3D, "world/hypotheses", pool, finite, colours, 4.0)
+        self._points(self.rr.Points3D, _HYPOTHESES, pool, finite, colours, 4.0)
 
     def _views(self, cameras: Cameras, evidence: Evidence | None) -> None:
         rr = self.rr
@@ -152,7 +202,7 @@ class _PieceLog:
         for v, name in enumerate(self.about.camera_names):
             centre = double.centre[v].expand_as(points)
             rays = torch.stack([centre, points], dim=-2)
-            path = f"world/rays/{rr.escape_entity_path_part(name)}"
+            path = f"{_RAYS}/{rr.escape_entity_path_part(name)}"
             self._strips(path, rays, piece.views[:, v] & observed, grey, 1.0)
             image = _image_path(rr, name)
             visible = piece.has_position & (depth[:, v] > 0)

@@ -3,25 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 from torch import Tensor
 
+from ghpt.models.measured import Measured, Number, TestRun
 from ghpt.models.predictions import Predictions
 
-FORMAT_VERSION = 1
 _CHUNK = 2048
 
 Error = Callable[[Any, Any], tuple[Tensor, Tensor]]
 """A problem's ``error``."""
 
 
-def mean_errors(predictions: Predictions[Any, Any, Any], error: Error) -> dict[str, Any]:
-    """Return the content of metrics.json, from predictions that store the true joints.
+@dataclass(frozen=True)
+class MeanError:
+    """The mean over the samples that can be compared with a truth."""
 
-    ``selections[name]``: ``error``, the mean over the samples that can be compared with a truth
-    (mm, null where none can), and ``coverage``, their share of all samples.
-    """
+    error: Number
+    """mm."""
+    coverage: float
+    """Share of such samples."""
+
+    @property
+    def headline(self) -> Number:
+        return self.error
+
+    def plain(self) -> dict[str, Any]:
+        """Return the numbers as plain data."""
+        return {"error": self.error, "coverage": self.coverage}
+
+
+def mean_errors(predictions: Predictions[Any, Any, Any], error: Error) -> Measured[MeanError]:
+    """Return what a test run measured, from predictions that store the true joints."""
     total = dict.fromkeys(predictions.names, 0.0)
     compared = dict.fromkeys(predictions.names, 0)
     for chunk in predictions.chunks(_CHUNK):
@@ -33,12 +48,5 @@ def mean_errors(predictions: Predictions[Any, Any, Any], error: Error) -> dict[s
     selections = {}
     for name, count in compared.items():
         mean = total[name] / count if count else None
-        selections[name] = {"error": mean, "coverage": count / len(predictions)}
-    meta = predictions.meta
-    return {
-        "format_version": FORMAT_VERSION,
-        **{key: meta.get(key) for key in ("data", "source", "split", "problem")},
-        "frames": len(predictions),
-        **{key: meta.get(key) for key in ("seed", "provenance")},
-        "selections": selections,
-    }
+        selections[name] = MeanError(mean, count / len(predictions))
+    return Measured(TestRun.from_meta(predictions.meta, len(predictions)), selections)

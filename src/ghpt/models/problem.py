@@ -21,6 +21,7 @@ from ghpt.config import Target
 from ghpt.data.datasets.frames import SampleSet, Sampling, draw_frames
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.mean_error import mean_errors
+from ghpt.models.measured import Measured
 from ghpt.models.predictions import Predictions, Schema, Tables, TrueJoints
 from ghpt.observations import Batch, Estimate, Labelled, LabelledRecording
 from ghpt.report.report import Report
@@ -58,8 +59,6 @@ class BaselineSettings:
     """Classical estimators of poses."""
     camera_baselines: Target
     """Classical estimators of relative camera poses."""
-    view_weights: Target | None = None
-    """How a model of poses weights the views; None: not at all."""
     trajectory: Target | None = None
     """How whole recordings are estimated; None: not at all."""
 
@@ -77,8 +76,6 @@ class Problem(ABC):
     """What ``error`` is, for people; mm."""
     schema: ClassVar[Schema[Any, Any, Any]]
     """What a test run stores."""
-    headline: ClassVar[str] = "error"
-    """The number of ``metrics`` that sums up a run, mm."""
     aggregations: ClassVar[tuple[str, ...]] = AGGREGATIONS
     """Those that mean something here; ``weight`` and ``average`` always do."""
     feature_size: int
@@ -140,8 +137,8 @@ class Problem(ABC):
         """Return what the stored predictions say of the problem's settings, as plain data."""
         return {}
 
-    def metrics(self, predictions: Predictions[Any, Any, Any]) -> dict[str, Any]:
-        """Return the content of metrics.json; ``selections`` has an entry for each estimator."""
+    def metrics(self, predictions: Predictions[Any, Any, Any]) -> Measured[Any]:
+        """Return what a test run measured of each selection and baseline."""
         return mean_errors(predictions, self.error)
 
     def report(self) -> Report:

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.report.tables import title
+from ghpt.report.tables import PosePriors
 from ghpt.skeleton import BONES, JOINT, JOINTS, PELVIS, SYMMETRIC_BONES, THORAX
 
 LineStyle = Literal["-", "--", "-.", ":"] | tuple[int, tuple[int, ...]]
@@ -108,15 +108,15 @@ def _side_handles(with_truth: bool) -> list[Line2D]:
     return handles
 
 
-def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
+def pose_prior_bars(priors: PosePriors, subject: str, title: str) -> Figure:
     """Draw fig:pose-prior: S² of a subject's six parts under the eight selections, log scale."""
     figure = Figure(figsize=(9, 4), layout="constrained")
     axes = figure.subplots()
-    selections = [name for name in AGGREGATIONS if name in metrics["selections"]]
+    selections = [name for name in AGGREGATIONS if name in priors]
     width = 0.84 / len(selections)
     for index, name in enumerate(selections):
-        prior = metrics["selections"][name]["pose_prior"][subject]
-        heights = [np.nan if prior[part] is None else prior[part] for part in SYMMETRIC_BONES]
+        prior = priors[name]
+        heights = np.array([prior[part] for part in SYMMETRIC_BONES], dtype=float)
         offset = (index - (len(selections) - 1) / 2) * width
         axes.bar(
             np.arange(len(SYMMETRIC_BONES)) + offset,
@@ -133,7 +133,7 @@ def pose_prior_bars(metrics: Mapping[str, Any], subject: str) -> Figure:
         range(len(SYMMETRIC_BONES)), [part.replace("_", " ") for part in SYMMETRIC_BONES]
     )
     axes.set_ylabel("S²: variance of left / right length")
-    heading = f"Pose prior of {subject} (lower is better)\n{title(metrics)}"
+    heading = f"Pose prior of {subject} (lower is better)\n{title}"
     axes.set_title(wrap_lines(heading, 110), fontsize=10)
     axes.grid(axis="y", color="#DDDDDD", linewidth=0.6)
     axes.set_axisbelow(True)

@@ -8,10 +8,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from ghpt.models.aggregation import AGGREGATIONS
-from ghpt.models.relative_pose.evaluation import ALONE, ERRORS
+from ghpt.models.measured import Number
+from ghpt.models.relative_pose.evaluation import ALONE, ERRORS, PairNumbers, PairsMeasured
 from ghpt.paper.published import FUNDAMENTAL, FUNDAMENTAL_DISSECTION, FUNDAMENTAL_FRAMES
 from ghpt.report.document import Block, Document, Heading, Paragraph, Strong, Table, Text, prose
-from ghpt.report.tables import NONE, Metrics, origin_text, title, training_data
+from ghpt.report.tables import NONE, origin_text, title
 
 NAMES = {
     "eight_point": "8-point",
@@ -64,63 +65,58 @@ _ABOUT_THE_PAPER = (
 )
 
 
-def pair_order(metrics: Metrics) -> list[str]:
+def pair_order(measured: PairsMeasured) -> list[str]:
     """Return the pairs' names, those of four cameras in the order of tab:fundamental-evaluation."""
-    first = next(iter(metrics["selections"]))
-    pairs = list(_pairs(metrics, first))
+    pairs = list(next(iter(measured.selections.values())).pairs)
     paper = [f"{a}-{b}" for a, b in FUNDAMENTAL]
     return paper if set(pairs) == set(paper) else pairs
 
 
-def _pairs(metrics: Metrics, name: str) -> Mapping[str, Any]:
-    """Return the numbers of a selection by pair."""
-    return metrics["selections"][name]["pairs"]
-
-
-def paper_numbers(metrics: Metrics, table: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
+def paper_numbers(measured: PairsMeasured, table: Mapping[tuple[int, int], Any]) -> dict[str, Any]:
     """Return a table of the paper by pair name.
 
     It is empty unless the run is one on Human3.6M's test split, trained there, with as many frames.
     """
-    data = (training_data(metrics)[0], metrics["data"], metrics["split"])
-    size = (len(metrics["cameras"]), metrics["frames"])
+    run = measured.run
+    data = (run.training[0], run.data, run.split)
+    size = (len(measured.cameras), run.frames)
     if data != ("h36m", "h36m", "test") or size != (4, FUNDAMENTAL_FRAMES):
         return {}
     return {f"{a}-{b}": errors for (a, b), errors in table.items()}
 
 
-def pair_rows(metrics: Metrics, name: str) -> list[list[str]]:
+def pair_rows(measured: PairsMeasured, name: str) -> list[list[str]]:
     """Return a row for each pair: its name and the six errors of a selection.
 
     Those of ``weight`` have the paper's in brackets.
     """
-    paper = paper_numbers(metrics, FUNDAMENTAL) if name == "weight" else {}
+    paper = paper_numbers(measured, FUNDAMENTAL) if name == "weight" else {}
     rows = []
-    for pair in _worst_first(metrics, name):
-        numbers = _pairs(metrics, name)[pair]
+    for pair in _worst_first(measured, name):
+        median = measured.selections[name].pairs[pair].median
         printed = paper.get(pair, {})
-        errors = [_beside_paper(error, numbers[error], printed.get(error)) for error in ERRORS]
+        errors = [_beside_paper(error, median[error], printed.get(error)) for error in ERRORS]
         rows.append([pair, *errors])
     return rows
 
 
-def pair_summary_document(metrics: Metrics) -> Document:
+def pair_summary_document(measured: PairsMeasured) -> Document:
     """Return the errors of ``weight`` on each pair, then E_3D of every name, for 80 columns."""
-    rows = pair_rows(metrics, "weight")
+    rows = pair_rows(measured, "weight")
     worst = f", the {MANY} worst of {len(rows)} pairs" if len(rows) > MANY else ""
-    paper = _PAPER if paper_numbers(metrics, FUNDAMENTAL) else ""
+    paper = _PAPER if paper_numbers(measured, FUNDAMENTAL) else ""
     errors = Table(
         _TERMINAL,
         rows[:MANY],
-        title=f"weight{worst} on {title(metrics)}",
+        title=f"weight{worst} on {title(measured.run)}",
         caption=(_CAPTION, _ANGLES + paper),
     )
-    return Document("", [errors, _comparison_summary(metrics)])
+    return Document("", [errors, _comparison_summary(measured)])
 
 
-def _comparison_summary(metrics: Metrics) -> Table:
-    comparison = comparison_table(metrics)
-    names = list(metrics["selections"])
+def _comparison_summary(measured: PairsMeasured) -> Table:
+    comparison = comparison_table(measured)
+    names = list(measured.selections)
     rows: list[list[Text]] = []
     for name, row in zip(names, comparison.rows, strict=True):
         rows.append([Strong(str(cell)) for cell in row] if name == "weight" else list(row))
@@ -134,70 +130,71 @@ def _comparison_summary(metrics: Metrics) -> Table:
     )
 
 
-def comparison_table(metrics: Metrics) -> Table:
+def comparison_table(measured: PairsMeasured) -> Table:
     """Return E_3D of every name on each pair; where there are many, of the median and the worst."""
-    order = pair_order(metrics)
+    order = pair_order(measured)
     many = len(order) > COLUMNS
     columns = ["median", "worst", "its pair"] if many else order
     rows = []
-    for name, numbers in metrics["selections"].items():
-        errors = {pair: _pairs(metrics, name)[pair]["E_3D"] for pair in order}
+    for name, numbers in measured.selections.items():
+        errors = {pair: numbers.pairs[pair].median["E_3D"] for pair in order}
         cells = _middle_and_worst(errors) if many else [_short(errors[pair]) for pair in order]
-        coverage = f"{100 * numbers['coverage']:.3g}"
-        rows.append([NAMES.get(name, name), *cells, _short(numbers["E_3D"]), coverage])
+        coverage = NONE if numbers.coverage is None else f"{100 * numbers.coverage:.3g}"
+        rows.append([NAMES.get(name, name), *cells, _short(numbers.headline), coverage])
     return Table(["selection", *columns, "mean", "cov"], rows)
 
 
-def _middle_and_worst(errors: Mapping[str, float | None]) -> list[str]:
+def _middle_and_worst(errors: Mapping[str, Number]) -> list[str]:
     finite = {pair: _none_to_inf(error) for pair, error in errors.items()}
     worst = max(finite, key=finite.__getitem__)
     middle = statistics.median(finite.values())
     return [_short(middle), _short(errors[worst]), worst]
 
 
-def pair_report_document(metrics: Metrics) -> Document:
+def pair_report_document(measured: PairsMeasured) -> Document:
     """Return the report of a test run of the camera problem."""
-    paper = bool(paper_numbers(metrics, FUNDAMENTAL))
+    paper = bool(paper_numbers(measured, FUNDAMENTAL))
     header = ["pair", *(f"{error}, {UNITS[error]}" for error in ERRORS)]
     in_brackets = " In brackets: the paper, tab:fundamental-dissection." if paper else ""
     blocks: list[Block] = [
-        Paragraph(_origin(metrics)),
+        Paragraph(_origin(measured)),
         Paragraph(_ABOUT),
         Heading(prose("Selection `weight`")),
-        Table(header, pair_rows(metrics, "weight")),
+        Table(header, pair_rows(measured, "weight")),
         *([Paragraph(_ABOUT_THE_PAPER)] if paper else []),
         Heading("E_3D of all"),
-        comparison_table(metrics),
+        comparison_table(measured),
         Heading("One part estimated, the other true"),
         Paragraph(prose("Median errors of `weight`.{}", in_brackets)),
-        dissection_table(metrics),
+        dissection_table(measured),
     ]
     for error in ERRORS:
         blocks += [
             Heading(f"{error}: {_DESCRIPTIONS[error]}, {UNITS[error]}"),
             Paragraph("Medians."),
-            _median_table(metrics, error),
+            _median_table(measured, error),
             Paragraph("Means ± deviations over the draws that could be measured."),
-            _mean_table(metrics, error),
+            _mean_table(measured, error),
         ]
-    return Document(f"Relative camera poses on {title(metrics)}", blocks)
+    return Document(f"Relative camera poses on {title(measured.run)}", blocks)
 
 
-def _origin(metrics: Metrics) -> Text:
-    cameras = ", ".join(metrics["cameras"])
-    size = f"{metrics['draws']} draws of {metrics['frames']} frames"
-    return (f"{size}, cameras {cameras}, seed {metrics['seed']}, ", *origin_text(metrics))
+def _origin(measured: PairsMeasured) -> Text:
+    run = measured.run
+    cameras = ", ".join(measured.cameras)
+    size = f"{measured.draws} draws of {run.frames} frames"
+    return (f"{size}, cameras {cameras}, seed {run.seed}, ", *origin_text(run))
 
 
-def dissection_table(metrics: Metrics) -> Table:
+def dissection_table(measured: PairsMeasured) -> Table:
     """Return tab:fundamental-dissection for ``weight``."""
-    paper = paper_numbers(metrics, FUNDAMENTAL_DISSECTION)
+    paper = paper_numbers(measured, FUNDAMENTAL_DISSECTION)
     rows = []
-    for pair in pair_order(metrics):
-        numbers = _pairs(metrics, "weight")[pair]
+    for pair in pair_order(measured):
+        alone = measured.selections["weight"].pairs[pair].alone
         printed = paper.get(pair, {})
         cells = [
-            _beside_paper(error, numbers[part][error], printed.get(part, {}).get(error))
+            _beside_paper(error, alone[part][error], printed.get(part, {}).get(error))
             for part in ALONE
             for error in ("E_2D", "E_3D")
         ]
@@ -205,42 +202,42 @@ def dissection_table(metrics: Metrics) -> Table:
     return Table(["pair", "R: E_2D, px", "R: E_3D, mm", "t: E_2D, px", "t: E_3D, mm"], rows)
 
 
-def _median_table(metrics: Metrics, error: str) -> Table:
+def _median_table(measured: PairsMeasured, error: str) -> Table:
     """Return the medians of an error of every name on every pair, and their means."""
 
-    def cell(numbers: Mapping[str, Any]) -> str:
-        return _short(_in_unit(error, numbers[error]))
+    def cell(numbers: PairNumbers) -> str:
+        return _short(_in_unit(error, numbers.median[error]))
 
-    selections = metrics["selections"]
-    table = _error_table(metrics, {name: _cells(metrics, name, cell) for name in selections})
-    if len(pair_order(metrics)) > MANY:
+    selections = measured.selections
+    table = _error_table(measured, {name: _cells(measured, name, cell) for name in selections})
+    if len(pair_order(measured)) > MANY:
         return table
-    means = [_short(_in_unit(error, numbers[error])) for numbers in selections.values()]
+    means = [_short(_in_unit(error, numbers.mean[error])) for numbers in selections.values()]
     rows = [[*row, mean] for row, mean in zip(table.rows, means, strict=True)]
     return Table([*table.header, "mean"], rows)
 
 
-def _mean_table(metrics: Metrics, error: str) -> Table:
+def _mean_table(measured: PairsMeasured, error: str) -> Table:
     """Return means and deviations of an error of every name on every pair."""
 
-    def cell(numbers: Mapping[str, Any]) -> str:
-        mean = _short(_in_unit(error, numbers["mean"][error]))
-        deviation = _short(_in_unit(error, numbers["deviation"][error]))
+    def cell(numbers: PairNumbers) -> str:
+        mean = _short(_in_unit(error, numbers.mean[error]))
+        deviation = _short(_in_unit(error, numbers.deviation[error]))
         return f"{mean} ± {deviation}"
 
-    cells = {name: _cells(metrics, name, cell) for name in metrics["selections"]}
-    return _error_table(metrics, cells)
+    cells = {name: _cells(measured, name, cell) for name in measured.selections}
+    return _error_table(measured, cells)
 
 
-def _cells(metrics: Metrics, name: str, cell: Callable[[Mapping[str, Any]], str]) -> list[str]:
+def _cells(measured: PairsMeasured, name: str, cell: Callable[[PairNumbers], str]) -> list[str]:
     """Return a selection's cells in the order of the pairs."""
-    pairs = _pairs(metrics, name)
-    return [cell(pairs[pair]) for pair in pair_order(metrics)]
+    pairs = measured.selections[name].pairs
+    return [cell(pairs[pair]) for pair in pair_order(measured)]
 
 
-def _error_table(metrics: Metrics, cells: Mapping[str, list[str]]) -> Table:
+def _error_table(measured: PairsMeasured, cells: Mapping[str, list[str]]) -> Table:
     """Return a table of cells by name; a row is a name, or where there are many pairs, a pair."""
-    order = pair_order(metrics)
+    order = pair_order(measured)
     if len(order) <= MANY:
         rows = [[NAMES.get(name, name), *of_name] for name, of_name in cells.items()]
         return Table(["selection", *order], rows)
@@ -248,23 +245,23 @@ def _error_table(metrics: Metrics, cells: Mapping[str, list[str]]) -> Table:
     return Table(["pair", *cells], [[pair, *row] for pair, row in zip(order, columns, strict=True)])
 
 
-def _worst_first(metrics: Metrics, name: str) -> list[str]:
+def _worst_first(measured: PairsMeasured, name: str) -> list[str]:
     """Return the pairs in the paper's order; where there are many, the largest E_3D first."""
-    order = pair_order(metrics)
+    order = pair_order(measured)
     if len(order) <= MANY:
         return order
-    pairs = _pairs(metrics, name)
-    return sorted(order, key=lambda pair: -_none_to_inf(pairs[pair]["E_3D"]))
+    pairs = measured.selections[name].pairs
+    return sorted(order, key=lambda pair: -_none_to_inf(pairs[pair].median["E_3D"]))
 
 
-def _beside_paper(error: str, value: float | None, paper: float | None) -> str:
+def _beside_paper(error: str, value: Number, paper: Number) -> str:
     ours = _short(_in_unit(error, value))
     if paper is None:
         return ours
     return f"{ours} ({_as_printed(1000 * paper if error == 'E_R' else paper)})"
 
 
-def _in_unit(error: str, value: float | None) -> float | None:
+def _in_unit(error: str, value: Number) -> Number:
     """Return an error in its unit of ``UNITS``."""
     if value is None:
         return None
@@ -278,11 +275,11 @@ def _as_printed(value: float) -> str:
     return f"{value:.1f}" if value % 1 or value < 10 else f"{value:.0f}"
 
 
-def _none_to_inf(value: float | None) -> float:
+def _none_to_inf(value: Number) -> float:
     return math.inf if value is None else value
 
 
-def _short(value: float | None) -> str:
+def _short(value: Number) -> str:
     """Return at most five characters: 0.12, 1.23, 12.3, 123, 1e+05."""
     if value is None or value == math.inf:
         return NONE

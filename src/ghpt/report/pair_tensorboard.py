@@ -6,14 +6,14 @@ from pathlib import Path
 import torch
 from torch.utils.tensorboard import SummaryWriter
 
-from ghpt.models.relative_pose.evaluation import pair_errors
+from ghpt.models.relative_pose.evaluation import PairsMeasured, pair_errors
 from ghpt.models.relative_pose.schema import PairPredictions
 from ghpt.observations import RelativePoseEstimate
 from ghpt.report.figures import image
 from ghpt.report.pair_figures import rig_figure
 from ghpt.report.pair_tables import pair_report_document, pair_summary_document
 from ghpt.report.report import Report
-from ghpt.report.tables import Metrics, title
+from ghpt.report.tables import title
 from ghpt.report.tensorboard import log_document, write_hyperparameters, write_parts, write_weights
 
 SHOWN = ("weight", "rig")
@@ -21,16 +21,18 @@ SHOWN = ("weight", "rig")
 _CHUNK = 2048
 
 
-def write_pair_events(folder: str | Path, predictions: PairPredictions, metrics: Metrics) -> int:
+def write_pair_events(
+    folder: str | Path, predictions: PairPredictions, measured: PairsMeasured
+) -> int:
     """Write the tables, histograms, the figure and hyper-parameters, as ``write_parts`` does."""
 
     def hyperparameters(writer: SummaryWriter) -> None:
-        write_hyperparameters(writer, predictions.meta, metrics, "E_3D")
+        write_hyperparameters(writer, predictions.meta, measured)
 
     parts = {
-        "the tables": lambda writer: log_document(writer, pair_report_document(metrics)),
+        "the tables": lambda writer: log_document(writer, pair_report_document(measured)),
         "the weights": lambda writer: _write_weights(writer, predictions),
-        "the rig": lambda writer: _write_rig(writer, predictions, metrics),
+        "the rig": lambda writer: _write_rig(writer, predictions, measured),
         "the hyper-parameters": hyperparameters,
     }
     return write_parts(folder, parts)
@@ -40,7 +42,9 @@ def _write_weights(writer: SummaryWriter, predictions: PairPredictions) -> None:
     write_weights(writer, [chunk.weights for chunk in predictions.chunks(_CHUNK)])
 
 
-def _write_rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Metrics) -> None:
+def _write_rig(
+    writer: SummaryWriter, predictions: PairPredictions, measured: PairsMeasured
+) -> None:
     """Write the draw whose mean E_3D over its pairs is the median, neither good nor bad."""
     rows = _typical_draw(predictions)
     chunks = [predictions.read(row, row + 1) for row in rows]
@@ -50,9 +54,8 @@ def _write_rig(writer: SummaryWriter, predictions: PairPredictions, metrics: Met
     for name in SHOWN:
         if name in predictions.names:
             estimates[name] = _concatenate([chunk.estimates[name] for chunk in chunks])
-    heading = (
-        f"{title(metrics)}\nrig of {tables.rig_name[rig]}, the draw of median E_3D under {SHOWN[0]}"
-    )
+    rig_name = f"rig of {tables.rig_name[rig]}"
+    heading = f"{title(measured.run)}\n{rig_name}, the draw of median E_3D under {SHOWN[0]}"
     figure = rig_figure(
         tables.cameras.index(rig),
         tables.camera_name[rig].tolist(),

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 from ghpt.models.aggregation import AGGREGATIONS
+from ghpt.models.measured import Measured, Number, TestRun
+from ghpt.models.pose.evaluation import PoseMeans, PoseNumbers
 from ghpt.paper.published import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 from ghpt.report.document import (
     Block,
@@ -24,7 +25,6 @@ NAMES = {
     "h36m": "Human3.6M",
     "panoptic": "Panoptic",
     **{f"cmu{i}": f"Panoptic CMU{i}" for i in range(1, 5)},
-    "view_weights": "view weights",
     "trajectory": "trajectory",
     "online": "trajectory, online",
     "frame_learned": "learned frames",
@@ -33,6 +33,8 @@ NAMES = {
     "adaptive_ransac": "adaptive RANSAC",
     "m_estimator": "M-estimator",
     "lo_ransac": "LO-RANSAC",
+    "pose2sim": "Pose2Sim's exclusion",
+    "aniposelib_robust": "aniposelib, robust",
 }
 """What people call a data set or a row, where it is not its name in metrics.json."""
 
@@ -53,12 +55,10 @@ _CAPTION = (
     "abs: in the world; rel: relative to the pelvis; PA: Procrustes-aligned",
     "6 j: rel, elbows wrists knees; cov: joints estimated; diff: rel to paper",
 )
-_MEANS = ("mpjpe_absolute", "mpjpe_relative", "mpjpe_aligned", "mpjpe_6_joints")
-_PER_ACTION = ("weight", "average", "best", "view_weights", "linear", "ransac")
-_BOLD = ("weight", "view_weights", "frame_learned")
+_PER_ACTION = ("weight", "average", "best", "frame_learned", "linear", "ransac")
+_BOLD = ("weight", "frame_learned")
 
-Metrics = Mapping[str, Any]
-"""The content of metrics.json."""
+PosesMeasured = Measured[PoseNumbers]
 
 
 def display_name(data: str | None, source: str | None) -> str:
@@ -67,68 +67,64 @@ def display_name(data: str | None, source: str | None) -> str:
     return f"synthetic {name}" if source == "synthetic" else f"{name} from {source}"
 
 
-def training_data(metrics: Metrics) -> tuple[str | None, str | None]:
-    """Return name and source of the training data, from the checkpoint's provenance."""
-    provenance = metrics.get("provenance") or {}
-    training = provenance.get("training") or {}
-    return training.get("data"), training.get("source")
-
-
-def title(metrics: Metrics) -> str:
+def title(run: TestRun) -> str:
     """Return what a run was tested and trained on, in words."""
-    tested = f"{display_name(metrics['data'], metrics['source'])}, {metrics['split']} split"
-    trained, source = training_data(metrics)
+    tested = f"{display_name(run.data, run.source)}, {run.split} split"
+    trained, source = run.training
     return f"{tested}, trained on {display_name(trained, source)}" if trained else tested
 
 
-def main_rows(metrics: Metrics) -> list[list[str]]:
+def main_rows(measured: PosesMeasured) -> list[list[str]]:
     """Return a row of ``COLUMNS`` for each selection and baseline.
 
     It has the paper's number where the paper has one for this test.
     """
-    return [_main_row(metrics, name) for name in metrics["selections"]]
+    return [_main_row(measured.run, name, numbers) for name, numbers in measured.selections.items()]
 
 
-def _main_row(metrics: Metrics, name: str) -> list[str]:
-    numbers = metrics["selections"][name]
+def _main_row(run: TestRun, name: str, numbers: PoseNumbers) -> list[str]:
     paper = None
-    if metrics["split"] == "test":
-        trained, _ = training_data(metrics)
-        paper = paper_value(metrics["data"], name, trained)
+    if run.data is not None and run.split == "test":
+        trained, _ = run.training
+        paper = paper_value(run.data, name, trained)
     return [
         NAMES.get(name, name),
-        *(_mm(numbers[mean]) for mean in _MEANS),
-        _percent(numbers["coverage"]),
+        *_mean_cells(numbers.means),
+        _percent(numbers.coverage),
         _mm(paper),
-        _difference(numbers["mpjpe_relative"], paper),
+        _difference(numbers.means.relative, paper),
     ]
 
 
-def _difference(ours: float | None, paper: float | None) -> str:
+def _mean_cells(means: PoseMeans) -> list[str]:
+    return [_mm(mean) for mean in (means.absolute, means.relative, means.aligned, means.six_joints)]
+
+
+def _difference(ours: Number, paper: Number) -> str:
     if ours is None or paper is None:
         return NONE
     return f"{100 * (ours / paper - 1):+.1f} %"
 
 
-def summary_document(metrics: Metrics) -> Document:
+def summary_document(measured: PosesMeasured) -> Document:
     """Return the main table, for the terminal, in 80 columns."""
-    names = list(metrics["selections"])
+    names = list(measured.selections)
     rows: list[list[Text]] = []
-    for name, row in zip(names, main_rows(metrics), strict=True):
+    for name, row in zip(names, main_rows(measured), strict=True):
         cells = [cell.removesuffix(" %") for cell in row]
         rows.append([Strong(cell) for cell in cells] if name in _BOLD else list(cells))
     selections = [name for name in names if name in AGGREGATIONS]
     table = Table(
         _TERMINAL,
         rows,
-        title=f"MPJPE in mm on {title(metrics)}",
+        title=f"MPJPE in mm on {title(measured.run)}",
         caption=_CAPTION,
         last_rows=[names.index(selections[-1])] if selections else [],
     )
     return Document("", [table])
 
 
-def report_document(metrics: Metrics) -> Document:
+def report_document(measured: PosesMeasured) -> Document:
     """Return the report of a test run."""
     about = (
         "MPJPE in mm: in the world, relative to the pelvis, after Procrustes alignment, and "
@@ -136,80 +132,91 @@ def report_document(metrics: Metrics) -> Document:
         "have a truth. Best and worst look at the truth."
     )
     blocks: list[Block] = [
-        Paragraph(_origin(metrics)),
+        Paragraph(_origin(measured.run)),
         Paragraph(about),
-        Table(COLUMNS, main_rows(metrics)),
-        *_paper_note(metrics),
-        *_without_damaged(metrics),
+        Table(COLUMNS, main_rows(measured)),
+        *_paper_note(measured),
+        *_without_damaged(measured),
         Heading("Actions"),
         Paragraph("Relative MPJPE, mm."),
-        action_table(metrics),
+        action_table(measured),
         Heading("Pose prior"),
         Paragraph("Variance over frames of the ratio of left to right part, times 1000."),
     ]
-    for subject in _first_selection(metrics)["pose_prior"]:
-        blocks += [Heading(subject, 3), prior_table(metrics, subject)]
-    return Document(f"Test on {title(metrics)}", blocks)
+    for subject in _first_selection(measured).pose_prior:
+        blocks += [Heading(subject, 3), prior_table(pose_priors(measured, subject))]
+    return Document(f"Test on {title(measured.run)}", blocks)
 
 
-def origin_text(metrics: Metrics) -> tuple[Span, ...]:
+def origin_text(run: TestRun) -> tuple[Span, ...]:
     """Return the checkpoint and the version that made a run's numbers."""
-    provenance = metrics.get("provenance") or {}
+    provenance = run.provenance
     checkpoint = Code(provenance.get("checkpoint", NONE))
     commit = Code(provenance.get("commit") or NONE)
     version = provenance.get("ghpt", NONE)
     return ("checkpoint ", checkpoint, f", ghpt {version}, commit ", commit, ".")
 
 
-def _origin(metrics: Metrics) -> Text:
-    return (f"{metrics['frames']} frames, seed {metrics['seed']}, ", *origin_text(metrics))
+def _origin(run: TestRun) -> Text:
+    return (f"{run.frames} frames, seed {run.seed}, ", *origin_text(run))
 
 
-def _first_selection(metrics: Metrics) -> Mapping[str, Any]:
-    return next(iter(metrics["selections"].values()))
+def _first_selection(measured: PosesMeasured) -> PoseNumbers:
+    return next(iter(measured.selections.values()))
 
 
-def _without_damaged(metrics: Metrics) -> list[Block]:
+def _without_damaged(measured: PosesMeasured) -> list[Block]:
     rows = []
-    for name, numbers in metrics["selections"].items():
-        if "without_damaged" in numbers:
-            means = [_mm(numbers["without_damaged"][mean]) for mean in _MEANS]
-            rows.append([NAMES.get(name, name), *means])
+    for name, numbers in measured.selections.items():
+        if numbers.without_damaged is not None:
+            rows.append([NAMES.get(name, name), *_mean_cells(numbers.without_damaged)])
     heading = Heading("Without S9's takes with damaged ground truth")
     return [heading, Table(COLUMNS[:5], rows)] if rows else []
 
 
-def action_table(metrics: Metrics) -> Table:
+def action_table(measured: PosesMeasured) -> Table:
     """Return the relative MPJPE of each action under the main selections.
 
     The last column is the paper's for ``weight``, where it has one.
     """
-    selections = metrics["selections"]
-    names = [name for name in _PER_ACTION if name in selections]
-    trained, _ = training_data(metrics)
-    of_paper = (trained, metrics["data"], metrics["split"]) == ("h36m", "h36m", "test")
+    shown = {name: measured.selections[name] for name in _PER_ACTION if name in measured.selections}
+    run = measured.run
+    trained, _ = run.training
+    of_paper = (trained, run.data, run.split) == ("h36m", "h36m", "test")
     paper = QUANTITATIVE if of_paper else {}
     rows = []
-    for action in _first_selection(metrics)["per_action"]:
-        errors = [_mm(selections[name]["per_action"][action]) for name in names]
+    for action in _first_selection(measured).per_action:
+        errors = [_mm(numbers.per_action[action]) for numbers in shown.values()]
         rows.append([action, *errors, _mm(paper.get(action))])
-    means = [_mm(selections[name]["mpjpe_relative"]) for name in names]
+    means = [_mm(numbers.means.relative) for numbers in shown.values()]
     rows.append(["all", *means, _mm(QUANTITATIVE_MEAN if of_paper else None)])
-    columns = [NAMES.get(name, name) for name in names]
+    columns = [NAMES.get(name, name) for name in shown]
     return Table(["action", *columns, "paper (weight)"], rows)
 
 
-def prior_table(metrics: Metrics, subject: str) -> Table:
-    """Return 1000 S² of a subject's six parts under each selection."""
-    selections = [name for name in metrics["selections"] if name in AGGREGATIONS]
-    priors = [metrics["selections"][name]["pose_prior"][subject] for name in selections]
+PosePriors = Mapping[str, Mapping[str, Number]]
+"""S² of a subject by selection and part."""
+
+
+def pose_priors(measured: PosesMeasured, subject: str) -> PosePriors:
+    """Return the pose priors of a subject under each selection."""
+    return {
+        name: numbers.pose_prior[subject]
+        for name, numbers in measured.selections.items()
+        if name in AGGREGATIONS
+    }
+
+
+def prior_table(priors: PosePriors) -> Table:
+    """Return 1000 S² of the six parts under each selection."""
     rows = []
     for part in SYMMETRIC_BONES:
-        rows.append([part.replace("_", " "), *(_thousandfold(prior[part]) for prior in priors)])
-    return Table(["part", *selections], rows)
+        cells = [_thousandfold(prior[part]) for prior in priors.values()]
+        rows.append([part.replace("_", " "), *cells])
+    return Table(["part", *priors], rows)
 
 
-def _thousandfold(value: float | None) -> str:
+def _thousandfold(value: Number) -> str:
     """Return 1000 times the value with three digits."""
     if value is None:
         return NONE
@@ -222,17 +229,17 @@ def max_difference(values: Iterable[float]) -> float:
     return 100 * (max(values) / min(values) - 1)
 
 
-def _paper_note(metrics: Metrics) -> list[Block]:
+def _paper_note(measured: PosesMeasured) -> list[Block]:
     paper_column = COLUMNS.index("paper")
-    if all(row[paper_column] == NONE for row in main_rows(metrics)):
+    if all(row[paper_column] == NONE for row in main_rows(measured)):
         return []
     note = (
         "Paper: relative MPJPE on the real data set, tab:quantitative-hypotheses and "
         "tab:generalization-evaluation. Its RANSAC is quoted from Iskakov et al., on their own "
         "detections."
     )
-    if metrics["source"] == "synthetic":
-        ransac = " and RANSAC" if metrics["data"] == "h36m" else ""
+    if measured.run.source == "synthetic":
+        ransac = " and RANSAC" if measured.run.data == "h36m" else ""
         note += (
             " These data are synthetic: their detector model was fitted to the paper's random, "
             f"average, best, worst{ransac} here, and to no row of a trained scorer."
@@ -240,9 +247,9 @@ def _paper_note(metrics: Metrics) -> list[Block]:
     return [Paragraph(note)]
 
 
-def _mm(value: float | None) -> str:
+def _mm(value: Number) -> str:
     return NONE if value is None else f"{value:.1f}"
 
 
-def _percent(value: float | None) -> str:
+def _percent(value: Number) -> str:
     return NONE if value is None else f"{100 * value:.2f} %"

@@ -18,6 +18,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.models.aggregation import WeightSummary
+from ghpt.models.measured import Measured
 from ghpt.models.pose.schema import PoseChunk, PosePredictions
 from ghpt.observations import PoseEstimate
 from ghpt.report.document import Document
@@ -26,16 +27,16 @@ from ghpt.report.hyperparameters import flatten, write_row
 from ghpt.report.markdown import render_markdown
 from ghpt.report.report import Report
 from ghpt.report.tables import (
-    Metrics,
+    PosesMeasured,
+    pose_priors,
     report_document,
     summary_document,
     title,
-    training_data,
 )
 
 SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
-_FINAL = ("weight", "average", "view_weights", "trajectory", "rig")
+_FINAL = ("weight", "average", "frame_learned", "trajectory", "rig")
 """The estimates whose errors stand beside the hyper-parameters, where there are such."""
 _SAMPLE = 50
 """Blocks of `_BLOCK` frames, evenly over the run, that histograms and the figure are made of."""
@@ -43,17 +44,17 @@ _BLOCK = 1000
 _log = logging.getLogger(__name__)
 
 
-def write_events(folder: str | Path, predictions: PosePredictions, metrics: Metrics) -> int:
+def write_events(folder: str | Path, predictions: PosePredictions, measured: PosesMeasured) -> int:
     """Write the tables, histograms, figures and hyper-parameters, as ``write_parts`` does."""
 
     def hyperparameters(writer: SummaryWriter) -> None:
-        write_hyperparameters(writer, predictions.meta, metrics, "mpjpe_relative")
+        write_hyperparameters(writer, predictions.meta, measured)
 
     parts = {
-        "the tables": lambda writer: log_document(writer, report_document(metrics)),
+        "the tables": lambda writer: log_document(writer, report_document(measured)),
         "the weights": lambda writer: _write_weights(writer, predictions),
-        "the skeletons": lambda writer: _write_skeletons(writer, predictions, metrics),
-        "the pose prior": lambda writer: _write_pose_prior(writer, metrics),
+        "the skeletons": lambda writer: _write_skeletons(writer, predictions, measured),
+        "the pose prior": lambda writer: _write_pose_prior(writer, measured),
         "the hyper-parameters": hyperparameters,
     }
     return write_parts(folder, parts)
@@ -97,7 +98,9 @@ def write_weights(writer: SummaryWriter, weights: Sequence[WeightSummary]) -> No
         writer.add_histogram(f"weights/{summary.name}", values.numpy(), 0)
 
 
-def _write_skeletons(writer: SummaryWriter, predictions: PosePredictions, metrics: Metrics) -> None:
+def _write_skeletons(
+    writer: SummaryWriter, predictions: PosePredictions, measured: PosesMeasured
+) -> None:
     """Write the whole frame whose error under ``weight`` is the median, neither good nor bad."""
     rows = []
     errors = []
@@ -116,17 +119,17 @@ def _write_skeletons(writer: SummaryWriter, predictions: PosePredictions, metric
     poses = {name: _with_nan(chunk.estimates[name]) for name in names}
     take = predictions.tables.recording_name[int(chunk.sample.recording)]
     frame = f"{take}, frame {int(chunk.sample.frame)}"
-    heading = f"{title(metrics)}\n{frame}: the median of the errors under {SHOWN[0]}"
+    heading = f"{title(measured.run)}\n{frame}: the median of the errors under {SHOWN[0]}"
     up = up_axis(torch.cat(truth).double().numpy())
     true_pose = chunk.sample.as_truth().points[0].double().numpy()
     figure = skeletons(true_pose, poses, up, heading)
     writer.add_image("skeletons", image(figure), 0, dataformats="HWC")
 
 
-def _write_pose_prior(writer: SummaryWriter, metrics: Metrics) -> None:
-    first = next(iter(metrics["selections"].values()))
-    for subject in first["pose_prior"]:
-        figure = pose_prior_bars(metrics, subject)
+def _write_pose_prior(writer: SummaryWriter, measured: PosesMeasured) -> None:
+    first = next(iter(measured.selections.values()))
+    for subject in first.pose_prior:
+        figure = pose_prior_bars(pose_priors(measured, subject), subject, title(measured.run))
         writer.add_image(f"pose_prior/{subject}", image(figure), 0, dataformats="HWC")
 
 
@@ -136,19 +139,20 @@ def log_document(writer: SummaryWriter, document: Document) -> None:
 
 
 def write_hyperparameters(
-    writer: SummaryWriter, meta: Mapping[str, Any], metrics: Metrics, error: str
+    writer: SummaryWriter, meta: Mapping[str, Any], measured: Measured[Any]
 ) -> None:
-    """Write the settings of the test and of its model beside the main estimates' ``error``."""
-    trained, source = training_data(metrics)
-    values = {key: metrics[key] for key in ("data", "source", "split", "seed", "frames")}
+    """Write the settings of the test and of its model beside the main estimates' errors."""
+    run = measured.run
+    trained, source = run.training
+    values = {name: getattr(run, name) for name in ("data", "source", "split", "seed", "frames")}
     values |= {"trained_on": trained, "trained_on_source": source}
     values |= dict(flatten(meta.get("model") or {}, "model"))
     values |= {"model.hypotheses": meta.get("hypotheses")}
     errors = {}
     for name in _FINAL:
-        numbers = metrics["selections"].get(name)
-        if numbers and numbers[error] is not None:
-            errors[f"test/{name}"] = numbers[error]
+        numbers = measured.selections.get(name)
+        if numbers is not None and numbers.headline is not None:
+            errors[f"test/{name}"] = numbers.headline
     write_row(writer, values, errors)
     for name, number in errors.items():
         writer.add_scalar(name, number, 0)

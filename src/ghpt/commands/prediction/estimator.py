@@ -15,6 +15,7 @@ from ghpt.errors import GhptCheckpointError
 from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.flips import LeftRightFlips
+from ghpt.models.estimators.pool_average import PoolAverage
 from ghpt.models.estimators.predictors import Classical, Learned, Predictor
 from ghpt.models.pose.problem import PoseTriangulation
 from ghpt.report.tables import NAMES
@@ -94,21 +95,21 @@ def _learned_estimator(settings: PredictSettings, ckpt: str) -> PoseEstimator:
     changes = {"hypotheses": settings.hypotheses, "seed": settings.seed}
     model, trained = load_model(ckpt, settings.trust, **changes)
     if not isinstance(model.problem, PoseTriangulation):
-        problem = f"is of a {type(model.problem).__name__}: it estimates no poses"
-        raise GhptCheckpointError(ckpt, problem, "Give one that train.py model=pose wrote.")
-    view_weights = build(settings.view_weights, "view_weights")(model)
+        problem = f"is of a {type(model.problem).__name__}: it has no pool of poses"
+        hint = "Give one that train.py model=pose wrote."
+        raise GhptCheckpointError(ckpt, problem, hint)
     group = _with_flips(settings, settings.predictor.learned)
-    predictor: Learned = build(group, "predictor.learned")(view_weights=view_weights)
+    average: PoolAverage = build(group["average"], "predictor.learned.average")(model)
+    predictor: Learned = build(group, "predictor.learned")(average=average)
     data = trained["provenance"].get("data", "unknown")
     return PoseEstimator(
-        name="view_weights",
+        name="weight",
         text=f"the learned model of {Path(ckpt).name}, trained on {data}",
         predictor=predictor,
         flips=predictor.flips,
         weights=model,
         identity=group
         | {
-            "view_weights": settings.view_weights,
             "ckpt_sha256": hashlib.sha256(Path(ckpt).read_bytes()).hexdigest(),
             "hypotheses": model.hypotheses,
             "seed": settings.seed,

@@ -239,13 +239,17 @@ def tell_apart(
         together = [(chosen >= 0).any(1) for chosen in found]
         if found and 2 * np.any(together, axis=0).sum() >= frames_of_two_views:
             return found
-        _log.warning(
-            "%s: the views agree on nobody: check the extrinsics of %s, and that frames have the "
-            "same numbers in all views. Each view follows the person that it tracks best.",
-            people.path,
-            cameras.path,
-        )
+        _warn_of_disagreement(people, cameras)
     return [follow_views(people)]
+
+
+def _warn_of_disagreement(people: Detections, cameras: CameraSet) -> None:
+    _log.warning(
+        "%s: the views agree on nobody: check the extrinsics of %s, and that frames have the "
+        "same numbers in all views. Each view follows the person that it tracks best.",
+        people.path,
+        cameras.path,
+    )
 
 
 def follow_anybody(
@@ -258,7 +262,8 @@ def follow_anybody(
     1. It is the most visible of the persons on whom two views agree in this frame.
     2. A view that agrees in less than half of the frames in which it has anybody may be off: it
        follows the person whom it tracks best (`follow_views`), as all views do without extrinsics
-       and where nobody is ever beside another.
+       and where nobody is ever beside another; and, with a warning, where no two views agree in
+       half of the frames.
     """
     own = follow_views(people)
     counts = people.counts()[:, at]
@@ -270,6 +275,7 @@ def follow_anybody(
         chosen[free] = person[free]
     together = (chosen >= 0).any(1)
     if 2 * together.sum() < ((counts > 0).sum(1) >= 2).sum():
+        _warn_of_disagreement(people, cameras)
         return own
     for place, view in enumerate(at):
         there = together & (counts[:, place] > 0)

@@ -1,1 +1,1 @@
-"""Estimators of 3D joints: classical, RANSAC, view weights; their uncertainty, left-right flips."""
+"""Estimators of 3D joints: classical, RANSAC, learned; their uncertainty, left-right flips."""

@@ -16,9 +16,9 @@ from ghpt.geometry.normal_equations import valid_key_points
 from ghpt.geometry.triangulation import Triangulation
 from ghpt.models.estimators.classical import Estimator, as_poses
 from ghpt.models.estimators.flips import LeftRightFlips, undo_flips
+from ghpt.models.estimators.pool_average import AveragedPool, PoolAverage
 from ghpt.models.estimators.rejection import Rejection
 from ghpt.models.estimators.uncertainty import JointUncertainty, UncertaintyModel
-from ghpt.models.estimators.view_weights import ViewWeights, WeightedViews
 from ghpt.observations import Observations, PoseEstimate
 from ghpt.reconstruction import Reconstruction, State, concatenate, move_to_cpu
 from ghpt.skeleton import HUMAN36M, JOINT, JOINTS, Skeleton
@@ -183,11 +183,11 @@ class Classical(FramePredictor):
 
 
 class Learned(FramePredictor):
-    """A trained model's view weights with what can be said of their joints.
+    """A trained model's average pose with what can be said of its joints.
 
     The model sees the 17 joints, which are means of the ``skeleton``'s key points in the images.
     Those of them that are key points themselves are its own; all other key points are what the
-    consensus of ``view_weights`` makes of them.
+    consensus of ``average`` makes of them.
 
     The views that made a joint are those on which the consensus agrees, and error and covariance
     are theirs. The score is the mean logit of the hypotheses under their
@@ -197,13 +197,13 @@ class Learned(FramePredictor):
 
     def __init__(
         self,
-        view_weights: ViewWeights,
+        average: PoolAverage,
         uncertainty: UncertaintyModel,
         flips: LeftRightFlips | None,
         reject: Rejection | None,
         skeleton: Skeleton = HUMAN36M,
     ) -> None:
-        self.view_weights = view_weights
+        self.average = average
         self.uncertainty = uncertainty
         self.flips = flips
         self.reject = reject
@@ -212,51 +212,51 @@ class Learned(FramePredictor):
     def for_skeleton(self, skeleton: Skeleton) -> Learned:
         """Return the same for batches of another skeleton, which has joints of the 17."""
         flips = self.flips and self.flips.for_skeleton(skeleton)
-        return Learned(self.view_weights, self.uncertainty, flips, self.reject, skeleton)
+        return Learned(self.average, self.uncertainty, flips, self.reject, skeleton)
 
     def fit_to(self, batch: Observations) -> Learned:
-        prepared = prepare(batch, self.flips, self.view_weights.consensus)
+        prepared = prepare(batch, self.flips, self.average.consensus)
         clean = prepared.batch
-        weighted = self._weigh(prepared)
-        result = weighted.triangulation
-        uncertainty = self.uncertainty.fit_to(clean, result.points, weighted.views)
+        averaged = self._average(prepared)
+        result = averaged.triangulation
+        uncertainty = self.uncertainty.fit_to(clean, result.points, averaged.views)
         reject = self.reject and self.reject.fit_to(clean, result.points, result.has_position)
-        return Learned(self.view_weights, uncertainty, self.flips, reject, self.skeleton)
+        return Learned(self.average, uncertainty, self.flips, reject, self.skeleton)
 
     def rejecting_nothing(self) -> Learned:
         """Return the same with all its joints: what it is compared with others by."""
-        return Learned(self.view_weights, self.uncertainty, self.flips, None, self.skeleton)
+        return Learned(self.average, self.uncertainty, self.flips, None, self.skeleton)
 
-    def _weigh(self, prepared: Prepared) -> WeightedViews:
+    def _average(self, prepared: Prepared) -> AveragedPool:
         """Return the key points, those of the 17 joints among them by the model."""
         clean = prepared.batch
         if self.skeleton == HUMAN36M:
-            return self.view_weights.weigh(clean, prepared.triangulation)
+            return self.average.estimate(clean, prepared.triangulation)
         consensus = prepared.triangulation
-        views, _ = self.view_weights.consensus.inlier_views(
+        views, _ = self.average.consensus.inlier_views(
             clean, consensus.points, consensus.has_position
         )
-        weighted = self.view_weights.weigh(observe_joints(clean, self.skeleton))
+        averaged = self.average.estimate(observe_joints(clean, self.skeleton))
         direct = [name for name in JOINTS if name in self.skeleton.key_points]
         device = views.device
         joints = torch.tensor([JOINT[name] for name in direct], device=device)
         own = [self.skeleton.key_points.index(name) for name in direct]
         key_points = torch.tensor(own, device=device)
-        learned = weighted.triangulation.joints(joints)
-        return WeightedViews(
+        learned = averaged.triangulation.joints(joints)
+        return AveragedPool(
             triangulation=consensus.with_joints(key_points, learned),
-            views=views.index_copy(2, key_points, weighted.views.index_select(2, joints)),
-            pool=weighted.pool,
+            views=views.index_copy(2, key_points, averaged.views.index_select(2, joints)),
+            pool=averaged.pool,
         )
 
     @torch.no_grad()
     def __call__(self, batch: Observations) -> Reconstruction:
-        prepared = prepare(batch, self.flips, self.view_weights.consensus)
-        weighted = self._weigh(prepared)
-        points = weighted.triangulation.points
-        state = final_states(prepared, weighted.triangulation, self.reject)
-        views = weighted.views & (state == State.OBSERVED)[:, None]
-        pool = weighted.pool
+        prepared = prepare(batch, self.flips, self.average.consensus)
+        averaged = self._average(prepared)
+        points = averaged.triangulation.points
+        state = final_states(prepared, averaged.triangulation, self.reject)
+        views = averaged.views & (state == State.OBSERVED)[:, None]
+        pool = averaged.pool
         score = (pool.weights() * pool.logits).sum(-1)
         return reconstruct(
             points=points,

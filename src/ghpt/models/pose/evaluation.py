@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,11 +15,11 @@ from torch import Tensor
 from ghpt.data.datasets.human36m import DAMAGED
 from ghpt.metrics.pose_error import MPJPE
 from ghpt.metrics.pose_prior import PARTS, PosePrior
+from ghpt.models.measured import Measured, Number, TestRun
 from ghpt.models.pose.schema import PosePredictions
 from ghpt.observations import PoseEstimate, Truth
 from ghpt.skeleton import JOINTS
 
-FORMAT_VERSION = 1
 NAMES = (
     "weight",
     "average",
@@ -29,7 +29,6 @@ NAMES = (
     "random",
     "best",
     "worst",
-    "view_weights",
     "trajectory",
     "frame_learned",
     "linear",
@@ -39,9 +38,65 @@ NAMES = (
     "m_estimator",
     "lo_ransac",
 )
-"""The order of every table: the selections, the learned view weights, then the baselines."""
+"""The order of every table: the selections, then the other estimators."""
 
 _CHUNK = 2048
+
+
+@dataclass(frozen=True)
+class PoseMeans:
+    """Mean distances of the estimated joints from the true ones, mm."""
+
+    absolute: Number
+    """In the world."""
+    relative: Number
+    """To the pelvis."""
+    aligned: Number
+    """After Procrustes alignment."""
+    six_joints: Number
+    """Relative; elbows, wrists, knees."""
+
+    def plain(self) -> dict[str, Number]:
+        """Return the means by their names in metrics.json."""
+        return {
+            "mpjpe_absolute": self.absolute,
+            "mpjpe_relative": self.relative,
+            "mpjpe_aligned": self.aligned,
+            "mpjpe_6_joints": self.six_joints,
+        }
+
+
+@dataclass(frozen=True)
+class PoseNumbers:
+    """What was measured of one selection or baseline."""
+
+    means: PoseMeans
+    coverage: Number
+    """Estimated joint-frames / joint-frames with a truth."""
+    per_joint: Mapping[str, Number]
+    """Relative, mm."""
+    per_action: Mapping[str, Number]
+    pose_prior: Mapping[str, Mapping[str, Number]]
+    """S^2 by subject and part."""
+    without_damaged: PoseMeans | None = None
+    """Where the data hold damaged takes: the means of the others."""
+
+    @property
+    def headline(self) -> Number:
+        return self.means.relative
+
+    def plain(self) -> dict[str, Any]:
+        """Return the numbers as plain data."""
+        content = {
+            **self.means.plain(),
+            "coverage": self.coverage,
+            "per_joint": dict(self.per_joint),
+            "per_action": dict(self.per_action),
+            "pose_prior": {subject: dict(parts) for subject, parts in self.pose_prior.items()},
+        }
+        if self.without_damaged is not None:
+            content["without_damaged"] = self.without_damaged.plain()
+        return content
 
 
 @dataclass(frozen=True)
@@ -80,41 +135,34 @@ class _Metrics:
             metric.update(estimate, truth, action)
         self.prior.update(estimate, self.subjects.of_recording[recording])
 
-    def means(self) -> dict[str, float | None]:
+    def means(self) -> PoseMeans:
         """Return the four means."""
         relative = self.relative.compute()
-        return {
-            "mpjpe_absolute": _number(self.absolute.compute().mean),
-            "mpjpe_relative": _number(relative.mean),
-            "mpjpe_aligned": _number(self.aligned.compute().mean),
-            "mpjpe_6_joints": _number(relative.six_joints),
-        }
+        return PoseMeans(
+            absolute=_number(self.absolute.compute().mean),
+            relative=_number(relative.mean),
+            aligned=_number(self.aligned.compute().mean),
+            six_joints=_number(relative.six_joints),
+        )
 
-    def numbers(self) -> dict[str, Any]:
+    def numbers(self) -> PoseNumbers:
         """Return all numbers."""
         relative = self.relative.compute()
         per_action = torch.atleast_1d(relative.per_group)
         priors = {}
         for subject, row in zip(self.subjects.labels, self.prior.compute(), strict=True):
             priors[subject] = _by_name(PARTS, row)
-        return {
-            **self.means(),
-            "coverage": _number(self.absolute.compute().coverage),
-            "per_joint": _by_name(JOINTS, relative.per_joint),
-            "per_action": _by_name(self.actions.labels, per_action),
-            "pose_prior": priors,
-        }
+        return PoseNumbers(
+            means=self.means(),
+            coverage=_number(self.absolute.compute().coverage),
+            per_joint=_by_name(JOINTS, relative.per_joint),
+            per_action=_by_name(self.actions.labels, per_action),
+            pose_prior=priors,
+        )
 
 
-def evaluate_poses(predictions: PosePredictions) -> dict[str, Any]:
-    """Return the content of metrics.json; lengths in mm, null where nothing could be measured.
-
-    ``selections[name]``: ``mpjpe_absolute``, ``mpjpe_relative`` (to the pelvis), ``mpjpe_aligned``
-    (Procrustes), ``mpjpe_6_joints`` (relative; elbows, wrists, knees), ``coverage`` (estimated
-    joint-frames / joint-frames with a truth), ``per_joint`` and ``per_action`` (relative),
-    ``pose_prior`` (S^2 by subject and part) and, where the data hold damaged takes,
-    ``without_damaged`` (the four means again).
-    """
+def evaluate_poses(predictions: PosePredictions) -> Measured[PoseNumbers]:
+    """Return what a test run measured, in the order of ``NAMES``."""
     tables = predictions.tables
     actions = _Groups.from_labels(tables.recording_action)
     subjects = _Groups.from_labels(tables.recording_subject)
@@ -133,20 +181,13 @@ def evaluate_poses(predictions: PosePredictions) -> dict[str, Any]:
                 sound[name].update(estimate.rows(keep), truth.rows(keep), recording[keep])
     selections = {name: metrics.numbers() for name, metrics in whole.items()}
     for name, metrics in sound.items():
-        selections[name]["without_damaged"] = metrics.means()
-    meta = predictions.meta
-    return {
-        "format_version": FORMAT_VERSION,
-        **{key: meta.get(key) for key in ("data", "source", "split")},
-        "frames": len(predictions),
-        **{key: meta.get(key) for key in ("seed", "provenance")},
-        "selections": selections,
-    }
+        selections[name] = replace(selections[name], without_damaged=metrics.means())
+    return Measured(TestRun.from_meta(predictions.meta, len(predictions)), selections)
 
 
-def _by_name(names: Iterable[str], values: Tensor) -> dict[str, float | None]:
+def _by_name(names: Iterable[str], values: Tensor) -> dict[str, Number]:
     return {name: _number(value) for name, value in zip(names, values, strict=True)}
 
 
-def _number(value: Float[Tensor, ""]) -> float | None:
+def _number(value: Float[Tensor, ""]) -> Number:
     return None if math.isnan(value.item()) else value.item()

@@ -17,7 +17,8 @@ from ghpt.extras import build_installed
 from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.metrics.pose_error import joint_errors
-from ghpt.models.pose.evaluation import evaluate_poses
+from ghpt.models.measured import Measured
+from ghpt.models.pose.evaluation import PoseNumbers, evaluate_poses
 from ghpt.models.pose.features import bone_lengths, normalised_coordinates
 from ghpt.models.pose.schema import POSES, PosePredictions, PoseSample, PoseTables
 from ghpt.models.predictions import with_nan
@@ -54,7 +55,6 @@ class PoseProblem(Problem):
 
     measures = "MPJPE relative to the pelvis"
     schema = POSES
-    headline = "mpjpe_relative"
 
     def error(self, estimate: PoseEstimate, truth: Truth) -> Errors:
         """Return the pelvis-relative MPJPE (eq:mpjpe), mm, and which frames can be compared.
@@ -90,8 +90,8 @@ class PoseProblem(Problem):
         """Return the recordings."""
         return PoseTables.from_recordings(dataset.recordings)
 
-    def metrics(self, predictions: PosePredictions) -> dict[str, Any]:
-        """Return the content of metrics.json."""
+    def metrics(self, predictions: PosePredictions) -> Measured[PoseNumbers]:
+        """Return what a test run measured."""
         return evaluate_poses(predictions)
 
     def report(self) -> Report:
@@ -161,13 +161,3 @@ class PoseTriangulation(PoseProblem):
         points = hypotheses.points
         estimated = hypotheses.estimated[:, None].expand(points.shape[:-1])
         return PoseEstimate(points, estimated)
-
-    def baselines(
-        self, settings: BaselineSettings, model: Any
-    ) -> Mapping[str, Callable[[Observations], PoseEstimate]]:
-        """Return view weights, where there are settings for them, and the rest."""
-        learned: dict[str, Callable[[Observations], PoseEstimate]] = {}
-        if settings.view_weights:
-            view_weights = build(settings.view_weights, "view_weights")
-            learned["view_weights"] = view_weights(model)
-        return learned | dict(super().baselines(settings, model))

@@ -22,9 +22,9 @@ from ghpt.metrics.relative_pose import (
     translation_error,
 )
 from ghpt.models.aggregation import AGGREGATIONS
+from ghpt.models.measured import Measured, Number, TestRun
 from ghpt.models.relative_pose.schema import PairChunk, PairPredictions
 
-FORMAT_VERSION = 1
 NAMES = (
     *AGGREGATIONS,
     "weight_refined",
@@ -45,16 +45,67 @@ ALONE = ("estimated_R", "estimated_t")
 _CHUNK = 512
 
 
-def evaluate_pairs(predictions: PairPredictions) -> dict[str, Any]:
-    """Return the content of metrics.json.
+@dataclass(frozen=True)
+class PairNumbers:
+    """The errors of one pair of views; those of all by their names in ``ERRORS``."""
 
-    Lengths are mm, images pixels, angles degrees; null where nothing could be measured.
-    ``selections[name]["pairs"]["1-2"]`` (places in the arrangement, from 1): the six errors of
-    ``ERRORS`` as medians over all draws of all rigs, in which a draw without an estimate counts as
-    infinitely bad (an infinite median is null); ``coverage`` (draws estimated / draws); ``mean``
-    and ``deviation`` over the draws that could be measured; ``estimated_R`` and ``estimated_t``:
-    median E_2D and E_3D when the other part is the true one. A selection's own numbers are means
-    over its pairs. A draw's E_2D and E_3D are means over the points that count.
+    median: Mapping[str, Number]
+    """Over all draws of all rigs; a draw without an estimate counts as infinitely bad, and an
+    infinite median is None.
+    """
+    coverage: float
+    """Draws estimated / draws."""
+    mean: Mapping[str, Number]
+    """Over the draws that could be measured."""
+    deviation: Mapping[str, Number]
+    alone: Mapping[str, Mapping[str, Number]]
+    """Median E_2D and E_3D of each of ``ALONE``, where the other part is the true one."""
+
+    def plain(self) -> dict[str, Any]:
+        """Return the numbers as plain data."""
+        return {
+            **self.median,
+            "coverage": self.coverage,
+            "mean": dict(self.mean),
+            "deviation": dict(self.deviation),
+            **{part: dict(errors) for part, errors in self.alone.items()},
+        }
+
+
+@dataclass(frozen=True)
+class PairSelection:
+    """The errors of one selection or baseline, and their means over the pairs."""
+
+    mean: Mapping[str, Number]
+    coverage: Number
+    pairs: Mapping[str, PairNumbers]
+    """By the pair's name, such as 1-2: places in the arrangement, from 1."""
+
+    @property
+    def headline(self) -> Number:
+        return self.mean["E_3D"]
+
+    def plain(self) -> dict[str, Any]:
+        """Return the numbers as plain data."""
+        pairs = {pair: numbers.plain() for pair, numbers in self.pairs.items()}
+        return {**self.mean, "coverage": self.coverage, "pairs": pairs}
+
+
+@dataclass(frozen=True)
+class PairsMeasured(Measured[PairSelection]):
+    """The errors of relative poses; mm, pixels and degrees."""
+
+    draws: int
+    cameras: Sequence[str]
+
+    def _own(self) -> dict[str, Any]:
+        return {"draws": self.draws, "cameras": list(self.cameras)}
+
+
+def evaluate_pairs(predictions: PairPredictions) -> PairsMeasured:
+    """Return what a test run measured, in the order of ``NAMES``.
+
+    A draw's E_2D and E_3D are means over the points that count.
     """
     rank = {name: place for place, name in enumerate(NAMES)}
     names = sorted(predictions.names, key=lambda name: (rank.get(name, len(NAMES)), name))
@@ -64,19 +115,18 @@ def evaluate_pairs(predictions: PairPredictions) -> dict[str, Any]:
     for name in names:
         of_pairs = {pair_name(pair): _pair_numbers(measured.select(name, pair)) for pair in pairs}
         means = {
-            key: _mean([numbers[key] for numbers in of_pairs.values()])
-            for key in (*ERRORS, "coverage")
+            error: _mean([numbers.median[error] for numbers in of_pairs.values()])
+            for error in ERRORS
         }
-        selections[name] = means | {"pairs": of_pairs}
+        coverage = _mean([numbers.coverage for numbers in of_pairs.values()])
+        selections[name] = PairSelection(means, coverage, of_pairs)
     meta = predictions.meta
-    return {
-        "format_version": FORMAT_VERSION,
-        **{key: meta.get(key) for key in ("data", "source", "split", "problem", "frames")},
-        "draws": len(np.unique(measured.draw)),
-        "cameras": predictions.tables.camera_name[0].tolist(),
-        **{key: meta.get(key) for key in ("seed", "provenance")},
-        "selections": selections,
-    }
+    return PairsMeasured(
+        run=TestRun.from_meta(meta, meta["frames"]),
+        selections=selections,
+        draws=len(np.unique(measured.draw)),
+        cameras=predictions.tables.camera_name[0].tolist(),
+    )
 
 
 def pair_name(pair: tuple[int, int]) -> str:
@@ -185,8 +235,8 @@ def _measure(predictions: PairPredictions, names: Sequence[str]) -> _Measured:
     return _Measured(errors, torch.cat(pair).numpy(), torch.cat(draw).numpy())
 
 
-def _pair_numbers(errors: Mapping[str, Float[np.ndarray, " D"]]) -> dict[str, Any]:
-    """Return a pair's entry of metrics.json, from the errors of its draws."""
+def _pair_numbers(errors: Mapping[str, Float[np.ndarray, " D"]]) -> PairNumbers:
+    """Return a pair's numbers, from the errors of its draws."""
     median = {error: _finite(np.median(values)) for error, values in errors.items()}
     mean: dict[str, float | None] = {}
     deviation: dict[str, float | None] = {}
@@ -198,13 +248,13 @@ def _pair_numbers(errors: Mapping[str, Float[np.ndarray, " D"]]) -> dict[str, An
     alone = {
         part: {error: median[f"{error} {part}"] for error in ("E_2D", "E_3D")} for part in ALONE
     }
-    return {
-        **{error: median[error] for error in ERRORS},
-        "coverage": float(np.isfinite(errors["E_R"]).mean()),
-        "mean": mean,
-        "deviation": deviation,
-        **alone,
-    }
+    return PairNumbers(
+        median={error: median[error] for error in ERRORS},
+        coverage=float(np.isfinite(errors["E_R"]).mean()),
+        mean=mean,
+        deviation=deviation,
+        alone=alone,
+    )
 
 
 def _finite(value: float) -> float | None:

@@ -41,7 +41,7 @@ from ghpt.models.problem import (
     Problem,
     Weights,
 )
-from ghpt.models.relative_pose.evaluation import evaluate_pairs
+from ghpt.models.relative_pose.evaluation import PairsMeasured, evaluate_pairs
 from ghpt.models.relative_pose.schema import PAIRS, PairPredictions, PairSample, RigTables
 from ghpt.observations import (
     Labelled,
@@ -89,7 +89,6 @@ class RelativePose(Problem):
 
     measures = "E_3D"
     schema = PAIRS
-    headline = "E_3D"
 
     def __init__(
         self,
@@ -243,8 +242,8 @@ class RelativePose(Problem):
         """Return the number of frames of a pair."""
         return {"frames": self.pairs.frames}
 
-    def metrics(self, predictions: PairPredictions) -> dict[str, Any]:
-        """Return the content of metrics.json."""
+    def metrics(self, predictions: PairPredictions) -> PairsMeasured:
+        """Return what a test run measured."""
         return evaluate_pairs(predictions)
 
     def report(self) -> Report:

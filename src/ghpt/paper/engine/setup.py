@@ -104,24 +104,21 @@ class Setup:
         *overrides: str,
         name: str = "",
         baselines: bool = True,
-        view_weights: bool = True,
         seconds: float | None = None,
     ) -> Task:
         """Return the test of the model of a `training` task on a data set.
 
-        ``overrides`` are those of test.py. ``baselines`` False leaves the classical estimators out,
-        ``view_weights`` False the learned view weights.
+        ``overrides`` are those of test.py. ``baselines`` False leaves the estimators out that are
+        beside the model.
         """
         overrides = (*self.overrides.test, *overrides)
         config = self.configuration("test", data, *overrides)
         of_pairs = "frames" in model.config["model"]["problem"]
-        unused = ("baselines", "view_weights") if of_pairs else ("camera_baselines",)
+        unused = ("baselines",) if of_pairs else ("camera_baselines",)
         config = _without(config, ("ckpt", "trajectory", *unused))
         for key in ("baselines", "camera_baselines"):
             if key in config and not baselines:
                 config[key] = {}
-        if "view_weights" in config and not view_weights:
-            config["view_weights"] = {}
         dependencies = {"model": model, "data": self.preparation(data, config["data"]["evaluate"])}
         trained = model.name.removeprefix("train-").removesuffix(f"-seed{self.seed}")
         name = _join("test", trained, "on", data, name, f"seed{self.seed}")

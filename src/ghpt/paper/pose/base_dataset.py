@@ -38,7 +38,7 @@ SCORED = ("weight", "most", "stochastic")
 bad on purpose.
 """
 BASELINES = ("ransac", "adaptive_ransac", "linear", "weighted_linear", "m_estimator", "lo_ransac")
-VIEW_WEIGHTS = "view weights (not in the paper)"
+LEARNED = "learned frames (not in the paper)"
 _WITH_TRUTH = ("best", "worst")
 """The selections that look at the truth."""
 
@@ -95,7 +95,7 @@ def _action_table(results: Results, comparisons: Sequence[Comparison]) -> Table:
     rows.append(["weight, the paper's", *paper[1:]])
     rows.append(["weight, ours", *ours[1:]])
     rows.append(difference)
-    own = {VIEW_WEIGHTS: "view_weights"}
+    own = {LEARNED: "frame_learned"}
     own |= {f"{NAMES.get(name, name)} on our detections": name for name in BASELINES}
     for label, selection in own.items():
         rows.append([label, *(error.text() for error in _action_errors(results, selection))])
@@ -121,7 +121,7 @@ def _hypotheses(results: Results) -> Section:
         name = "Human3.6M" if data == "h36m" else "Panoptic Studio"
         paper = QUANTITATIVE_HYPOTHESES["h36m" if data == "h36m" else "panoptic"]
         rows = [_compare_selection(results, test, *printed) for printed in paper.items()]
-        others = [Comparison(VIEW_WEIGHTS, None, results.relative(test, "view_weights"))]
+        others = [Comparison(LEARNED, None, results.relative(test, "frame_learned"))]
         for selection in BASELINES[1:]:
             label = NAMES.get(selection, selection)
             others.append(Comparison(label, None, results.relative(test, selection)))
@@ -225,9 +225,7 @@ def _limitation_tasks(setup: Setup) -> dict[str, Task]:
     tasks = {}
     for split in ("train", "validation"):
         override = f"data.evaluate={split}"
-        tasks[split] = setup.test(
-            model, "h36m", override, name=split, baselines=False, view_weights=False
-        )
+        tasks[split] = setup.test(model, "h36m", override, name=split, baselines=False)
     tasks["test"] = setup.test(model, "h36m")
     return tasks
 

@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.aggregation import AGGREGATIONS
+from ghpt.models.measured import TestRun
 from ghpt.models.pose.schema import POSES, PoseChunk
 from ghpt.models.predictions import open_predictions
 from ghpt.paper.engine.artefact import Artefact, Claim, Results, Section, figure_block
@@ -20,7 +21,7 @@ from ghpt.paper.engine.tasks import Task
 from ghpt.paper.pose.base_dataset import SELF, on_itself
 from ghpt.report.document import Paragraph, prose
 from ghpt.report.figures import pose_prior_bars, skeletons, up_axis
-from ghpt.report.tables import prior_table
+from ghpt.report.tables import prior_table, title
 
 SHOWN = ("weight", "most", "random", "least")
 """The four selections of fig:qualitative."""
@@ -90,6 +91,12 @@ def _relative_errors(chunk: PoseChunk, name: str) -> Float[np.ndarray, " N"]:
 
 def _pose_prior(results: Results) -> Section:
     metrics = results.read(TEST, "metrics.json")[0]
+    run = TestRun.from_meta(metrics, metrics["frames"])
+    priors = {
+        name: numbers["pose_prior"][SUBJECT]
+        for name, numbers in metrics["selections"].items()
+        if name in AGGREGATIONS
+    }
     text = (
         f"Variance over the frames of {SUBJECT} of the ratio of left to right length, six pairs of "
         "parts, eight hypotheses. The paper prints no numbers here, so there is nothing to set "
@@ -101,9 +108,9 @@ def _pose_prior(results: Results) -> Section:
             Paragraph(text),
             figure_block("pose-prior", "pose prior"),
             Paragraph(f"1000 S², seed {results.setup.seed}:"),
-            prior_table(metrics, SUBJECT),
+            prior_table(priors),
         ],
-        {"pose-prior": pose_prior_bars(metrics, SUBJECT)},
+        {"pose-prior": pose_prior_bars(priors, SUBJECT, title(run))},
         claims=_pose_prior_claims(_mean_prior(results)),
     )
 

@@ -22,6 +22,7 @@ from ghpt.report.document import Paragraph, Table
 from ghpt.report.tables import NAMES, NONE
 
 SAME_DETECTIONS = (
+    "frame_learned",
     "ransac",
     "adaptive_ransac",
     "weighted_linear",
@@ -180,7 +181,6 @@ def _sota(results: Results) -> Section:
     ]
     rows.append([label, *comparison.cells()])
     beside = {
-        "view weights (the same 12; not in the paper)": _novel_mean(results, "view_weights"),
         "average of the same 12 pools": _novel_mean(results, "average"),
     }
     for name in SAME_DETECTIONS:

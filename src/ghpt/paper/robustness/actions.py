@@ -27,7 +27,7 @@ KINDS: tuple[Kind, ...] = ("relative", "absolute")
 OF_POOL = ("weight", "average", "most", "best")
 """Selections of the model's pool; the best one looks at the truth."""
 TRAJECTORY = "trajectory"
-OURS = (TRAJECTORY, "frame_learned", "view_weights")
+OURS = (TRAJECTORY, "frame_learned")
 """What the paper lacks, to be compared with the classical estimators of single frames."""
 NOT_CLASSICAL = (*OF_POOL, *OURS)
 
@@ -41,7 +41,6 @@ class CurveSettings:
 
     data: Target
     baselines: Mapping[str, Target]
-    view_weights: Target
     sequences: Mapping[str, int]
     """`Sequences`."""
     seed: int
@@ -101,7 +100,7 @@ class LevelMetrics:
 def measure_curve(config: dict[str, Any], dependencies: dict[str, Path], folder: Path) -> None:
     """Measure all estimators on the data under each of the perturbations; see `CurveSettings`.
 
-    They are the model of the dependency ``model``, view weights, baselines and the trajectory.
+    They are the model of the dependency ``model``, baselines and the trajectory.
     result.json: `CurveContent`.
     """
     own = settings(CurveSettings, config)
@@ -109,7 +108,7 @@ def measure_curve(config: dict[str, Any], dependencies: dict[str, Path], folder:
     data.setup("test")
     runs = draw_runs(data.frames["test"].recordings, settings(Sequences, own.sequences))
     model, _ = load_model(dependencies["model"] / LAST, seed=own.seed)
-    groups = BaselineSettings(own.baselines, {}, own.view_weights)
+    groups = BaselineSettings(own.baselines, {})
     estimate = all_estimators(model.eval(), model.problem.baselines(groups, model))
     trajectory = build(own.trajectory, "trajectory") if own.trajectory else None
     levels = [

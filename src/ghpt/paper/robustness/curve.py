@@ -81,7 +81,6 @@ def curve_task(
     config = CurveSettings(
         data=whole["data"],
         baselines=whole["baselines"],
-        view_weights=whole["view_weights"],
         sequences=asdict(sizes.sequences["h36m" if data == "h36m" else "panoptic"]),
         trajectory=whole["trajectory"] and whole["trajectory"]["trajectory"],
         seed=setup.seed,

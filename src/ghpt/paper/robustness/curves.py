@@ -238,8 +238,7 @@ ARTEFACTS = (
         "box around the joints), on top of the detector's own errors: on the left new in every "
         "frame, on the right for 0.3 s at a time. The weights of the paper's "
         "selection are soft, so hypotheses with an outlier keep a share of its average; the "
-        "best-scored hypothesis alone stands beside it. The view weights' pool is drawn from the "
-        "views on which adaptive RANSAC finds agreement.",
+        "best-scored hypothesis alone stands beside it.",
         OUTLIERS,
         LASTING_OUTLIERS,
     ),

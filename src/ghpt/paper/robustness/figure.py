@@ -24,7 +24,6 @@ STYLES = {
     "ransac": ("#009E73", (0, (1, 1)), "^"),
     "m_estimator": ("#CC79A7", (0, (3, 1, 1, 1, 1, 1)), "P"),
     "lo_ransac": ("#666666", (0, (6, 2)), "X"),
-    "view_weights": ("#000000", "-", "*"),
     "adaptive_ransac": ("#882255", (0, (5, 1, 1, 1)), "<"),
     "frame_learned": ("#117733", "-", "p"),
     "trajectory": ("#CC3311", "-", "h"),
@@ -35,7 +34,6 @@ STYLES = {
 LABELS = NAMES | {
     "weight": "the paper's selection",
     "trajectory": "trajectories",
-    "view_weights": "learned view weights",
     "frame_learned": "learned frames",
     "average": "average of its pool",
     "most": "best-scored of its pool",
@@ -45,14 +43,13 @@ WIDTHS = {
     "weight": 2.2,
     "trajectory": 2.6,
     "frame_learned": 2.2,
-    "view_weights": 2.2,
     "linear": 2.6,
     "ransac": 3.2,
     "adaptive_ransac": 4.0,
 }
 """Widths of the lines that others often lie upon, or that matter most."""
 OTHER_WIDTH = 1.4
-_IN_FRONT = ("weight", "trajectory", "frame_learned", "view_weights")
+_IN_FRONT = ("weight", "trajectory", "frame_learned")
 ACROSS = 6.0
 """Largest ratio of the errors in a panel on a linear axis."""
 TICKS = (10, 15, 20, 30, 50, 70, 100, 150, 200, 300, 500, 700, 1000, 2000, 5000)

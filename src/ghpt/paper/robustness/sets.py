@@ -47,7 +47,7 @@ def _section(results: Results) -> Section:
         "Not in the paper: pelvis-relative MPJPE in mm of every estimator on the same frames, "
         f"{frames} in all. The trajectory is that of the run of successive frames around each of "
         "them (`sizes.robustness.sequences`); it and the learned frames have seen none of the "
-        f"five arrangements. The paper's selection and the view weights are trained on {training}."
+        f"five arrangements. The paper's selection is trained on {training}."
     )
     return Section(
         f"{panoptic_name(results)} and {results.display_name('h36m')}",

@@ -180,7 +180,7 @@ class Trajectory:
         origin = frames.rows.origin
         covariance = solution.points.new_zeros(len(batch), solution.points.shape[1], 6)
         if with_covariance:
-            every = size**2 * self.inflation * covariances(solution)
+            every = size**2 * covariances(solution, self.inflation)
             covariance = every[..., at].permute(2, 1, 0)
         limit = self.agree * solution.body.scale[:, None]
         agrees = solution.used & (solution.residual <= limit)

@@ -1,10 +1,9 @@
-"""Choose ``adapt``, ``quantile`` and ``power`` on validation data.
+"""Choose ``adapt`` and ``quantile`` of adaptive RANSAC on validation data.
 
-    python scripts/tune_view_weights.py runs/cmu2/last.ckpt
+    python scripts/tune_adaptive_ransac.py
 
-Prints the pelvis-relative MPJPE of adaptive RANSAC and of the view weights on the synthetic
-validation splits, as they are and perturbed, and the geometric mean over all, by which
-conf/view_weights and conf/baselines are chosen. Test data are never looked at.
+Prints its pelvis-relative MPJPE on the synthetic validation splits, as they are and perturbed, and
+the geometric mean over all, by which conf/baselines are chosen. Test data are never looked at.
 """
 
 import argparse
@@ -20,10 +19,8 @@ from rich.table import Column, Table
 
 from ghpt.config import build, plain
 from ghpt.metrics.pose_error import joint_errors
-from ghpt.models.checkpoint import load_model
 from ghpt.models.estimators.classical import Linear
 from ghpt.models.estimators.ransac import AdaptiveRansac
-from ghpt.models.estimators.view_weights import ViewWeights
 from ghpt.paper.robustness.perturbation import (
     MissingDetections,
     Noise,
@@ -35,7 +32,6 @@ from ghpt.paper.robustness.perturbation import (
 CONF = Path(__file__).resolve().parents[1] / "conf"
 STRIDES = {"h36m": 256, "cmu3": 512}
 CONSENSUS = list(itertools.product((0.5, 0.55, 0.6), (4.0, 5.0)))
-POWERS = (1.0, 2.0, 2.5, 3.0)
 CONDITIONS = {
     "as is": lambda batch, seed: batch,
     "5 % out": Outliers(0.05, 0.1, 0.5),
@@ -78,8 +74,7 @@ def error(estimator, batches: list, condition) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("checkpoint", type=Path)
-    model, _ = load_model(parser.parse_args().checkpoint, seed=0)
+    parser.parse_args()
     torch.set_num_threads(2)
     batches = {name: validation_batches(name) for name in STRIDES}
     estimators = [("linear", Linear())]
@@ -94,9 +89,6 @@ def main() -> None:
         }
         robust = AdaptiveRansac(**settings)
         estimators.append((f"RANSAC, quantile {quantile:g}, adapt {adapt:g}", robust))
-        estimators += [
-            (f"  power {power:g}", ViewWeights(model, robust, power)) for power in POWERS
-        ]
     columns = [
         Column("estimator", no_wrap=True),
         "mean",

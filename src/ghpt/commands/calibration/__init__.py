@@ -1,0 +1,1 @@
+"""From key points and intrinsics to a rig: the rooms of calibrate.py."""
