@@ -52,6 +52,10 @@ class CameraCheckResult:
     """The held-out error of each view after that: median, pixels."""
     given_px: Float[Tensor, " V"]
     """The same as the files have it."""
+    course_px: Float[Tensor, "F V"]
+    """The held-out error in each frame, NaN where nothing is compared: as ``error_px``."""
+    given_course_px: Float[Tensor, "F V"]
+    """The same as the files have it."""
     stature: float
     """Of the person, mm; 0 where it was not measured."""
     unit_mm: float | None
@@ -123,6 +127,7 @@ class CameraCheck:
         cache = RayCache(evidence)
         search = Search(cache, setup, self.thresholds)
         given_px = pixels_of(cache, setup, search.now.error)
+        given_course_px = pixels_of(cache, setup, search.now.course)
         findings: list[Finding] = []
         for _ in range(self.rounds):
             best = search.best()
@@ -161,6 +166,8 @@ class CameraCheck:
             setup=setup,
             error_px=error_px,
             given_px=given_px,
+            course_px=pixels_of(cache, setup, search.now.course),
+            given_course_px=given_course_px,
             stature=height,
             unit_mm=unit_mm,
             points=points[0],
@@ -255,7 +262,7 @@ class CameraCheck:
         return float(stature(points[0], known[0]))
 
 
-def pixels_of(cache: RayCache, setup: Setup, error: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
+def pixels_of(cache: RayCache, setup: Setup, error: Float[Tensor, "*F V"]) -> Float[Tensor, "*F V"]:
     """Return the errors of the views, in sizes of the person, as pixels."""
     size = cache.all(setup).size
     typical = torch.where(size > 0, size, torch.nan).nanmedian(-1).values.nan_to_num(0.0)
