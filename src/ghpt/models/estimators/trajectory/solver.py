@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -113,7 +113,8 @@ class TrajectorySolver:
     ``noise``: a key point's deviation is this multiple of the one that the median residual of its
     joint says. A residual r weighs ``(1 + (r / (kernel x deviation))^2)^-2`` (Geman-McClure), with
     a kernel for each round: ``kernels`` without bones, then ``bone_kernels`` with them. The motion
-    prior is adapted to the current estimate before every second round. ``exchange`` and ``others``:
+    prior is adapted to the current estimate before every second round, and in the last one, when
+    what is wrong has little weight left and may no longer pull, with ``last_factor``. ``exchange`` and ``others``:
     what views may do beside seeing the joints of the person; null: nothing. ``group``: joints that
     are solved at once.
     """
@@ -123,6 +124,7 @@ class TrajectorySolver:
     exchange: SideExchange | None
     others: OtherPeople | None
     noise: float
+    last_factor: float
     kernels: tuple[float, ...]
     bone_kernels: tuple[float, ...]
     group: int
@@ -131,6 +133,7 @@ class TrajectorySolver:
 
     def __post_init__(self) -> None:
         check_positive(noise=self.noise, group=self.group, tolerance=self.tolerance)
+        check_positive(last_factor=self.last_factor)
         check_positive(iterations=self.iterations, rounds=len(self.kernels))
 
     def __call__(self, frames: Frames, skeleton: Skeleton, body: Body | None = None) -> Solution:
@@ -148,7 +151,7 @@ class TrajectorySolver:
                 state.exchange_sides()
             last = number == len(self.bone_kernels) - 1
             state.tolerance = self.tolerance * (1 if last else _EARLIER)
-            state.update(kernel, adapt=number % 2 == 0, with_bones=True)
+            state.update(kernel, adapt=last or number % 2 == 0, with_bones=True, is_last=last)
         return state.solution()
 
 
@@ -188,7 +191,7 @@ class _Rounds:
         self.points = self._join_start()
         self.body = body or self._measure(self.points)
 
-    def update(self, kernel: float, adapt: bool, with_bones: bool) -> None:
+    def update(self, kernel: float, adapt: bool, with_bones: bool, is_last: bool = False) -> None:
         """Go one round."""
         solver = self.solver
         frames = self.frames
@@ -196,7 +199,8 @@ class _Rounds:
         if self.given is None:
             self.body = self._measure(self.points, residual)
         if adapt:
-            self.deviation = solver.motion.adapt(self.points, frames.axis)
+            motion = replace(solver.motion, factor=solver.last_factor) if is_last else solver.motion
+            self.deviation = motion.adapt(self.points, frames.axis)
         scale = self.body.scale[:, None]
         relative = residual / scale
         robust = (1 + (relative / kernel).square()).square().reciprocal()
