@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 import __main__
 import ghpt
 from ghpt.commands.catalogue import load
-from ghpt.commands.display import as_started, until_reader_leaves
+from ghpt.commands.display import as_started, name_as_started, until_reader_leaves
 from ghpt.commands.jobs import (
     Job,
     Program,
@@ -364,6 +364,8 @@ def _records(config: Any, output: Path) -> Iterator[None]:
     handler = logging.FileHandler(output / f"{hydra_config.job.name}.log", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.root.addHandler(handler)
+    for each in logging.root.handlers:
+        each.addFilter(name_as_started)
     try:
         yield
     finally:
