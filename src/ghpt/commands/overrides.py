@@ -169,7 +169,7 @@ def _parse_all(words: Sequence[str], sweep: bool) -> list[Override]:
 
 
 def put_options_first(words: Sequence[str], overrides: Sequence[str]) -> list[str]:
-    """Return a command line with its settings behind its options, as Hydra's own parser wants it."""
+    """Return a command line whose settings stand behind its options, as Hydra wants them."""
     options = list(words)
     for override in overrides:
         options.remove(override)
