@@ -451,7 +451,8 @@ LITTLE_MOTION = Mistake(
     "little_motion",
     "{used} frames are worth {independent:.0f} independent ones, and people turn by {turned:.0f} "
     "degrees: rotations are known to ± {value:.1f} degrees",
-    "let somebody walk through the whole volume and turn: {needed}",
+    "let somebody walk through the whole volume and turn for 20 s, which gives ± 0.5 or so: "
+    "{needed}",
     Severity.WARNING,
 )
 OUTSIDE_IMAGE = Mistake(
