@@ -31,7 +31,8 @@ from ghpt.paper.robustness.curve import PERTURBATIONS, Curve
 from ghpt.paper.robustness.curves import ALL_CURVES
 from ghpt.paper.robustness.perturbation import Perturbation
 
-BATCH = 64
+BATCH = 512
+"""Frames at a time, as predict.py has them."""
 
 
 def draw_frames(words: list[str], split: str, count: int) -> tuple[Frames, Mapping[str, Estimator]]:

@@ -1,13 +1,11 @@
 """Other people's calibration and triangulation, each called in its own way on the same input.
 
 An adapter is a function. It imports its package when it is called, so that the benchmarks run with
-whichever packages are installed. Pose2Sim's triangulation is written here from its publication,
-because the package brings a whole pipeline with it.
+whichever packages are installed. The triangulations are those that predict.py compares with.
 """
 
 from __future__ import annotations
 
-import itertools
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +18,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy.signal import butter, filtfilt
 
 from ghpt.geometry.cameras import Cameras
+from ghpt.models.estimators.peers import Aniposelib, Pose2Sim
 from ghpt.observations import Observations, PoseEstimate
 
 MSAC_PIXELS = 10.0
@@ -27,6 +26,8 @@ MSAC_PIXELS = 10.0
 POSE2SIM_PIXELS = 15.0
 """Largest mean reprojection error of a point of Pose2Sim's."""
 POSE2SIM_LIKELIHOOD = 0.3
+POSE2SIM_SUBSETS = 500
+"""Most subsets of views in a step of the exclusion."""
 POSE2SIM_GAP = 20
 """Frames; shorter gaps are interpolated."""
 POSE2SIM_CUTOFF_HZ = 6.0
@@ -158,83 +159,19 @@ def as_estimate(points: Float[np.ndarray, "T J 3"]) -> PoseEstimate:
     return PoseEstimate(found.nan_to_num(0.0), found.isfinite().all(-1))
 
 
-def key_points_with_nan(batch: Observations) -> Float[np.ndarray, "V T J 2"]:
-    """Return key points as aniposelib takes them."""
-    shown = torch.where(batch.valid[..., None], batch.key_points.double(), torch.nan)
-    return shown.transpose(0, 1).numpy()
-
-
-def anipose_group(cameras: Cameras) -> object:
-    """Return the cameras as aniposelib's."""
-    from aniposelib.init import from_extrinsics
-
-    pose = torch.cat((cameras.R, cameras.t[..., None]), dim=-1).double().numpy()
-    views = len(pose)
-    last_row = np.broadcast_to([0.0, 0.0, 0.0, 1.0], (views, 1, 4))
-    matrices = np.concatenate((pose, last_row), axis=1)
-    names = [f"c{v}" for v in range(views)]
-    return from_extrinsics(names, matrices, K=cameras.K.double().numpy())
-
-
 def anipose_linear(batch: Observations) -> PoseEstimate:
     """Return aniposelib-pytorch's triangulation from all views."""
-    group = anipose_group(batch.cameras.index(0))
-    return as_estimate(group.triangulate(key_points_with_nan(batch)))
+    return Aniposelib(None)(batch)
 
 
 def anipose_msac(batch: Observations, tau: float = MSAC_PIXELS) -> PoseEstimate:
     """Return aniposelib-pytorch's robust triangulation; ``tau`` in pixels."""
-    group = anipose_group(batch.cameras.index(0))
-    return as_estimate(group.triangulate_robust(key_points_with_nan(batch), tau=tau).p3d)
+    return Aniposelib(tau)(batch)
 
 
 def pose2sim(batch: Observations, largest_error: float = POSE2SIM_PIXELS) -> PoseEstimate:
-    """Return Pose2Sim's weighted triangulation with exclusion of cameras (Pagnon et al. 2022).
-
-    Each point is triangulated from all its views, and while its mean reprojection error exceeds
-    ``largest_error`` (pixels) from all subsets with one view fewer, of which the best is taken. A
-    point that no two views explain is missing.
-    """
-    frames, views, joints = batch.valid.shape
-    camera = batch.cameras.index(0)
-    metres = camera.t / 1000
-    P = (camera.K @ torch.cat((camera.R, metres[..., None]), dim=-1)).double().numpy()
-    pixels = batch.key_points.double().numpy().swapaxes(1, 2).reshape(-1, views, 2)
-    weight = batch.confidence.double().numpy().swapaxes(1, 2).reshape(-1, views)
-    valid = batch.valid.numpy().swapaxes(1, 2).reshape(-1, views)
-    weight = np.where(valid & (weight >= POSE2SIM_LIKELIHOOD), weight, 0.0)
-    points = np.full((len(pixels), 3), np.nan)
-    count = (weight > 0).sum(-1)
-    for excluded in range(views - 1):
-        rows = np.flatnonzero(np.isnan(points[:, 0]) & (count - excluded >= 2))
-        best = np.full(len(rows), np.inf)
-        for out in itertools.combinations(range(views), excluded):
-            own = weight[rows]
-            own[:, out] = 0.0
-            found, error = _weighted_dlt(P, pixels[rows], own)
-            better = (error < best) & (error <= largest_error)
-            points[rows[better]] = found[better]
-            best = np.where(better, error, best)
-    return as_estimate(1000 * points.reshape(frames, joints, 3))
-
-
-def _weighted_dlt(
-    P: Float[np.ndarray, "V 3 4"],
-    pixels: Float[np.ndarray, "N V 2"],
-    weight: Float[np.ndarray, "N V"],
-) -> tuple[Float[np.ndarray, "N 3"], Float[np.ndarray, " N"]]:
-    """Return points and their mean reprojection error over the views of weight above 0."""
-    rows = pixels[..., None] * P[:, None, 2] - P[:, :2]
-    rows = (weight[..., None, None] * rows).reshape(len(pixels), 2 * len(P), 4)
-    _, _, Vt = np.linalg.svd(rows, full_matrices=False)
-    solution = Vt[:, -1]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        point = solution[:, :3] / solution[:, 3:]
-        image = np.einsum("vij,nj->nvi", P, solution)
-        offset = image[..., :2] / image[..., 2:] - pixels
-        distance = np.where(weight > 0, np.linalg.norm(offset, axis=-1), 0.0)
-        error = distance.sum(-1) / (weight > 0).sum(-1)
-    return point, np.where(np.isfinite(error), error, np.inf)
+    """Return Pose2Sim's weighted triangulation with exclusion of cameras."""
+    return Pose2Sim(largest_error, POSE2SIM_LIKELIHOOD, POSE2SIM_SUBSETS)(batch)
 
 
 def pose2sim_filtered(

@@ -4,8 +4,8 @@ The errors are of the same key points for all: 5 pixels of noise, one in fifty u
 second error one detection in ten 100 pixels off. A point is one joint of one frame; for subsets, of
 one hypothesis. pycolmap and the loop work point by point, so their speed is taken on fewer frames.
 ``pycolmap alone`` is its LO-RANSAC on cameras and arrays that are made beforehand: the fastest that
-it can be called from Python. ``predict`` is its classical default with states, covariances and
-swaps. The second table divides the time of twice the frames, or views, by twice the time of one: 1
+it can be called from Python. ``predict`` is ``estimator=frame`` with states, covariances and
+exchanged sides. The second table divides the time of twice the frames, or views, by twice the time of one: 1
 is linear.
 
 Settings: ``views=4,7,10,31`` ``frames=512`` ``loop_frames=64`` ``least=1`` (seconds for each
@@ -174,10 +174,10 @@ def measure_linearity(views: int, name: str, method: Method, options: Options) -
 
 
 def make_methods(baselines: dict[str, Any]) -> dict[str, Method]:
-    """Return all classical estimators, the loop, and what predict does by default."""
+    """Return all estimators of single frames, the loop, and what predict makes of one."""
     config = configuration("predictor/default")["predictor"]["classical"]
     classical = build(config, "predictor.classical")
-    predictor = classical(estimator=baselines[configuration("predict")["triangulation"]])
+    predictor = classical(estimator=baselines["adaptive_ransac"])
     methods: dict[str, Method] = {}
     for name, baseline in baselines.items():
         methods[name] = lambda data, baseline=baseline: baseline(data).points

@@ -9,6 +9,7 @@ import torch
 
 import sizes
 from ghpt.calibration.baseline import RigBaseline
+from ghpt.calibration.moved import RigChange
 from ghpt.calibration.normal_matrix import linearise
 from ghpt.calibration.observations import choose_frames, observe, reweight
 from ghpt.calibration.resection import PlacedRig
@@ -18,6 +19,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import matrix_to_vector, nearest_rotation, vector_to_matrix
 from ghpt.metrics.relative_pose import rotation_deg, translation_deg
 from ghpt.models.estimators.classical import person_scale
+from ghpt.models.relative_pose.scale import stature
 from rigs_with_people import calibration, people, relative
 from scenes import labelled_pairs
 
@@ -130,6 +132,32 @@ def test_errors_that_last_are_in_the_uncertainty():
         z.append(free_error(estimate, scene.cameras) / variance.sqrt())
         assert estimate.evidence.lasting > 0.2
     assert 0.5 < torch.stack(z).square().mean().sqrt() < 1.8
+
+
+def test_the_camera_that_moved_is_told_where_the_people_determine_it():
+    scene = people(frames=40)
+    estimate = scene.calibrate(CALIBRATE)
+    turn = vector_to_matrix(torch.tensor([0.0, 0.03, 0.0], dtype=torch.float64))
+    R = scene.cameras.R.clone()
+    t = scene.cameras.t.clone()
+    R[2] = turn @ R[2]
+    t[2] = turn @ t[2]
+    moved = Cameras(scene.cameras.K, R, t)
+    change = RigChange.of(estimate, moved)
+    assert change.suspects(2) == (2,)
+    assert set(change.suspects(1)) == {1, 2}  # whoever is accused, the one that moved is named
+    vague = replace(estimate, joint_covariance=1e6 * estimate.joint_covariance)
+    assert set(RigChange.of(vague, moved).suspects(2)) == {0, 1, 2, 3}
+
+
+def test_views_that_share_no_frame_are_not_linked():
+    scene = people(frames=40)
+    turns = torch.arange(40)[:, None] % 4 == torch.arange(4)
+    apart = replace(scene, valid=scene.valid & turns[..., None])
+    estimate = apart.calibrate(CALIBRATE)
+    assert {"few_frames", "unlinked"} <= {found.code for found in estimate.findings}
+    assert not estimate.calibrated.any()
+    assert float(stature(estimate.points, estimate.estimated)) == 0
 
 
 def problem(views=3, seed=0):

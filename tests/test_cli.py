@@ -262,6 +262,7 @@ def test_the_trace_is_shown_to_who_asks_for_it(conf, tmp_path):
 
 def test_values_are_typed_as_shell_and_hydra_take_them():
     assert shell_override("ckpt", "runs/1_a-2.0/last.ckpt") == "ckpt=runs/1_a-2.0/last.ckpt"
+    assert shell_override("output", "runs/a=b") == "\"output='runs/a=b'\""
     assert shell_override("ckpt", "a b/[1],x=2") == "\"ckpt='a b/[1],x=2'\""
 
 

@@ -5,7 +5,7 @@ import torch
 
 from ghpt.reconstruction import State, select_frames
 from ghpt.report.course import sample_course
-from ghpt.report.course_figure import ViewCourse, course_figure
+from ghpt.report.course_figure import ViewCourse, check_figure, course_figure
 from ghpt.report.drawing import draw
 from reconstructions import random_reconstruction
 
@@ -43,6 +43,30 @@ def test_the_figure_of_a_single_frame_and_of_unmeasured_views_is_drawn():
     figure = course_figure(views, course_of(made, ()), made_joints(17), None)
     assert draw(figure, "svg").startswith(b"<?xml")
     assert [axes.get_xlim() for axes in figure.axes] == [(0, 1), (0, 1)]
+
+
+def test_the_views_of_a_camera_check_are_compared_in_the_colours_of_the_first():
+    given = np.full((10, 2), 3.0)
+    given[5:, 1] = 40.0
+    views = {
+        name: ViewCourse(("a", "b"), np.arange(10.0), error)
+        for name, error in {"given": given, "mended": np.minimum(given, 3.0)}.items()
+    }
+    figure = check_figure(views, made_joints(3), np.zeros((10, 3), np.int8), 50.0)
+    images = [axes.images[0] for axes in figure.axes[:3]]
+    assert [image.get_clim() for image in images[:2]] == [(0, 40), (0, 40)]
+    np.testing.assert_array_equal(images[0].get_array()[1], given[:, 1])
+    assert images[2].get_extent()[:2] == [0, 0.2]
+
+
+def test_frames_that_are_not_evenly_spread_leave_a_gap_only_where_nobody_is():
+    frame = np.concatenate([np.linspace(0, 99, 64).round(), np.linspace(300, 399, 64).round()])
+    views = ViewCourse(("a",), frame, np.ones((128, 1)))
+    figure = check_figure({"given": views}, made_joints(2), np.zeros((128, 2), np.int8), None)
+    shown = np.isfinite(figure.axes[0].images[0].get_array().filled(np.nan)[0])
+    gap = np.flatnonzero(~shown)
+    assert len(gap) == len(shown) // 2
+    assert np.all(np.diff(gap) == 1)
 
 
 def made_joints(count):

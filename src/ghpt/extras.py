@@ -15,6 +15,7 @@ EXTRAS = {
     "optuna": "optuna",
     "psutil": "device",
     "mediapipe": "detect",
+    "aniposelib": "anipose",
 }
 """The extra of each package, which has the name by which it is imported."""
 _log = logging.getLogger(__name__)

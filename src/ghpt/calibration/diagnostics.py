@@ -32,7 +32,12 @@ from ghpt.calibration.observations import Correspondences, typical_size
 from ghpt.calibration.pairs import PairTable
 from ghpt.calibration.repair import Repair, RepairThresholds
 from ghpt.calibration.resection import PlacedRig, Resection
-from ghpt.calibration.uncertainty import Uncertainty
+from ghpt.calibration.uncertainty import (
+    Uncertainty,
+    blocks_of,
+    centre_std,
+    rotation_std_deg,
+)
 from ghpt.errors import check_positive
 from ghpt.geometry.cameras import camera_centre
 from ghpt.models.relative_pose.scale import average_lengths, bone_scales
@@ -289,9 +294,9 @@ class Diagnostics:
         if case.adjusted is not None and not case.adjusted.converged:
             gain = case.adjusted.final.gain
             yield NOT_CONVERGED.finding((), gain, iterations=case.adjusted.iterations)
-        variance = uncertainty.covariance.diagonal(dim1=-2, dim2=-1)
-        rotation = torch.rad2deg(variance[:, :3].mean(-1).sqrt())
-        position = variance[:, 3:].mean(-1).sqrt()
+        covariance = blocks_of(uncertainty.covariance)
+        rotation = rotation_std_deg(covariance)
+        position = centre_std(covariance)
         weak = rig.placed & ((rotation > self.rotation_std) | (position > self.centre_std))
         if weak.any():
             names = case.select_names(weak)
@@ -305,7 +310,7 @@ def _needed(evidence: Evidence, wanted: float) -> str:
     frames = evidence.frames_for(wanted)
     if frames is None:
         return f"however many frames like these leave ± {evidence.least_sd_deg:.1f}"
-    return f"± {wanted:g} takes about {frames} frames like these, and fewer of more motion"
+    return f"± {wanted:g} takes about {frames} frames like these"
 
 
 def _extent(pixels: Float[Tensor, "N 2"]) -> Float[Tensor, " 2"]:

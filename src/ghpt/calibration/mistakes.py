@@ -398,6 +398,13 @@ MOVED = Mistake(
     "calibrate it again",
     fitted=True,
 )
+MOVED_ONE_OF = Mistake(
+    "moved",
+    "one of {cameras} is not where the file has it, and the people in view do not tell which: key "
+    "points of {camera} lie as if it were rotated by {value:.1f}°, and moving another explains "
+    "them as well",
+    "calibrate the rig again, or let somebody walk and turn before it",
+)
 OFF = Mistake(
     "off",
     "{camera} does not agree with the others, and no mistake that is known explains it",
@@ -444,7 +451,8 @@ LITTLE_MOTION = Mistake(
     "little_motion",
     "{used} frames are worth {independent:.0f} independent ones, and people turn by {turned:.0f} "
     "degrees: rotations are known to ± {value:.1f} degrees",
-    "let somebody walk through the whole volume and turn: {needed}",
+    "let somebody walk through the whole volume and turn for 20 s, which gives ± 0.5 or so: "
+    "{needed}",
     Severity.WARNING,
 )
 OUTSIDE_IMAGE = Mistake(

@@ -28,7 +28,14 @@ from ghpt.calibration.observations import (
 )
 from ghpt.calibration.pairs import PairEstimation, PairTable
 from ghpt.calibration.resection import PlacedRig, Resection
-from ghpt.calibration.uncertainty import LensErrors, Uncertainty, uncertainty
+from ghpt.calibration.uncertainty import (
+    LensErrors,
+    Uncertainty,
+    blocks_of,
+    centre_std,
+    rotation_std_deg,
+    uncertainty,
+)
 from ghpt.errors import GhptDataError, check_positive
 from ghpt.geometry.cameras import Cameras
 from ghpt.models.relative_pose.scale import stature
@@ -51,10 +58,10 @@ class RigEstimate:
     calibrated.
     """
     calibrated: Bool[Tensor, " V"]
-    covariance: Float64[Tensor, "V 6 6"]
-    """Rotation vector about the world's axes (radians; of camera to world), then centre (world), in
-    the gauge of the rig as a whole (``ghpt.calibration.uncertainty.Uncertainty``); 0 for a camera
-    that is not calibrated.
+    joint_covariance: Float64[Tensor, "P P"]
+    """Of all cameras together: of each the rotation vector about the world's axes (radians; of
+    camera to world), then the centre (world), in the gauge of the rig as a whole
+    (``ghpt.calibration.uncertainty.Uncertainty``); 0 for a camera that is not calibrated.
     """
     reprojection: Float64[Tensor, " V"]
     """Median reprojection error of the key points whose point is known, outliers among them,
@@ -74,14 +81,19 @@ class RigEstimate:
     findings: tuple[Finding, ...]
 
     @property
+    def covariance(self) -> Float64[Tensor, "V 6 6"]:
+        """Each camera's own part of the covariance."""
+        return blocks_of(self.joint_covariance)
+
+    @property
     def rotation_std_deg(self) -> Float64[Tensor, " V"]:
-        """Root mean square over the axes of the standard deviation of a camera's rotation."""
-        return _rotation_std_deg(self.covariance)
+        """Standard deviation of a camera's rotation: of the angle about whatever axis."""
+        return rotation_std_deg(self.covariance)
 
     @property
     def centre_std(self) -> Float64[Tensor, " V"]:
-        """The same of its centre, in the unit of length."""
-        return (self.covariance.diagonal(dim1=-2, dim2=-1)[:, 3:].mean(-1)).sqrt()
+        """Standard deviation of a camera's centre, of its distance, in the unit of length."""
+        return centre_std(self.covariance)
 
     @property
     def succeeded(self) -> bool:
@@ -99,14 +111,14 @@ class RigEstimate:
         if not 0 < factor < float("inf"):
             hint = "Give a body height, segment lengths or a baseline that the recording shows."
             raise GhptDataError("rig", "scale", f"{factor} mm per unit of length", hint)
-        unit = torch.cat((torch.ones(3), torch.full((3,), factor))).double()
+        unit = torch.cat((torch.ones(3), torch.full((3,), factor))).double().repeat(len(self.names))
         points = self.points * factor
         height = float(stature(points, self.estimated))
         wrong_size = size_finding(height) if height else None
         return replace(
             self,
             cameras=Cameras(self.cameras.K, self.cameras.R, self.cameras.t * factor),
-            covariance=self.covariance * unit * unit[:, None],
+            joint_covariance=self.joint_covariance * unit * unit[:, None],
             points=points,
             findings=self.findings if wrong_size is None else (*self.findings, wrong_size),
         )
@@ -209,7 +221,7 @@ class RigCalibration:
                 used=observed.frames,
                 independent=lasting.independent,
                 turned_deg=facing.degrees,
-                rotation_sd_deg=3**0.5 * float(_rotation_std_deg(spread.covariance).max()),
+                rotation_sd_deg=float(rotation_std_deg(blocks_of(spread.covariance)).max()),
                 lasting=spread.lasting,
             )
         case = Case(
@@ -310,7 +322,7 @@ class RigCalibration:
                 torch.where(placed[:, None], rig.t, 0.0),
             ),
             calibrated=placed,
-            covariance=torch.zeros(views, 6, 6, dtype=torch.float64)
+            joint_covariance=torch.zeros(6 * views, 6 * views, dtype=torch.float64)
             if spread is None
             else spread.covariance,
             reprojection=reprojection,
@@ -324,10 +336,6 @@ class RigCalibration:
             evidence=case.evidence,
             findings=self.diagnostics(case, spread),
         )
-
-
-def _rotation_std_deg(covariance: Float64[Tensor, "V 6 6"]) -> Float64[Tensor, " V"]:
-    return torch.rad2deg(covariance.diagonal(dim1=-2, dim2=-1)[:, :3].mean(-1).sqrt())
 
 
 def unitise(rig: PlacedRig) -> PlacedRig:

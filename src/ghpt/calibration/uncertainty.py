@@ -24,9 +24,9 @@ class Uncertainty:
     the true ones, radians and centres in units of the rig's size counting alike.
     """
 
-    covariance: Float[Tensor, "V 6 6"]
-    """Rotation vector about the world's axes (radians), then centre (world); 0 for a view that is
-    not placed.
+    covariance: Float[Tensor, "P P"]
+    """Of all views together: for each the rotation vector about the world's axes (radians), then
+    the centre (world); 0 for a view that is not placed.
     """
     lasting: float
     """The share of the rotations' variance that more of the same recording would leave: errors that
@@ -56,21 +56,37 @@ def uncertainty(
     their mean) is 1; ``scale``: of its Cauchy loss, units of noise; ``lenses``: what is not known
     of the intrinsics.
     """
-    covariance = torch.zeros(len(rig.R), 6, 6, dtype=torch.float64)
+    parameters = 6 * len(rig.R)
     views = torch.nonzero(rig.placed)[:, 0]
     if len(views) < 2 or not rig.inlier.any():
-        return Uncertainty(covariance, 0.0)
+        return Uncertainty(torch.zeros(parameters, parameters, dtype=torch.float64), 0.0)
     propagation = Propagation.of(model.observed, rig, scale)
     steps, lasts = error_steps(model, propagation, draws)
     if lenses is not None:
         of_lenses = propagation(lenses.shifts(model.observed))[0]
         steps = torch.cat((steps, of_lenses), dim=-1)
         lasts = torch.cat((lasts, torch.ones(of_lenses.shape[-1], dtype=torch.bool)))
-    blocks = steps.unflatten(0, (-1, 6))
-    covariance[views] = (blocks @ blocks.mT)[views]
-    rotation = blocks[:, :3].square().sum((0, 1))
+    rotation = steps.unflatten(0, (-1, 6))[:, :3].square().sum((0, 1))
     lasting = float(rotation[lasts].sum() / rotation.sum().clamp(min=1e-300))
-    return Uncertainty(covariance, lasting)
+    return Uncertainty(steps @ steps.mT, lasting)
+
+
+def blocks_of(covariance: Float[Tensor, "P P"]) -> Float[Tensor, "V 6 6"]:
+    """Return each view's own part of a covariance of all views together."""
+    parts = covariance.unflatten(0, (-1, 6)).unflatten(2, (-1, 6))
+    return parts.diagonal(dim1=0, dim2=2).permute(2, 0, 1)
+
+
+def rotation_std_deg(covariance: Float[Tensor, "V 6 6"]) -> Float[Tensor, " V"]:
+    """Return the standard deviation of each camera's rotation: of the angle about whatever axis."""
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    return torch.rad2deg(variance[:, :3].sum(-1).sqrt())
+
+
+def centre_std(covariance: Float[Tensor, "V 6 6"]) -> Float[Tensor, " V"]:
+    """Return the standard deviation of each camera's centre: of its distance from the true one."""
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    return variance[:, 3:].sum(-1).sqrt()
 
 
 @dataclass(frozen=True)
@@ -96,19 +112,22 @@ def error_steps(
 
     1. ``draws`` errors of each kind of the model, or more, are propagated to the parameters, and to
        the residuals that remain.
-    2. The variances of the kinds are those whose residuals have the moments of the true residuals.
+    2. The variances of the kinds are those whose residuals have the moments of the true residuals,
+       as far as these tell them (``variances``).
     3. Along an error the loss bends less than its weight says, which enlarges the steps.
     """
     steps = []
     moments = []
     lasts = []
+    lasting = []
     for kind in model.kinds(draws, _SEED):
         step, residual = propagation(kind.draws)
         moments.append(model.moments(residual[..., :draws], propagation.used).mean(-1))
         steps.append(step / step.shape[-1] ** 0.5)
         lasts.append(torch.full(step.shape[-1:], kind.lasts))
+        lasting.append(kind.lasts)
     seen = model.moments(propagation.residual[..., None], propagation.used)[:, 0]
-    variance = variances(seen, torch.stack(moments, dim=-1))
+    variance = variances(seen, torch.stack(moments, dim=-1), torch.tensor(lasting))
     sizes = variance.sqrt() / propagation.curvature
     scaled = [size * step for size, step in zip(sizes, steps, strict=True)]
     return torch.cat(scaled, dim=-1), torch.cat(lasts)

@@ -46,6 +46,7 @@ from ghpt.commands.overrides import (
     compose,
     expand_home,
     parse_options,
+    put_options_first,
     rename_settings,
     spread_seeds,
 )
@@ -142,6 +143,7 @@ def _run(
         print(f"ghpt {ghpt.__version__}")
         return
     arguments = parse_options(get_args_parser(), sys.argv[1:])
+    sys.argv[1:] = put_options_first(sys.argv[1:], arguments.overrides)
     check_search(arguments.overrides, bool(arguments.multirun))
     source = _source(conf, name, arguments)
     sweep = bool(arguments.multirun)

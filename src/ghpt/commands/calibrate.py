@@ -154,7 +154,7 @@ def _findings(case: Case, solution: RigSolution, camera_check: CameraCheck) -> t
     said = {(found.code, frozenset(found.cameras)) for found in own}
     of_file = [
         found
-        for found in check_reference(case, camera_check)
+        for found in check_reference(case, camera_check, solution.estimate)
         if (found.code, frozenset(found.cameras)) not in said
     ]
     return (*own, *of_file)

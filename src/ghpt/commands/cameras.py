@@ -48,6 +48,7 @@ from ghpt.errors import GhptConfigError, GhptDataError, check
 from ghpt.files import remove, sweep_temporaries, write_json
 from ghpt.geometry.cameras import Cameras, CameraSet
 from ghpt.geometry.lens import distort
+from ghpt.geometry.state import State
 from ghpt.geometry.upright import upright
 from ghpt.observations import Recording
 from ghpt.provenance import provenance
@@ -57,17 +58,29 @@ from ghpt.report.camera_check import (
     camera_check_document,
     camera_check_summary,
 )
-from ghpt.report.document import Block, Figure, Heading
+from ghpt.report.course_figure import ViewCourse, check_figure
+from ghpt.report.document import Block, Figure, Heading, Paragraph
 from ghpt.report.html import write_html
 from ghpt.report.markdown import write_markdown
 from ghpt.report.rig_figure import DrawnPerson, DrawnRig, rig_figure
 from ghpt.report.tables import display_name
 from ghpt.report.terminal import print_document
+from ghpt.skeleton import JOINTS
 
 _RIG = "rig"
+_COURSE = "course"
+_GIVEN = "as the file has them"
+_MENDED_LABEL = "mended"
 _PICTURES: tuple[Block, ...] = (
     Heading("Who is where"),
     Figure(_RIG, "cameras and the person from above and from the side"),
+    Heading("Over time"),
+    Paragraph(
+        "A view that is dark throughout has a wrong camera, or a detector that errs in it; one "
+        "that becomes dark has moved or lost its place in time; a dark column is a moment in which "
+        "the views disagree. Below are the joints that the agreeing views give together."
+    ),
+    Figure(_COURSE, "errors of the views and states of the joints over time"),
 )
 _log = logging.getLogger(__name__)
 
@@ -135,9 +148,11 @@ def check_cameras(settings: CamerasSettings, output: Path) -> CameraReport:
     report = _report(subject, result, settings.seed, _next_command(settings, found, output))
     write_json(output / "cameras.json", report.plain())
     write_markdown(output / "report.md", camera_check_document(report))
-    figure = _rig_figure(subject, result, mended)
-    document = camera_check_document(report, _PICTURES)
-    write_html(output / "report.html", document, {_RIG: figure})
+    figures = {
+        _RIG: _rig_figure(subject, result, mended),
+        _COURSE: _course_figure(subject, result, mended),
+    }
+    write_html(output / "report.html", camera_check_document(report, _PICTURES), figures)
     print_document(camera_check_summary(report))
     path = display_path(output / "report.html")
     _log.info("Report: %s%s.", path, ", beside it the mended files" if mended else "")
@@ -162,14 +177,30 @@ def _rig_figure(subject: Subject, result: CameraCheckResult, mended: bool) -> Dr
     """Return the figure of the cameras, beside them as the file has them where some are mended."""
     setup = result.setup
     cameras = Cameras(setup.K, setup.R, setup.t)
-    label = "mended" if mended else "as the file has them"
+    label = _MENDED_LABEL if mended else _GIVEN
     person = DrawnPerson(result.points, result.estimated)
     rig = DrawnRig(subject.evidence.names, cameras, (person,), label=label)
     given = subject.setup
     ratio = (setup.t.norm(dim=-1) / given.t.norm(dim=-1).clamp(min=1e-9)).median()
     reference = Cameras(given.K, given.R, ratio * given.t) if mended else None
     up = upright(result.points, result.estimated, cameras)
-    return rig_figure("", rig, up, reference, "as the file has them")
+    return rig_figure("", rig, up, reference, _GIVEN)
+
+
+def _course_figure(subject: Subject, result: CameraCheckResult, mended: bool) -> DrawnFigure:
+    """Return the figure of the views' errors over time, also after mending where some are mended,
+    and of the joints.
+    """
+    evidence = subject.evidence
+    frame = evidence.frame.double().numpy()
+    views = {_GIVEN: ViewCourse(evidence.names, frame, result.given_course_px.numpy())}
+    if mended:
+        views[_MENDED_LABEL] = ViewCourse(evidence.names, frame, result.course_px.numpy())
+    seen = evidence.valid[:, evidence.max_shift].sum(0) >= 2
+    missing = torch.where(seen, int(State.REJECTED), int(State.FEW_VIEWS))
+    state = torch.where(result.estimated, int(State.OBSERVED), missing).to(torch.int8)
+    rate_hz = None if subject.sequence is None else subject.sequence.rate_hz
+    return check_figure(views, JOINTS, state.numpy(), rate_hz)
 
 
 def summary(report: CameraReport) -> str:

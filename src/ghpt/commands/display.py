@@ -39,5 +39,5 @@ def display_path(path: Path) -> str:
 
 def shell_override(key: str, value: object) -> str:
     """Return ``key=value`` as a shell and Hydra's grammar take it."""
-    text = f"{key}={value}"
-    return text if re.fullmatch(r"[\w=./+-]+", text) else f"\"{key}='{value}'\""
+    plain = re.fullmatch(r"[\w./+-]+", str(value))
+    return f"{key}={value}" if plain else f"\"{key}='{value}'\""

@@ -142,11 +142,10 @@ class _Setup:
 
 
 def _prepare(settings: PredictSettings) -> _Setup:
+    comparable = settings.baselines | settings.peers
     return _Setup(
         estimator=build_estimator(settings),
-        compared={
-            name: build(settings.baselines[name], f"baselines.{name}") for name in settings.compare
-        },
+        compared={name: build(comparable[name], f"compare.{name}") for name in settings.compare},
         camera_check=build(settings.camera_check, "camera_check"),
         judge=build(settings.verdict, "verdict"),
         origin=provenance(settings.seed),

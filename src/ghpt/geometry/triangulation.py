@@ -71,6 +71,10 @@ class Triangulation:
         """The joints that have a point: those that are ``ok`` or did not converge."""
         return self.status <= State.FILLED
 
+    def rows(self, rows: Int[Tensor, " b"]) -> Triangulation:
+        """Return these rows of the first dimension."""
+        return _map_fields(lambda x: x.index_select(0, rows), self)
+
     def with_rows(self, rows: Int[Tensor, " b"], part: Triangulation) -> Triangulation:
         """Return a copy with ``part`` in these rows of the first dimension."""
         return _map_fields(lambda x, y: x.index_copy(0, rows, y), self, part)

@@ -33,6 +33,8 @@ NAMES = {
     "adaptive_ransac": "adaptive RANSAC",
     "m_estimator": "M-estimator",
     "lo_ransac": "LO-RANSAC",
+    "pose2sim": "Pose2Sim's exclusion",
+    "aniposelib_robust": "aniposelib, robust",
 }
 """What people call a data set or a row, where it is not its name in metrics.json."""
 

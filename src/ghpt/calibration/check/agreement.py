@@ -33,6 +33,8 @@ class Agreement:
     left.
     """
     known: Bool[Tensor, "V F J"]
+    course: Float[Tensor, "F V"]
+    """The held-out errors of each frame; NaN where nothing is compared."""
 
     @property
     def cost(self) -> float:
@@ -128,7 +130,9 @@ def agreement(
         errors(_rays_of_view(rays, v), setup.R[v], setup.t[v], points[v], known[v])
         for v in range(views)
     ]
-    return Agreement(core, median(torch.stack(each)), points, known)
+    error = torch.stack(each)
+    course = error.nanmedian(-1).values.T
+    return Agreement(core, median(error), points, known, course)
 
 
 def triangulate_choices(

@@ -20,6 +20,7 @@ from ghpt.calibration.findings import Finding
 from ghpt.calibration.mistakes import (
     LENS,
     MOVED,
+    MOVED_ONE_OF,
     NOTHING_AGREES,
     OFF,
     OUT_OF_SYNC,
@@ -27,10 +28,16 @@ from ghpt.calibration.mistakes import (
     Candidate,
     size_finding,
 )
+from ghpt.calibration.moved import RigChange
+from ghpt.calibration.rig import RigCalibration, RigEstimate
 from ghpt.calibration.time.estimation import TimeEstimation
 from ghpt.errors import check, check_positive
+from ghpt.geometry.cameras import Cameras
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.relative_pose.scale import stature
+
+_LEAST_VIEWS = 3
+"""Of two cameras nobody can say which has moved."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +51,10 @@ class CameraCheckResult:
     error_px: Float[Tensor, " V"]
     """The held-out error of each view after that: median, pixels."""
     given_px: Float[Tensor, " V"]
+    """The same as the files have it."""
+    course_px: Float[Tensor, "F V"]
+    """The held-out error in each frame, NaN where nothing is compared: as ``error_px``."""
+    given_course_px: Float[Tensor, "F V"]
     """The same as the files have it."""
     stature: float
     """Of the person, mm; 0 where it was not measured."""
@@ -65,6 +76,8 @@ class CameraCheck:
     error of the others, or ``repaired``. ``many``: of more views it asks only if a view's error
     exceeds ``suspicious``, because the time grows with their square. ``consensus``: estimator that
     the person is measured with. ``time``: of the views, which is looked at before anything else.
+    ``rig``: the calibration of all cameras from the people, which tells whether a camera that does
+    not fit the others is the one that has moved.
     """
 
     frames: int
@@ -79,6 +92,7 @@ class CameraCheck:
     thresholds: Thresholds
     consensus: Estimator
     time: TimeEstimation
+    rig: RigCalibration
 
     def __post_init__(self) -> None:
         check_positive(
@@ -102,11 +116,18 @@ class CameraCheck:
         return any(error is None or error > limit for error in errors.values())
 
     @torch.no_grad()
-    def __call__(self, evidence: Evidence, setup: Setup) -> CameraCheckResult:
-        """Return what is wrong with the cameras, and the setup with it undone."""
+    def __call__(
+        self, evidence: Evidence, setup: Setup, estimate: RigEstimate | None = None
+    ) -> CameraCheckResult:
+        """Return what is wrong with the cameras, and the setup with it undone.
+
+        ``estimate``: of the rig, from the people in view; without one it is calibrated where a
+        camera seems to have moved.
+        """
         cache = RayCache(evidence)
         search = Search(cache, setup, self.thresholds)
         given_px = pixels_of(cache, setup, search.now.error)
+        given_course_px = pixels_of(cache, setup, search.now.course)
         findings: list[Finding] = []
         for _ in range(self.rounds):
             best = search.best()
@@ -120,7 +141,12 @@ class CameraCheck:
             given_back = _restore_given(search.setup, setup, partly)
             search = Search(cache, given_back, self.thresholds)
             findings = [_as_unrepaired(found, partly, evidence.names) for found in findings]
-        findings += self._unrepaired_views(search)
+        named = self._ambiguous_moves(search, setup, findings, estimate)
+        if named:
+            given_back = _restore_given(search.setup, setup, set(named))
+            search = Search(cache, given_back, self.thresholds)
+            findings = [_as_one_of(found, named, evidence.names) for found in findings]
+        findings += self._unrepaired_views(search, set(named))
         height = self._stature(search)
         setup, height, unit_mm = _file_unit(search.setup, height)
         wrong_size = size_finding(height) if height else None
@@ -140,6 +166,8 @@ class CameraCheck:
             setup=setup,
             error_px=error_px,
             given_px=given_px,
+            course_px=pixels_of(cache, setup, search.now.course),
+            given_course_px=given_course_px,
             stature=height,
             unit_mm=unit_mm,
             points=points[0],
@@ -167,8 +195,45 @@ class CameraCheck:
                 partly |= views
         return partly
 
-    def _unrepaired_views(self, search: Search) -> list[Finding]:
-        """Return the views that nothing that was tried brings to the others."""
+    def _ambiguous_moves(
+        self, search: Search, given: Setup, findings: list[Finding], estimate: RigEstimate | None
+    ) -> dict[int, tuple[int, ...]]:
+        """Return the views that seem to have moved although another one may have as well, and
+        which these are.
+
+        A camera is held against the others as the file has them. Whether these are right only a
+        rig tells in which all cameras are free, as far as its ± allow.
+        """
+        names = search.cache.evidence.names
+        moves = {
+            names.index(found.cameras[0])
+            for found in findings
+            if found.code == MOVED.code and found.mended
+        }
+        if not moves or len(names) < _LEAST_VIEWS:
+            return {}
+        rig = self._free_rig(search) if estimate is None else estimate
+        if not bool(rig.calibrated.all()):
+            return {}
+        before = _restore_given(search.setup, given, moves)
+        change = RigChange.of(rig, Cameras(before.K, before.R, before.t))
+        suspects = {view: change.suspects(view, moves - {view}) for view in moves}
+        return {view: those for view, those in suspects.items() if len(those) > 1}
+
+    def _free_rig(self, search: Search) -> RigEstimate:
+        """Return the rig that the key points show without any extrinsics."""
+        rays = search.cache.all(search.setup)
+        K = search.setup.K
+        pixels = rays.xy.transpose(0, 1) @ K[:, :2, :2].mT + K[:, None, :2, 2]
+        valid = rays.valid.transpose(0, 1)
+        evidence = search.cache.evidence
+        names = evidence.names
+        return self.rig(names, K, pixels, valid.double(), valid, None, 0, evidence.frame)
+
+    def _unrepaired_views(self, search: Search, named: set[int]) -> list[Finding]:
+        """Return the views that nothing that was tried brings to the others, but those that a
+        finding has named.
+        """
         error = search.now.error
         pixels = pixels_of(search.cache, search.setup, error)
         off = error > self.astray
@@ -177,7 +242,7 @@ class CameraCheck:
             found = NOTHING_AGREES.finding()
             return [replace(found, before_px=mean, after_px=mean)]
         findings = []
-        for view in torch.nonzero(off)[:, 0].tolist():
+        for view in set(torch.nonzero(off)[:, 0].tolist()) - named:
             name = search.cache.evidence.names[view]
             found = OFF.finding((name,), float(error[view]), self.astray)
             own = float(pixels[view])
@@ -197,7 +262,7 @@ class CameraCheck:
         return float(stature(points[0], known[0]))
 
 
-def pixels_of(cache: RayCache, setup: Setup, error: Float[Tensor, " V"]) -> Float[Tensor, " V"]:
+def pixels_of(cache: RayCache, setup: Setup, error: Float[Tensor, "*F V"]) -> Float[Tensor, "*F V"]:
     """Return the errors of the views, in sizes of the person, as pixels."""
     size = cache.all(setup).size
     typical = torch.where(size > 0, size, torch.nan).nanmedian(-1).values.nan_to_num(0.0)
@@ -239,6 +304,21 @@ def _as_unrepaired(found: Finding, views: set[int], names: tuple[str, ...]) -> F
     if not any(names.index(name) in views for name in found.cameras):
         return found
     return replace(found, mended=False, after_px=found.before_px)
+
+
+def _as_one_of(
+    found: Finding, suspects: dict[int, tuple[int, ...]], names: tuple[str, ...]
+) -> Finding:
+    """Return the finding of a camera that has moved as one of several that may have."""
+    views = {names.index(name) for name in found.cameras}
+    ambiguous = views & set(suspects)
+    if not ambiguous:
+        return found
+    if found.code != MOVED.code:
+        return replace(found, mended=False, after_px=found.before_px)
+    those = tuple(names[view] for view in suspects[ambiguous.pop()])
+    told = MOVED_ONE_OF.finding(those, found.value)
+    return replace(told, before_px=found.before_px, after_px=found.before_px)
 
 
 def _undone(search: Search, candidate: Candidate, after: Agreement) -> Finding:

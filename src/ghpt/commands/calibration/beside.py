@@ -71,9 +71,12 @@ def difference(
     return Differences(rotation, centre, found.scale)
 
 
-def check_reference(case: Case, camera_check: CameraCheck) -> tuple[Finding, ...]:
+def check_reference(
+    case: Case, camera_check: CameraCheck, estimate: RigEstimate | None = None
+) -> tuple[Finding, ...]:
     """Return what the camera check finds in the user's own extrinsics.
 
+    ``estimate``: the rig from the people, by which it tells what has moved.
     They are warnings: the calibrated rig does not rest on these extrinsics.
     """
     cameras = case.sequence.cameras
@@ -83,5 +86,5 @@ def check_reference(case: Case, camera_check: CameraCheck) -> tuple[Finding, ...
         evidence = gather(case.sequence, camera_check.frames, camera_check.shift)
     except GhptDataError:  # no frame shows enough: nothing can be told
         return ()
-    findings = camera_check(evidence, setup_of(cameras)).findings
+    findings = camera_check(evidence, setup_of(cameras), estimate).findings
     return tuple(replace(found, severity=Severity.WARNING) for found in findings)

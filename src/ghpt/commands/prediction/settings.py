@@ -64,6 +64,7 @@ class PredictSettings(InputSettings):
     batch: int
     progress_bar: bool
     baselines: dict[str, Target]
+    peers: dict[str, Target]
     trainer: dict[str, Any]
     flips: bool
     predictor: PredictorSettings
@@ -87,7 +88,7 @@ class PredictSettings(InputSettings):
             names = (TRAJECTORY, ONLINE, *ALIASES, *self.baselines)
             _check_exists("estimator", self.estimator, dict.fromkeys(names))
         for name in self.compare:
-            _check_exists("compare", name, self.baselines)
+            _check_exists("compare", name, self.baselines | self.peers)
         for name in self.formats or ():
             _check_exists("formats", name, WRITERS)
             WRITERS[name].check_installed(name)

@@ -14,7 +14,7 @@ from ghpt.errors import GhptDataError
 _VIDEOS = (".mp4", ".avi", ".mov", ".mkv", ".m4v", ".mpg", ".mpeg", ".webm", ".mts")
 _IMAGES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 _KEY_POINTS = (".h5", ".hdf5", ".slp", ".csv", ".npz", ".npy", ".json", ".txt")
-_WORDS = (b"keypoints", b'"people"', b'"instance', b"sync_index", b"scorer,", b"NUMPY", b"\x89HDF")
+_WORDS = (b"keypoints", b'"people"', b'"instance', b"sync_index", b"scorer", b"NUMPY", b"\x89HDF")
 """Of which one is at the begin of a file of key points, but for archives."""
 _SETTINGS = ("skeleton", "session", "rate_hz", "format", "least_confidence")
 """Of which an error says something, whatever the format is."""

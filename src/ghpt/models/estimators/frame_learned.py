@@ -8,7 +8,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from ghpt.errors import check_positive
 from ghpt.geometry.triangulation import Triangulation, concatenate
+from ghpt.models.body import stature
 from ghpt.models.estimators.classical import Estimator
 from ghpt.models.estimators.predictors import observe_joints
 from ghpt.models.joint.problem import JointSubsets
@@ -31,6 +33,10 @@ class FrameLearned(Estimator):
     as one that made a joint as it does there. Angles and conditions are those of the weighted
     triangulation.
 
+    Where a joint of a frame moves by more than ``far`` (of the person's stature) it was a wrong
+    estimate that the key points were judged beside: the frame is weighed again beside the new one,
+    ``passes`` times in all at most.
+
     The network knows the 17 joints, which are means of the ``skeleton``'s key points in the images.
     Those of them that are key points themselves are its own; all others have the first estimate.
     """
@@ -39,7 +45,12 @@ class FrameLearned(Estimator):
 
     key_points: str
     joints: str | None
+    passes: int = 1
+    far: float = 0.07
     skeleton: Skeleton = HUMAN36M
+
+    def __post_init__(self) -> None:
+        check_positive(passes=self.passes, far=self.far)
 
     def for_skeleton(self, skeleton: Skeleton) -> FrameLearned:
         return replace(self, skeleton=skeleton)
@@ -66,17 +77,27 @@ class FrameLearned(Estimator):
 
     @torch.no_grad()
     def _triangulate(self, batch: Observations) -> Triangulation:
-        model = load_shipped(self.key_points)
-        problem = self._problem
-        start = problem.start.triangulate(batch)
-        key_points = KeyPoints(batch, PoseEstimate(start.points, start.has_position))
-        logits = model.scorer(problem.featurize(key_points))
-        result = problem.triangulate(key_points, logits.softmax(dim=-1))
-        weighted = result.with_fallback(result.ok, start)
+        result = self._problem.start.triangulate(batch)
+        rows = torch.arange(len(batch), device=batch.valid.device)
+        for _ in range(self.passes):
+            before = result.rows(rows)
+            weighted = self._weigh(batch.rows(rows), before)
+            result = result.with_rows(rows, weighted)
+            rows = rows[_largest_move(before, weighted) > self.far]
+            if not len(rows):
+                break
         if self.joints is None:
-            return weighted
-        points = _average_subsets(self.joints, batch, weighted)
-        return replace(weighted, points=points)
+            return result
+        points = _average_subsets(self.joints, batch, result)
+        return replace(result, points=points)
+
+    def _weigh(self, batch: Observations, start: Triangulation) -> Triangulation:
+        """Return the weighted triangulation of key points that are judged beside ``start``."""
+        problem = self._problem
+        key_points = KeyPoints(batch, PoseEstimate(start.points, start.has_position))
+        logits = load_shipped(self.key_points).scorer(problem.featurize(key_points))
+        result = problem.triangulate(key_points, logits.softmax(dim=-1))
+        return result.with_fallback(result.ok, start)
 
     def inlier_threshold(
         self, batch: Observations, points: Float[Tensor, "B J 3"]
@@ -89,6 +110,13 @@ class FrameLearned(Estimator):
         if not isinstance(problem, KeyPointWeights):
             raise TypeError(f"{self.key_points} are no weights of key points")
         return problem
+
+
+def _largest_move(before: Triangulation, after: Triangulation) -> Float[Tensor, " B"]:
+    """Return how far the joint of each frame moved that moved most, in statures."""
+    placed = before.has_position
+    moved = torch.where(placed, (after.points - before.points).norm(dim=-1), 0.0)
+    return moved.amax(-1) / stature(after.points, placed)
 
 
 def _average_subsets(

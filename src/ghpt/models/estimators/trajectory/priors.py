@@ -83,9 +83,8 @@ class MotionPrior:
         square = torch.zeros_like(points[0])
         square[:, 1:-1] = points.diff(n=2, dim=-1).square().mean(0)
         square *= _inside(axis.joined)
-        sigma = self.window_s * axis.rate_hz
-        mean = gaussian_filter1d(square.numpy(), sigma, axis=-1, mode="nearest", truncate=3.0)
-        deviation = self.factor * torch.from_numpy(mean).clamp(min=0).sqrt()
+        mean = _smooth(square, self.window_s * axis.rate_hz)
+        deviation = self.factor * mean.clamp(min=0).sqrt()
         unit = axis.scale**2
         return deviation.clamp(self.least * unit, self.most * unit)
 
@@ -117,8 +116,16 @@ class MotionPrior:
 
 _JUMP = 4.0
 """Of the usual second difference of the median joint: from there on it is a jump."""
+_CHANGE_S = 0.12
+"""Deviation of the Gaussian window in which views agree on a bone's length."""
 _TINY = 1e-5
 """Of the velocity prior's precision: keeps the matrix of what nobody sees positive definite."""
+
+
+def _smooth(values: Float[Tensor, "J T"], sigma: float) -> Float[Tensor, "J T"]:
+    """Return the mean around each frame, weighted by a Gaussian of so many frames."""
+    smooth = gaussian_filter1d(values.numpy(), sigma, axis=-1, mode="nearest", truncate=3.0)
+    return torch.from_numpy(smooth)
 
 
 def _inside(joined: Bool[Tensor, " T"]) -> Bool[Tensor, " T"]:
@@ -135,15 +142,18 @@ class BonePrior:
 
     A bone's length is the median over the frames in which both of its ends are placed without it,
     the deviation ``factor`` times the (robust) one of these, at least ``least`` mm. It counts only
-    within ``reach_s`` of such a frame, and a bone with fewer than 10 of them is free.
+    within ``reach_s`` of such a frame, and a bone with fewer than 10 of them is free. Where views
+    agree on another length, ``change`` deviations away, it is as uncertain as that says.
     """
 
     factor: float
     least: float
     reach_s: float
+    change: float
 
     def __post_init__(self) -> None:
         check_positive(factor=self.factor, least=self.least, reach_s=self.reach_s)
+        check_positive(change=self.change)
 
     def measure(
         self, lengths: Float[Tensor, "B T"], placed: Bool[Tensor, "B T"]
@@ -156,6 +166,27 @@ class BonePrior:
         deviation = (self.factor * 1.48 * spread).clamp(min=self.least)
         precision = torch.where(known, 1 / deviation.square(), 0.0)
         return torch.where(known, length, 0.0), precision
+
+    def changes(
+        self,
+        lengths: Float[Tensor, "B T"],
+        sure: Bool[Tensor, "B T"],
+        length: Float[Tensor, " B"],
+        precision: Float[Tensor, " B"],
+        axis: TimeAxis,
+    ) -> Float[Tensor, "B T"]:
+        """Return the variance of lengths around each frame that is seen without bones, mm^2.
+
+        ``sure``: where enough views agree on both ends. Some bones are none: a spine bends, and a
+        hip is not where its neighbours' middle is. 0 where a length is less than ``change``
+        deviations from its own.
+        """
+        sigma = _CHANGE_S * axis.rate_hz
+        share = _smooth(sure.double(), sigma)
+        offset = _smooth(sure * (lengths - length[:, None]), sigma) / share.clamp(min=1e-6)
+        square = offset.square()
+        changed = (share > 0.5) & (square * precision[:, None] > self.change**2)
+        return torch.where(changed, square, 0.0)
 
     def near(self, placed: Bool[Tensor, "B T"], axis: TimeAxis) -> Bool[Tensor, "B T"]:
         """Return the frames in which bones count."""

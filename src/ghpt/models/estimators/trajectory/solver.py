@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -37,6 +37,10 @@ _COUNTS = 0.05
 """Weight from which a key point says that a joint is seen."""
 _EARLIER = 20.0
 """By how much the tolerance of rounds before the last is larger."""
+_SURE = 0.5
+"""Robust weight from which a key point agrees with the estimate beyond doubt."""
+_SURE_VIEWS = 3
+"""So many of a joint's say where it is whatever bones say; two wrong ones may agree by chance."""
 _USUAL = 0.75
 """Quantile of a joint's accelerations that are expected where they are not seen."""
 _START_DEVIATION = 10.0
@@ -109,7 +113,8 @@ class TrajectorySolver:
     ``noise``: a key point's deviation is this multiple of the one that the median residual of its
     joint says. A residual r weighs ``(1 + (r / (kernel x deviation))^2)^-2`` (Geman-McClure), with
     a kernel for each round: ``kernels`` without bones, then ``bone_kernels`` with them. The motion
-    prior is adapted to the current estimate before every second round. ``exchange`` and ``others``:
+    prior is adapted to the current estimate before every second round, and in the last one, when
+    what is wrong has little weight left and may no longer pull, with ``last_factor``. ``exchange`` and ``others``:
     what views may do beside seeing the joints of the person; null: nothing. ``group``: joints that
     are solved at once.
     """
@@ -119,6 +124,7 @@ class TrajectorySolver:
     exchange: SideExchange | None
     others: OtherPeople | None
     noise: float
+    last_factor: float
     kernels: tuple[float, ...]
     bone_kernels: tuple[float, ...]
     group: int
@@ -127,6 +133,7 @@ class TrajectorySolver:
 
     def __post_init__(self) -> None:
         check_positive(noise=self.noise, group=self.group, tolerance=self.tolerance)
+        check_positive(last_factor=self.last_factor)
         check_positive(iterations=self.iterations, rounds=len(self.kernels))
 
     def __call__(self, frames: Frames, skeleton: Skeleton, body: Body | None = None) -> Solution:
@@ -138,12 +145,13 @@ class TrajectorySolver:
         state = _Rounds(self, frames, skeleton, body)
         for number, kernel in enumerate(self.kernels):
             state.update(kernel, adapt=number in (2, 4), with_bones=False)
+        state.measure_change()
         for number, kernel in enumerate(self.bone_kernels):
             if number in (0, 2):
                 state.exchange_sides()
             last = number == len(self.bone_kernels) - 1
             state.tolerance = self.tolerance * (1 if last else _EARLIER)
-            state.update(kernel, adapt=number % 2 == 0, with_bones=True)
+            state.update(kernel, adapt=last or number % 2 == 0, with_bones=True, is_last=last)
         return state.solution()
 
 
@@ -178,10 +186,12 @@ class _Rounds:
         self.deviation = solver.motion.initial(frames.start, frames.placed, frames.axis)
         self.seen = frames.rows.used.any(0)
         self.crossed = frames.placed
+        self.sure = torch.zeros_like(frames.placed)
+        self.change = torch.zeros_like(frames.start[0, :1])
         self.points = self._join_start()
         self.body = body or self._measure(self.points)
 
-    def update(self, kernel: float, adapt: bool, with_bones: bool) -> None:
+    def update(self, kernel: float, adapt: bool, with_bones: bool, is_last: bool = False) -> None:
         """Go one round."""
         solver = self.solver
         frames = self.frames
@@ -189,7 +199,8 @@ class _Rounds:
         if self.given is None:
             self.body = self._measure(self.points, residual)
         if adapt:
-            self.deviation = solver.motion.adapt(self.points, frames.axis)
+            motion = replace(solver.motion, factor=solver.last_factor) if is_last else solver.motion
+            self.deviation = motion.adapt(self.points, frames.axis)
         scale = self.body.scale[:, None]
         relative = residual / scale
         robust = (1 + (relative / kernel).square()).square().reciprocal()
@@ -199,6 +210,7 @@ class _Rounds:
         counts = (counted > _COUNTS) & self.rows.used
         self.seen = counts.any(0)
         self.crossed = counts.sum(0) >= 2
+        self.sure = ((robust > _SURE) & self.rows.used).sum(0) >= _SURE_VIEWS
         self.precision = counted / scale.square()
         blocks, right = self.rows.sums(self.precision)
         self.observed = blocks.clone()
@@ -243,8 +255,22 @@ class _Rounds:
 
     def _bone_terms(self) -> BoneTerms:
         direction, _ = self._directions(self.points)
-        precision = self.near * self.body.precision[:, None]
-        return BoneTerms(self.ends, direction, precision)
+        precision = self.body.precision[:, None]
+        told = self.near * precision / (1 + precision * self.change)
+        return BoneTerms(self.ends, direction, told)
+
+    def measure_change(self) -> None:
+        """Measure where views agree that a bone has another length than usual."""
+        start, end = self.ends
+        _, lengths = self._directions(self.points)
+        body = self.body
+        self.change = self.solver.bones.changes(
+            lengths,
+            self.sure[start] & self.sure[end],
+            body.length,
+            body.precision,
+            self.frames.axis,
+        )
 
     def _join_start(self) -> Float[Tensor, "3 J T"]:
         """Return the start with what is missing in it carried over through time."""
