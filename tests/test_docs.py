@@ -67,7 +67,7 @@ PLACEHOLDERS = {
 }
 
 
-OWN_SCORERS = {"model=attending"}
+OWN_SCORERS = {"model=attending", "scorer@model.scorer=residual"}
 """Models whose scorer has no layers to be made small."""
 SLOW = {"data=people", "data=random"}
 """Data sets that no override makes small; tests of their own run a part of them."""
@@ -307,6 +307,8 @@ def wanted(command: Command, page: Path) -> bool:
         (word.split("=")[1].rstrip("/") for word in command.words if word.startswith("output=")),
         None,
     )
+    if documented.is_notebook(page):  # its cells follow from each other
+        return output not in LAID_OUT
     again = output and any(
         any(f"={output}/" in word for word in later.words if not word.startswith("output="))
         and wanted(later, page)
@@ -340,6 +342,8 @@ def test_the_commands_and_the_code_of_a_page_run(
     monkeypatch.syspath_prepend(tmp_path)
     shutil.copytree(workplace, tmp_path, copy_function=os.link, dirs_exist_ok=True)
     runner = Page(tmp_path, typed, monkeypatch)
+    if documented.is_notebook(page):
+        lay_out(runner, models)
     for block in documented.blocks(page):
         if not block.language:
             commands_in_it = re.findall(r"^python ", block.text, re.MULTILINE)

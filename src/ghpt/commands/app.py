@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 import __main__
 import ghpt
 from ghpt.commands.catalogue import load
-from ghpt.commands.display import as_started, until_reader_leaves
+from ghpt.commands.display import as_started, name_as_started, until_reader_leaves
 from ghpt.commands.jobs import (
     Job,
     Program,
@@ -47,6 +47,7 @@ from ghpt.commands.overrides import (
     expand_home,
     flags_first,
     parse_options,
+    put_options_first,
     rename_settings,
     spread_seeds,
 )
@@ -143,6 +144,7 @@ def _run(
         print(f"ghpt {ghpt.__version__}")
         return
     arguments = parse_options(get_args_parser(), sys.argv[1:])
+    sys.argv[1:] = put_options_first(sys.argv[1:], arguments.overrides)
     check_search(arguments.overrides, bool(arguments.multirun))
     source = _source(conf, name, arguments)
     sweep = bool(arguments.multirun)
@@ -365,6 +367,8 @@ def _records(config: Any, output: Path) -> Iterator[None]:
     handler = logging.FileHandler(output / f"{hydra_config.job.name}.log", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.root.addHandler(handler)
+    for each in logging.root.handlers:
+        each.addFilter(name_as_started)
     try:
         yield
     finally:

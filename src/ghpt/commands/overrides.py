@@ -153,11 +153,11 @@ def flags_first(words: Sequence[str]) -> list[str]:
 
 
 def parse_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
-    """Return the options of a command line.
+    """Return the options of a command line, which may stand between settings.
 
     Raises GhptConfigError for one that Hydra does not have: a setting with dashes before it.
     """
-    arguments, unknown = parser.parse_known_args(words)
+    arguments, unknown = parser.parse_known_intermixed_args(words)
     for word in unknown:
         name, _, value = word.lstrip("-").partition("=")
         if not word.startswith("-"):
@@ -175,6 +175,14 @@ def _parse_all(words: Sequence[str], sweep: bool) -> list[Override]:
         for override in overrides:
             _check_single(override)
     return overrides
+
+
+def put_options_first(words: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """Return a command line whose settings stand behind its options, as Hydra wants them."""
+    options = list(words)
+    for override in overrides:
+        options.remove(override)
+    return [*options, *overrides]
 
 
 def _check_single(override: Override) -> None:
