@@ -33,10 +33,14 @@ quick.make_quick()
 
 FIRST = (
     "test_docs.py",
-    "test_ddp.py",
+    "test_calibrate.py",
     "test_camera_check.py",
+    "test_predict.py",
+    "test_cli.py",
+    "test_verdict.py",
+    "test_commands_agree.py",
+    "test_ddp.py",
     "test_reproduce.py",
-    "test_geometry_battery.py",
 )
 """The files that take longest: begun first, so that no test process waits for another's last."""
 CACHE = pytest.StashKey[tempfile.TemporaryDirectory[str]]()

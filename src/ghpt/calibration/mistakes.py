@@ -276,8 +276,8 @@ IMAGE_TURNED = Mistake(
     "image_turned",
     "key points of {camera} are of images turned by {value:g} degrees (clockwise) against the "
     "calibration's",
-    "give the cameras of the turned images, which cameras.py writes, or detect again in images "
-    "that are turned back",
+    "give the cameras of the turned images, which the camera check writes, or detect again in "
+    "images that are turned back",
     undo=_turn,
     values=(90, 180, 270),
     needs_extrinsics=False,

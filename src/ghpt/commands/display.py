@@ -1,5 +1,6 @@
 """How paths, settings and commands are said, so that a reader can type them."""
 
+import logging
 import os
 import re
 import sys
@@ -15,12 +16,16 @@ _SCRIPTS = re.compile(
 @contextmanager
 def until_reader_leaves() -> Iterator[None]:
     """End the program with status 1, and without a word, when nobody reads its output any more."""
+    said = logging.raiseExceptions
+    logging.raiseExceptions = False  # a line of the log that nobody reads would print a trace
     try:
         yield
         sys.stdout.flush()
     except BrokenPipeError:  # as `head` does when it has its lines
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    finally:
+        logging.raiseExceptions = said
 
 
 def as_started(text: str) -> str:
@@ -29,6 +34,13 @@ def as_started(text: str) -> str:
     Where that was ``ghpt train``, ``python test.py`` becomes ``ghpt test``.
     """
     return _SCRIPTS.sub(r"ghpt \1", text) if sys.argv[0].startswith("ghpt ") else text
+
+
+def name_as_started(record: logging.LogRecord) -> bool:
+    """Apply `as_started` to a line of the log. Returns True: it is a filter that keeps all."""
+    record.msg = as_started(record.getMessage())
+    record.args = ()
+    return True
 
 
 def display_path(path: Path) -> str:
