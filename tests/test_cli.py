@@ -14,13 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra._internal.utils import get_args_parser
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import children
 import ghpt.commands.test as testing
 import toys
 from ghpt.commands.display import as_started, shell_override
+from ghpt.commands.overrides import flags_first, parse_options
 from ghpt.commands.train import COMMAND
+from ghpt.errors import GhptConfigError
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
@@ -427,3 +430,10 @@ def test_commands_are_named_as_the_program_was_started(monkeypatch, program, sai
     monkeypatch.setattr(sys, "argv", [program])
     text = "Run python test.py ckpt=x; train.py wrote it, mytrain.py did not"
     assert as_started(text) == said
+
+
+def test_the_option_of_a_sweep_may_stand_anywhere():
+    words = ["data=cmu1,cmu2", "-m", "seed=1"]
+    assert flags_first(words) == ["-m", "data=cmu1,cmu2", "seed=1"]
+    with pytest.raises(GhptConfigError, match="seed=1: stands behind an option"):
+        parse_options(get_args_parser(), ["data=cmu1", "--cfg", "job", "seed=1"])

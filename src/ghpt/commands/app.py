@@ -45,6 +45,7 @@ from ghpt.commands.overrides import (
     check_overrides,
     compose,
     expand_home,
+    flags_first,
     parse_options,
     put_options_first,
     rename_settings,
@@ -136,7 +137,7 @@ def _run(
 ) -> None:
     """Do what the command line asks for; jobs that end are added to ``ended``."""
     name = command if isinstance(command, str) else command.name
-    sys.argv[1:] = expand_home(rename_settings(sys.argv[1:]))
+    sys.argv[1:] = flags_first(expand_home(rename_settings(sys.argv[1:])))
     if name == "reproduce":
         sys.argv[1:] = spread_seeds(sys.argv[1:])
     if "--version" in sys.argv:
