@@ -1,7 +1,8 @@
-"""What mkdocs does for this site: pages that lie outside of docs/, where GitHub wants them, and API
-pages.
+"""What mkdocs does for this site: pages that lie outside of docs/, where GitHub wants them,
+notebooks, and API pages.
 """
 
+import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,12 +16,28 @@ OUTSIDE = {"benchmarks.md": "benchmarks/README.md", "changelog.md": "CHANGELOG.m
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages from outside."""
+    """Add the pages from outside, and a page for each notebook."""
     for page, file in OUTSIDE.items():
         files.append(
             File.generated(config, page, content=(ROOT / file).read_text(encoding="utf-8"))
         )
+    for notebook in sorted((ROOT / "docs").glob("notebooks/*.ipynb")):
+        page = f"notebooks/{notebook.stem}.md"
+        files.append(File.generated(config, page, content=render_notebook(notebook)))
     return files
+
+
+def render_notebook(path: Path) -> str:
+    """Return a notebook as Markdown: its texts, and its cells of code in fences."""
+    parts = []
+    for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:
+        text = "".join(cell["source"])
+        if cell["cell_type"] == "code":
+            language = "bash" if text.startswith("!") else "python"
+            text = f"```{language}\n{text}\n```"
+        parts.append(text)
+    parts.append(f"[This page as a notebook]({path.name})")
+    return "\n\n".join(parts) + "\n"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -29,6 +46,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     """
     for page, file in OUTSIDE.items():
         markdown = markdown.replace(f"](../{file}", f"]({page}")
+    markdown = re.sub(r"\]\((notebooks/\w+)\.ipynb\)", r"](\1.md)", markdown)
     return re.sub(
         r"^::: ([\w.]+)\.\*$",
         lambda match: "\n\n".join(_entries(match[1])),

@@ -1,9 +1,14 @@
 """Draw the pictures of README.md and the documentation into docs/images.
 
-``python scripts/pictures.py`` draws all. The animation is of a synthetic person before the cameras
-of Human3.6M; the others are cut out of the reports of ``predict.py``, ``calibrate.py`` and
+``python scripts/pictures.py`` draws the vectors. The animation is of a synthetic person before the
+cameras of Human3.6M; the others are cut out of the reports of ``predict.py``, ``calibrate.py`` and
 ``cameras.py`` on synthetic recordings. docs/images/sources.json keeps the digests of the code that
 each is made by, and a test compares them.
+
+With ``--browser COMMAND`` it also makes the pictures of whole pages, which take a browser: a
+command with ``{url}``, ``{out}``, ``{width}`` and ``{height}`` that writes a PNG, such as
+``chromium --headless --screenshot={out} --window-size={width},{height} {url}``. ``--page URL
+NAME`` makes one of them of a page that is there already, of TensorBoard say.
 """
 
 from __future__ import annotations
@@ -14,15 +19,18 @@ import contextlib
 import hashlib
 import json
 import re
+import shlex
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from PIL import Image
 
 import ghpt
 from ghpt.data.synthetic.recordings import draw_motion
@@ -39,6 +47,11 @@ SOURCES = {
     "predict-course.svg": (f"{REPORT}/course_figure.py", f"{REPORT}/course.py"),
     "calibrate-rig.svg": (f"{REPORT}/rig_figure.py",),
     "cameras-rig.svg": (f"{REPORT}/rig_figure.py",),
+    "player.png": ("src/ghpt/export/player.html", "src/ghpt/export/player.js"),
+    "predict-report.png": (f"{REPORT}/page.html", "src/ghpt/commands/prediction/page.py"),
+    "cameras-report.png": (f"{REPORT}/page.html", f"{REPORT}/camera_check.py"),
+    "calibrate-report.png": (f"{REPORT}/page.html",),
+    "tensorboard.png": (f"{REPORT}/tensorboard.py", f"{REPORT}/logger.py"),
 }
 """The code that decides on a picture's looks."""
 REPORTS = {
@@ -47,6 +60,28 @@ REPORTS = {
     "cameras-rig.svg": ("cameras.py", "data=h36m", "spoil=one_rotation_transposed"),
 }
 """The commands whose reports hold a picture: the first one in the report."""
+
+
+@dataclass(frozen=True)
+class Screen:
+    """A page of a command's output, as a browser shows it."""
+
+    report: str
+    """The picture of ``REPORTS`` whose command writes it."""
+    page: str
+    width: int
+    height: int
+
+
+SCREENS = {
+    "player.png": Screen("predict-course.svg", "poses.html#frame=300", 1200, 720),
+    "predict-report.png": Screen("predict-course.svg", "report.html", 1100, 1000),
+    "calibrate-report.png": Screen("calibrate-rig.svg", "report.html", 1100, 1000),
+    "cameras-report.png": Screen("cameras-rig.svg", "report.html", 1100, 1250),
+}
+TENSORBOARD = (1400, 900)
+"""Width and height of the picture of TensorBoard."""
+_COLOURS = 128
 FRAMES = 200
 _EVERY = 6
 """The animation keeps every sixth of 50 frames a second, and browsers draw what is between."""
@@ -152,17 +187,33 @@ def _animation(kind: str, paths: list[str]) -> str:
     return f'<path class="{kind}" d="{paths[0]}">{animate} values="{values}"/></path>'
 
 
-def draw_reports() -> Iterator[tuple[str, str]]:
-    """Yield the names of the pictures of reports and the pictures."""
+def draw_reports(browser: str | None) -> Iterator[tuple[str, str]]:
+    """Yield the names of the pictures of reports and the pictures; take those of whole pages."""
     for name, (script, *words) in REPORTS.items():
         with tempfile.TemporaryDirectory() as folder:
-            command = [sys.executable, ROOT / script, *words, f"output={folder}"]
-            subprocess.run(command, check=script != "cameras.py", cwd=ROOT)
-            page = (Path(folder) / "report.html").read_text(encoding="utf-8")
+            command = [sys.executable, ROOT / script, *words, "output=out"]
+            subprocess.run(command, check=script != "cameras.py", cwd=folder)
+            page = (Path(folder) / "out" / "report.html").read_text(encoding="utf-8")
+            for screen, wanted in SCREENS.items():
+                if browser and wanted.report == name:
+                    url = f"file://{folder}/out/{wanted.page}"
+                    take_picture(browser, url, screen, (wanted.width, wanted.height))
         found = re.search(r'src="data:image/svg\+xml;base64,([^"]+)"', page)
         if found is None:
             raise SystemExit(f"error: {script}: its report holds no picture")
         yield name, base64.b64decode(found[1]).decode()
+
+
+def take_picture(browser: str, url: str, name: str, size: tuple[int, int]) -> None:
+    """Keep what a browser shows, in few colours."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / name
+        values = {"url": url, "out": str(out), "width": size[0], "height": size[1]}
+        subprocess.run([word.format(**values) for word in shlex.split(browser)], check=True)
+        with Image.open(out) as picture:
+            few = picture.convert("RGB").quantize(_COLOURS, dither=Image.Dither.NONE)
+        few.save(FOLDER / name, optimize=True)
+    _keep_digest(name)
 
 
 def digests() -> dict[str, str]:
@@ -179,17 +230,31 @@ def digests() -> dict[str, str]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--walk", action="store_true", help="draw the animation alone")
+    parser.add_argument("--browser", help="command that writes a PNG {out} of a page {url}")
+    parser.add_argument("--page", nargs=2, metavar=("URL", "NAME"), help="take this page alone")
     options = parser.parse_args()
     FOLDER.mkdir(exist_ok=True)
+    if options.page:
+        if not options.browser:
+            parser.error("--page needs a browser: see --browser")
+        url, name = options.page
+        take_picture(options.browser, url, name, TENSORBOARD)
+        return
     _keep("walk.svg", draw_walk())
     if not options.walk:
-        for name, picture in draw_reports():
+        for name, picture in draw_reports(options.browser):
             _keep(name, picture)
+    if not options.browser:
+        print("The pictures of whole pages are left as they are: they need --browser.")
 
 
 def _keep(name: str, picture: str) -> None:
     """Write a picture and the digest of the code that made it."""
     (FOLDER / name).write_text(picture, encoding="utf-8")
+    _keep_digest(name)
+
+
+def _keep_digest(name: str) -> None:
     known = {}
     with contextlib.suppress(FileNotFoundError):
         known = json.loads(DIGESTS.read_text(encoding="utf-8"))

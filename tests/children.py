@@ -30,7 +30,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import IO
 
-import quick_yaml
+import quick
 import sizes
 
 ADDRESS = "GHPT_TEST_FORK_SERVER"
@@ -303,7 +303,7 @@ def fork_ranks() -> None:
 
 
 def import_modules() -> None:
-    quick_yaml.use_libyaml()
+    quick.make_quick()
     for module in MODULES:
         importlib.import_module(module)
     gc.collect()

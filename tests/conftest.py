@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 import children
-import quick_yaml
+import quick
 
 if TYPE_CHECKING:  # the process that only hands out tests to others does not import torch
     from ghpt.commands.app import Command
@@ -29,14 +29,18 @@ if WORKER:  # each of several test processes has its own core, and so have the c
     os.environ["OMP_NUM_THREADS"] = "1"
     torch.set_num_threads(1)
 
-quick_yaml.use_libyaml()
+quick.make_quick()
 
 FIRST = (
     "test_docs.py",
-    "test_ddp.py",
+    "test_calibrate.py",
     "test_camera_check.py",
+    "test_predict.py",
+    "test_cli.py",
+    "test_verdict.py",
+    "test_commands_agree.py",
+    "test_ddp.py",
     "test_reproduce.py",
-    "test_geometry_battery.py",
 )
 """The files that take longest: begun first, so that no test process waits for another's last."""
 CACHE = pytest.StashKey[tempfile.TemporaryDirectory[str]]()
@@ -116,8 +120,8 @@ def shared_data() -> Path:
 
 @pytest.fixture
 def little_data(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Synthetic data sets of one subject a split and some frames, in a cache of their own, which
-    all tests share.
+    """Synthetic data sets of one subject a split, a few actions and some frames, in a cache of
+    their own, which all tests share.
     """
     from ghpt.data.synthetic import recordings as synthetic
 
@@ -125,6 +129,7 @@ def little_data(monkeypatch: pytest.MonkeyPatch) -> None:
     subjects = {"train": ("S1",), "validation": ("S8",), "test": ("S9",)}
     monkeypatch.setattr(synthetic, "HUMAN36M_FRAMES", frames)
     monkeypatch.setattr(synthetic, "HUMAN36M_SUBJECTS", subjects)
+    monkeypatch.setattr(synthetic, "action_names", lambda: ("Eating", "Sitting", "Walking"))
     monkeypatch.setattr(synthetic, "PANOPTIC_FRAMES", 400)
     monkeypatch.setattr(synthetic, "PANOPTIC_SUBJECTS", ("P1",))
     monkeypatch.setenv("GHPT_CACHE", os.path.join(os.environ["GHPT_CACHE"], "little"))

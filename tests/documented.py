@@ -4,6 +4,7 @@ need to run.
 
 from __future__ import annotations
 
+import json
 import re
 import shlex
 import shutil
@@ -27,6 +28,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [
     ROOT / "README.md",
     *sorted((ROOT / "docs").glob("*.md")),
+    *sorted((ROOT / "docs").glob("notebooks/*.ipynb")),
     ROOT / "benchmarks" / "README.md",
 ]
 FRAMES = 80
@@ -60,8 +62,40 @@ class Command:
         return self.words[1] if self.words[0] == "python" and len(self.words) > 1 else None
 
 
+def is_notebook(page: Path) -> bool:
+    """Whether a page is a notebook, whose cells follow from each other."""
+    return page.suffix == ".ipynb"
+
+
+def _cells(page: Path, kind: str) -> Iterator[tuple[int, str]]:
+    """The numbers and the texts of a notebook's cells of a kind."""
+    for number, cell in enumerate(json.loads(page.read_text(encoding="utf-8"))["cells"], start=1):
+        if cell["cell_type"] == kind:
+            yield number, "".join(cell["source"]) + "\n"
+
+
+def _cell_block(page: Path, number: int, text: str) -> Block:
+    """A cell of code as a block: one that writes a file, commands, or Python."""
+    if written := re.match(r"%%writefile (\S+)\n", text):
+        language = "yaml" if written[1].endswith(".yaml") else "python"
+        return Block(page, number, language, f"# {written[1]}\n{text[written.end() :]}")
+    if text.startswith("!"):
+        typed = re.sub(r"^!ghpt (\w+)", r"python \1.py", text, flags=re.MULTILINE)
+        return Block(page, number, "bash", typed.replace("--config-dir conf ", ""))
+    return Block(page, number, "python", text)
+
+
+def text_of(page: Path) -> str:
+    """What a reader reads: a page, or the text between a notebook's cells of code."""
+    if is_notebook(page):
+        return "\n".join(text for _, text in _cells(page, "markdown"))
+    return page.read_text(encoding="utf-8")
+
+
 def blocks(page: Path) -> list[Block]:
     """The page's fenced blocks in their order."""
+    if is_notebook(page):
+        return [_cell_block(page, number, text) for number, text in _cells(page, "code")]
     found, text = [], page.read_text(encoding="utf-8")
     for match in re.finditer(r"^```(.*)\n((?:(?!```).*\n)*)```$", text, flags=re.MULTILINE):
         found.append(
@@ -82,7 +116,7 @@ def commands_of(block: Block) -> Iterator[Command]:
 
 def inline_commands(page: Path) -> Iterator[Command]:
     """Commands between backticks in the text, which may go over a line's end."""
-    text = page.read_text(encoding="utf-8")
+    text = text_of(page)
     prose = re.sub(
         r"^```.*?^```$", lambda m: "\n" * m[0].count("\n"), text, flags=re.MULTILINE | re.DOTALL
     )

@@ -20,7 +20,7 @@ from ghpt.data.people.persons import (
     tell_apart,
     undistort_detections,
 )
-from ghpt.data.people.tracks import Bodies, track_bodies
+from ghpt.data.people.tracks import Bodies, join_tracks, track_bodies
 from ghpt.data.points import KeyPoints
 from ghpt.data.synthetic.detector import Detector
 from ghpt.data.synthetic.people import PeopleRecording, Scene, Stay, record_people
@@ -238,6 +238,20 @@ def test_detections_of_nobody_make_nobody(detector):
     owners = [recording.owner[chosen[chosen >= 0]] for chosen in everybody(recording)]
     assert sorted(np.bincount(owner + 1).argmax() - 1 for owner in owners) == [0, 1]
     assert all((owner >= 0).mean() > 0.97 for owner in owners)
+
+
+@pytest.mark.parametrize(("straight", "count"), [(True, 1), (False, 0)])
+def test_who_walks_on_is_somebody_and_what_jumps_as_far_is_nobody(straight, count):
+    """Two views see a body that moves a quarter of a metre from frame to frame."""
+    rng = np.random.default_rng(0)
+    body = rng.uniform(-1, 1, (17, 3)) * [300, 300, 900]
+    heading = np.zeros(20) if straight else rng.uniform(0, 2 * np.pi, 20)
+    step = 250 * np.stack([np.cos(heading), np.sin(heading), 0 * heading], -1)
+    points = body + step.cumsum(0)[:, None] + rng.normal(0, 20, (20, 17, 3))
+    members = np.arange(40).reshape(20, 2)
+    bodies = Bodies(np.arange(20), points, np.ones((20, 17), bool), 0 * members - 1, BONES)
+    track = np.zeros(20, np.int64)
+    assert len(join_tracks(20, bodies, track, np.ones(20), members)) == count
 
 
 @pytest.fixture(scope="module")

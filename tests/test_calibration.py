@@ -19,6 +19,7 @@ from ghpt.geometry.cameras import Cameras
 from ghpt.geometry.rotations import matrix_to_vector, nearest_rotation, vector_to_matrix
 from ghpt.metrics.relative_pose import rotation_deg, translation_deg
 from ghpt.models.estimators.classical import person_scale
+from ghpt.models.relative_pose.scale import stature
 from rigs_with_people import calibration, people, relative
 from scenes import labelled_pairs
 
@@ -147,6 +148,16 @@ def test_the_camera_that_moved_is_told_where_the_people_determine_it():
     assert set(change.suspects(1)) == {1, 2}  # whoever is accused, the one that moved is named
     vague = replace(estimate, joint_covariance=1e6 * estimate.joint_covariance)
     assert set(RigChange.of(vague, moved).suspects(2)) == {0, 1, 2, 3}
+
+
+def test_views_that_share_no_frame_are_not_linked():
+    scene = people(frames=40)
+    turns = torch.arange(40)[:, None] % 4 == torch.arange(4)
+    apart = replace(scene, valid=scene.valid & turns[..., None])
+    estimate = apart.calibrate(CALIBRATE)
+    assert {"few_frames", "unlinked"} <= {found.code for found in estimate.findings}
+    assert not estimate.calibrated.any()
+    assert float(stature(estimate.points, estimate.estimated)) == 0
 
 
 def problem(views=3, seed=0):

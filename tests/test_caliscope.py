@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from ghpt.data.formats.key_points import read_key_points
 from ghpt.data.formats.skeletons import SKELETONS
 from ghpt.errors import GhptDataError
 from single_person import read_person
@@ -34,6 +35,23 @@ def test_rows_become_an_array_whatever_their_order(tmp_path):
     np.testing.assert_array_equal(found.valid, there)
     np.testing.assert_array_equal(found.key_points[there], pixels[there])
     assert (found.confidence == there).all()
+
+
+def test_the_columns_of_today_and_several_people(tmp_path):
+    header = "sync_index,cam_id,object_id,keypoint_id,img_loc_x,img_loc_y,obj_loc_x,obj_loc_y"
+    pixels = np.random.default_rng(0).uniform(0, 1000, (2, 3, 2, 17, 2))
+    rows = []
+    for t, v, person, k in np.ndindex(pixels.shape[:-1]):
+        if (t, v, person) != (1, 1, 0):
+            x, y = pixels[t, v, person, k].tolist()
+            rows.append(f"{t},{v},{person + 3},{k},{x!r},{y!r},,")
+    rng = np.random.default_rng(1)
+    found = read_key_points(table(tmp_path, *rng.permutation(rows), header=header), "coco_17")
+    assert found.view.tolist() == [0] * 4 + [1] * 3 + [2] * 4
+    assert found.row.tolist() == [0, 0, 1, 1, 0, 0, 1, 0, 0, 1, 1]
+    assert found.identity.tolist() == [0, 1, 0, 1, 0, 1, 1, 0, 1, 0, 1]
+    expected = pixels[found.row, found.view, found.identity]
+    np.testing.assert_array_equal(found.points.pixels, expected)
 
 
 def test_an_empty_cell_is_a_point_that_was_not_found(tmp_path):

@@ -16,6 +16,7 @@ from ghpt.data.synthetic.rigs import human36m_rig
 from ghpt.errors import GhptDataError
 from ghpt.geometry.cameras import CameraSet
 from ghpt.geometry.lens import fisheye_lens, pad_lens
+from ghpt.geometry.rotations import matrix_to_quaternion
 
 RIG = human36m_rig("S1")
 
@@ -66,6 +67,37 @@ def nested(view: int) -> dict:
     return {"intrinsics": intrinsics | lens, "extrinsic": pose.tolist()}
 
 
+def pinhole(view: int) -> dict:
+    """Single numbers, and the camera in the world."""
+    (fx, _, cx), (_, fy, cy), _ = RIG.cameras.K[view].tolist()
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = RIG.cameras.R[view], RIG.cameras.t[view] / 1000
+    lens = {"coeffs": RIG.distortion[view].tolist(), "width": 1000, "height": 1002}
+    intrinsics = {"fx": fx, "fy": fy, "ppx": cx, "ppy": cy} | lens
+    return {"color": intrinsics, "camera_to_world": np.linalg.inv(pose).tolist()}
+
+
+def quaternion(view: int) -> dict:
+    (fx, _, cx), (_, fy, cy), _ = RIG.cameras.K[view].tolist()
+    return {
+        "intrinsics": [fx, fy, cx, cy],
+        "distortion_coeffs": RIG.distortion[view].tolist(),
+        "resolution": [1000, 1002],
+        "qvec": matrix_to_quaternion(RIG.cameras.R[view]).tolist(),
+        "tvec": (RIG.cameras.t[view] / 1000).tolist(),
+    }
+
+
+def flat(view: int) -> dict:
+    return {
+        "K": RIG.cameras.K[view].tolist(),
+        "dist": RIG.distortion[view].tolist(),
+        "size": [1000, 1002],
+        "R": RIG.cameras.R[view].tolist(),
+        "t": (RIG.cameras.t[view] / 1000).tolist(),
+    }
+
+
 def check_rig(found: CameraSet, names: tuple[str, ...] = RIG.names) -> None:
     assert found.names == names
     torch.testing.assert_close(found.K, RIG.cameras.K, rtol=0, atol=1e-9)
@@ -75,21 +107,67 @@ def check_rig(found: CameraSet, names: tuple[str, ...] = RIG.names) -> None:
     assert found.size.tolist() == [[1000, 1002]] * 4
 
 
-@pytest.mark.parametrize("form", [xrmocap, to_world, nested])
+@pytest.mark.parametrize("form", [xrmocap, to_world, nested, pinhole, quaternion])
 def test_a_json_file_for_each_camera(form, tmp_path):
     for view, name in enumerate(RIG.names):
         (tmp_path / f"{name}.json").write_text(json.dumps(form(view)))
     check_rig(read_cameras(tmp_path, unit_mm=1000))
     assert not read_cameras(tmp_path).unit_known
-    with pytest.raises(GhptDataError, match=f"holds 1 camera. .*cameras={tmp_path}"):
+    with pytest.raises(GhptDataError, match=rf"holds 1 camera\. .*cameras={tmp_path}"):
         read_cameras(tmp_path / f"{RIG.names[0]}.json")
 
 
-def test_a_json_file_of_cameras_by_name(tmp_path):
-    cameras = {name: nested(view) for view, name in enumerate(RIG.names)}
+@pytest.mark.parametrize("form", [nested, pinhole, quaternion, flat])
+def test_a_json_file_of_cameras_by_name_or_in_a_list(form, tmp_path):
+    cameras = {name: form(view) for view, name in enumerate(RIG.names)}
     (tmp_path / "rig.json").write_text(json.dumps(cameras))
     check_rig(read_cameras(tmp_path / "rig.json", unit_mm=1000))
     check_rig(read_cameras(tmp_path, unit_mm=1000))
+    listed = [camera | {"name": name} for name, camera in cameras.items()]
+    for content in (listed, {"cameras": listed}):
+        (tmp_path / "rig.json").write_text(json.dumps(content))
+        check_rig(read_cameras(tmp_path / "rig.json", unit_mm=1000))
+
+
+def test_a_quaternion_of_an_unknown_order_is_named(tmp_path):
+    cameras = {name: flat(view) | {"R": [1, 0, 0, 0]} for view, name in enumerate(RIG.names)}
+    (tmp_path / "rig.json").write_text(json.dumps(cameras))
+    with pytest.raises(GhptDataError, match=r"rotation: is a quaternion.*qvec"):
+        read_cameras(tmp_path / "rig.json")
+
+
+def test_toml_of_other_fields(tmp_path):
+    lines = []
+    for view, name in enumerate(RIG.names):
+        lines += [f"[{name}]", *(f"{key} = {value}" for key, value in flat(view).items())]
+    (tmp_path / "rig.toml").write_text("\n".join(lines))
+    check_rig(read_cameras(tmp_path / "rig.toml", unit_mm=1000))
+
+
+def yml(value: list, columns: int) -> str:
+    return f"{{rows: {len(value) // columns}, cols: {columns}, data: {value}}}"
+
+
+@pytest.mark.parametrize("start", ["%YAML:1.0\n---\n", "distortion_model: plumb_bob\n"])
+def test_a_yml_file_for_each_camera(start, tmp_path):
+    for view, name in enumerate(RIG.names):
+        camera = flat(view)
+        fields = {
+            "image_width": 1000,
+            "image_height": 1002,
+            "camera_matrix": yml(np.ravel(camera["K"]).tolist(), 3),
+            "distortion_coefficients": yml(camera["dist"], 5),
+            "R": yml(np.ravel(camera["R"]).tolist(), 3),
+            "T": yml(camera["t"], 1),
+        }
+        lines = "".join(f"{key}: {value}\n" for key, value in fields.items())
+        (tmp_path / f"{name}.yml").write_text(start + lines)
+    check_rig(read_cameras(tmp_path, unit_mm=1000))
+    path = tmp_path / f"{RIG.names[0]}.yml"
+    path.write_text(path.read_text() + "distortion_model: omnidirectional\n")
+    says = "there twice" if "model" in start else "distortion_model: is 'omni"
+    with pytest.raises(GhptDataError, match=says):
+        read_cameras(tmp_path)
 
 
 def test_opencap_s_pickles_beside_each_other_or_in_folders(tmp_path):

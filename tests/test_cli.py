@@ -14,13 +14,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from hydra._internal.utils import get_args_parser
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import children
 import ghpt.commands.test as testing
 import toys
 from ghpt.commands.display import as_started, shell_override
+from ghpt.commands.overrides import flags_first, parse_options
 from ghpt.commands.train import COMMAND
+from ghpt.errors import GhptConfigError
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
@@ -262,6 +265,7 @@ def test_the_trace_is_shown_to_who_asks_for_it(conf, tmp_path):
 
 def test_values_are_typed_as_shell_and_hydra_take_them():
     assert shell_override("ckpt", "runs/1_a-2.0/last.ckpt") == "ckpt=runs/1_a-2.0/last.ckpt"
+    assert shell_override("output", "runs/a=b") == "\"output='runs/a=b'\""
     assert shell_override("ckpt", "a b/[1],x=2") == "\"ckpt='a b/[1],x=2'\""
 
 
@@ -401,15 +405,18 @@ def test_an_interrupt_while_the_data_are_prepared_leaves_nothing(tmp_path, monke
     assert files(tmp_path) == []
 
 
-@pytest.mark.parametrize("words", [("--help",), ("train", "--help")])
-def test_help_that_nobody_reads_ends_without_a_word(words):
+@pytest.mark.parametrize(
+    ("words", "status"), [(("train", "--help"), 1), (("train", "--info", "config"), 0)]
+)
+def test_what_nobody_reads_ends_without_a_word(words, status):
+    """Help breaks off; lines of a log are lost."""
     reading, writing = os.pipe()
     os.close(reading)
     program = [sys.executable, "-m", "ghpt", *words]
     environment = os.environ | {"PYTHONPATH": str(ROOT / "src")}
     ended = subprocess.run(program, stdout=writing, stderr=subprocess.PIPE, env=environment)
     os.close(writing)
-    assert (ended.returncode, ended.stderr) == (1, b"")
+    assert (ended.returncode, ended.stderr) == (status, b"")
 
 
 @pytest.mark.parametrize(
@@ -423,3 +430,10 @@ def test_commands_are_named_as_the_program_was_started(monkeypatch, program, sai
     monkeypatch.setattr(sys, "argv", [program])
     text = "Run python test.py ckpt=x; train.py wrote it, mytrain.py did not"
     assert as_started(text) == said
+
+
+def test_the_option_of_a_sweep_may_stand_anywhere():
+    words = ["data=cmu1,cmu2", "-m", "seed=1"]
+    assert flags_first(words) == ["-m", "data=cmu1,cmu2", "seed=1"]
+    with pytest.raises(GhptConfigError, match="seed=1: stands behind an option"):
+        parse_options(get_args_parser(), ["data=cmu1", "--cfg", "job", "seed=1"])

@@ -12,6 +12,7 @@ import pytest
 import ghpt
 from ghpt.paper.engine.code import (
     code_digest,
+    data_files,
     import_closure,
     imported_names,
     source_meaning,
@@ -124,6 +125,11 @@ def test_comments_docstrings_and_layout_have_no_meaning(tmp_path: Path):
     documented = '"""About."""\n\n\ndef f(x):\n    """More."""\n    # why\n    return (x\n  + 1)\n'
     assert meaning("b.py", documented) == plain
     assert meaning("c.py", "def f(x):\n    return x + 2\n") != plain
+
+
+def test_weights_that_ship_count_where_they_are_loaded():
+    file = import_closure({"ghpt.models.estimators.frame_learned"})["ghpt.models.weights"]
+    assert [path.name for path in data_files(file)] == ["joint.npz", "key_points.npz"]
 
 
 def test_classes_that_a_configuration_names_count():

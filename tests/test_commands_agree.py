@@ -51,7 +51,8 @@ def said_by_cameras(words: tuple[str, ...]) -> Said:
 
 def said_by_predict(words: tuple[str, ...], folder: Path) -> Said:
     quick = ("camera_check.clean=0.004", "evaluated_frames=40", "fitted_frames=40", "formats=[npz]")
-    result = predict(config(*words, *quick), folder)
+    estimator = "trajectory" if sizes.NIGHTLY else "frame"
+    result = predict(config(*words, *quick, f"estimator={estimator}"), folder)
     assert result is not None
     assert result.verdict is not None
     said = codes(result.verdict.findings)
@@ -131,6 +132,7 @@ CALISCOPE = ("caliscope/xy_HOLISTIC.csv", "caliscope/camera_array.toml")
 )
 def test_the_commands_agree_on_real_recordings(points, cameras, expected, shared_data, tmp_path):
     words = (f"keypoints={shared_data / points}", f"cameras={shared_data / cameras}", "rate_hz=30")
+    words = (*words, "camera_check.frames=32", "camera_check.shift=12")
     assert said_by_cameras(words) == expected
     assert said_by_calibrate(words) == expected
     assert said_by_predict(words, tmp_path / "out") == expected

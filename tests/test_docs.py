@@ -2,6 +2,7 @@
 
 import argparse
 import importlib.util
+import os
 import re
 import runpy
 import shutil
@@ -41,9 +42,14 @@ SMALL = {
         "trainer.max_epochs=1",
     ),
     "test.py": (*QUICK, "data.stride=40", "trajectory=null"),
-    "predict.py": (*QUICK, "evaluated_frames=8", "camera_check.clean=1.0"),
+    "predict.py": (*QUICK, "evaluated_frames=8", "fitted_frames=40", "camera_check.clean=1.0"),
     "cameras.py": ("camera_check.frames=16", "camera_check.shift=2"),
-    "calibrate.py": ("evaluated_frames=8", "calibration.frames=40"),
+    "calibrate.py": (
+        "evaluated_frames=8",
+        "calibration.frames=40",
+        "camera_check.frames=16",
+        "camera_check.shift=2",
+    ),
 }
 """What makes a command quick, where it does not say otherwise itself."""
 SMALL_PAIRS = ("model.problem.draws=1", "model.problem.frames=20")
@@ -61,7 +67,7 @@ PLACEHOLDERS = {
 }
 
 
-OWN_SCORERS = {"model=attending"}
+OWN_SCORERS = {"model=attending", "scorer@model.scorer=residual"}
 """Models whose scorer has no layers to be made small."""
 SLOW = {"data=people", "data=random"}
 """Data sets that no override makes small; tests of their own run a part of them."""
@@ -256,8 +262,26 @@ def has_own_code(page: Path) -> bool:
     return any(re.match(r"# \S+\.(py|yaml)\n", block.text) for block in documented.blocks(page))
 
 
+OTHER_WORK = {
+    "camera_check.clean",
+    "ckpt",
+    "compare",
+    "data.root",
+    "estimator",
+    "fill",
+    "image_size",
+    "keypoints",
+    "logger",
+    "more_keypoints",
+    "resume",
+    "spoil",
+    "time",
+}
+"""Settings with which a command does other work; what others change is tested elsewhere."""
+
+
 def sort_of(command: Command) -> tuple[object, ...]:
-    """Return what commands that do alike share: script, sweep and the settings that are named.
+    """Return what commands that do alike share: script, sweep and which of `OTHER_WORK` is named.
 
     At night every command is of a sort of its own, and so are those of pages with code.
     """
@@ -265,7 +289,7 @@ def sort_of(command: Command) -> tuple[object, ...]:
         return command.words
     if "-m" in command.words:
         return (command.script, "-m")
-    named = {word.split("=")[0] for word in command.words[2:]} - {"output", "data"}
+    named = {word.split("=")[0] for word in command.words[2:]} & OTHER_WORK
     return (command.script, frozenset(named), "model=camera" in command.words)
 
 
@@ -283,8 +307,11 @@ def wanted(command: Command, page: Path) -> bool:
         (word.split("=")[1].rstrip("/") for word in command.words if word.startswith("output=")),
         None,
     )
+    if documented.is_notebook(page):  # its cells follow from each other
+        return output not in LAID_OUT
     again = output and any(
-        f"={output}/" in " ".join(later.words) and wanted(later, page)
+        any(f"={output}/" in word for word in later.words if not word.startswith("output="))
+        and wanted(later, page)
         for later in commands(page)
         if later.line > command.line
     )
@@ -313,13 +340,17 @@ def test_the_commands_and_the_code_of_a_page_run(
     monkeypatch.setenv("COLUMNS", "120")
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
-    shutil.copytree(workplace, tmp_path, dirs_exist_ok=True)
+    shutil.copytree(workplace, tmp_path, copy_function=os.link, dirs_exist_ok=True)
     runner = Page(tmp_path, typed, monkeypatch)
+    if documented.is_notebook(page):
+        lay_out(runner, models)
     for block in documented.blocks(page):
         if not block.language:
             commands_in_it = re.findall(r"^python ", block.text, re.MULTILINE)
             assert commands_in_it == [], f"{page}:{block.line}: bash?"
         if block.language in ("python", "yaml"):
+            if any(output in block.text for output in LAID_OUT):
+                lay_out(runner, models)
             runner.execute(block)
         elif block.language == "bash":
             for command in documented.commands_of(block):

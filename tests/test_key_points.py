@@ -3,6 +3,7 @@ calibration.
 """
 
 import json
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -254,3 +255,14 @@ def test_a_damaged_json_is_read_or_named(tmp_path):
         "read",
         "named",
     }
+
+
+@pytest.mark.parametrize(
+    ("member", "says"),
+    [("[Content_Types].xml", "is a spreadsheet"), ("cam1/0.json", "is an archive of files")],
+)
+def test_an_archive_of_something_else_is_named(member, says, tmp_path):
+    with zipfile.ZipFile(tmp_path / "points.zip", "w") as archive:
+        archive.writestr(member, "{}")
+    with pytest.raises(GhptDataError, match=says):
+        read_key_points(tmp_path / "points.zip")

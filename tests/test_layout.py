@@ -1,5 +1,6 @@
 """Which file is which view and frame: the layouts that people have on their disks."""
 
+import unicodedata
 from pathlib import Path, PurePath
 
 import numpy as np
@@ -181,3 +182,9 @@ def test_many_files_are_arranged_in_little_time():
     views = arrange_frames(ROOT, names)
     assert [len(view.files) for view in views] == [500] * 8
     np.testing.assert_array_equal(list(views[3].files.values()), np.arange(1500, 2000))
+
+
+def test_accents_that_macos_stores_apart_are_letters():
+    apart = unicodedata.normalize("NFD", "Türseite")
+    assert list(frames("{cam}/{n}.json", cameras=(apart, "vorn"))) == ["Türseite", "vorn"]
+    assert list(recordings("{cam}.json", cameras=(apart, "vorn"))) == ["Türseite", "vorn"]

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import yaml
 
+from composed import compose
 from ghpt.commands.people import PeopleResult, test_people
 from ghpt.config import build
 from ghpt.data.datasets.people import People
@@ -43,7 +44,9 @@ def settings(pytestconfig, **changed):
 def result(pytestconfig, tmp_path_factory) -> tuple[PeopleResult, dict]:
     output = tmp_path_factory.mktemp("people")
     data = settings(pytestconfig)
-    found = test_people(data, LINEAR, {"enable_model_summary": False}, None, 0, False, output)
+    trajectory = compose("test")["trajectory"]
+    trainer = {"enable_model_summary": False}
+    found = test_people(data, LINEAR, trajectory, trainer, None, 0, False, output)
     assert (output / "report.md").exists()
     return found, json.loads((output / "metrics.json").read_text())
 
@@ -57,6 +60,13 @@ def test_two_people_are_found_followed_and_placed(result):
     assert scores.idf1 == pytest.approx(100, abs=2)
     assert scores.mpjpe < 60
     assert written["estimators"]["linear"] == scores.plain()
+
+
+def test_the_trajectory_places_limbs_that_one_view_sees(result):
+    """It is what the terminal shows of each scene."""
+    found, _ = result
+    assert found.headline == "trajectory"
+    assert found.scores["trajectory"].pcp > found.scores["linear"].pcp
 
 
 def test_a_recording_is_of_its_scene_and_seed_alone(pytestconfig):
@@ -94,7 +104,7 @@ def test_bad_scenes_are_named(changed, words, pytestconfig):
 
 def test_a_checkpoint_is_refused(pytestconfig, tmp_path):
     with pytest.raises(GhptConfigError, match="ckpt"):
-        test_people(settings(pytestconfig), LINEAR, {}, "last.ckpt", 0, False, tmp_path)
+        test_people(settings(pytestconfig), LINEAR, None, {}, "last.ckpt", 0, False, tmp_path)
 
 
 def test_nothing_is_trained_on_people(pytestconfig):

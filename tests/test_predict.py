@@ -436,6 +436,7 @@ def test_a_recording_of_a_data_set_is_a_demonstration(tmp_path, monkeypatch):
         )
 
 
+@pytest.mark.skipif(not sizes.NIGHTLY, reason="test_commands_agree.py predicts it by day")
 def test_a_recording_of_openpose_is_predicted(shared_data, tmp_path):
     """Pose2Sim's demo: figures of docs/recordings.md."""
     one = shared_data / "pose2sim_single"
@@ -453,7 +454,7 @@ def test_a_recording_of_openpose_is_predicted(shared_data, tmp_path):
     assert next(iter(numbers["evaluation"]["estimators"].values()))["held_out"]["median"] < 40
 
 
-@pytest.mark.skipif(not sizes.NIGHTLY, reason="Pose2Sim's demo is predicted; this one at night")
+@pytest.mark.skipif(not sizes.NIGHTLY, reason="Pose2Sim's demo is predicted by day")
 def test_a_recording_of_mediapipe_is_predicted(shared_data, tmp_path):
     two = shared_data / "caliscope"
     numbers = numbers_of(

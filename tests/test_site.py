@@ -1,6 +1,7 @@
 """The documentation's site builds, fetches nothing, and has every page and every public module."""
 
 import importlib.util
+import json
 import re
 import subprocess
 import sys
@@ -8,7 +9,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from documented import PAGES, ROOT
+from documented import PAGES, ROOT, text_of
 from sizes import NIGHTLY
 
 
@@ -57,11 +58,27 @@ def test_every_entry_of_the_api_reference_is_on_its_page(site):
     assert sorted(set(entries()) - anchors) == []
 
 
-def entries() -> list[str]:
-    """What the pages of the API reference ask mkdocstrings for."""
+def load_hooks():
     spec = importlib.util.spec_from_file_location("hooks", ROOT / "docs" / "hooks.py")
     hooks = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(hooks)
+    return hooks
+
+
+def test_notebooks_have_no_outputs_and_are_pages_of_the_site():
+    hooks = load_hooks()
+    nav = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")
+    for path in (ROOT / "docs").glob("notebooks/*.ipynb"):
+        cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
+        assert all(cell.get("outputs", []) == [] for cell in cells)
+        page = hooks.render_notebook(path)
+        assert page.count("```") == 2 * sum(cell["cell_type"] == "code" for cell in cells)
+        assert f"notebooks/{path.stem}.md" in nav
+
+
+def entries() -> list[str]:
+    """What the pages of the API reference ask mkdocstrings for."""
+    hooks = load_hooks()
     pages = [page.read_text(encoding="utf-8") for page in (ROOT / "docs" / "api").glob("*.md")]
     markdown = "\n".join(map(hooks.on_page_markdown, pages))
     return re.findall(r"^::: (\S+)$", markdown, re.MULTILINE)
@@ -81,5 +98,5 @@ def test_every_public_module_is_in_the_api_reference():
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_between_files_are_right_on_github(page):
-    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", page.read_text())
+    links = re.findall(r"\]\(([^)#]+)(?:#[^)]*)?\)", text_of(page))
     assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []

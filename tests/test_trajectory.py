@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+import sizes
 from ghpt.api import default_settings
 from ghpt.commands.prediction.estimator import build_estimator
 from ghpt.data.synthetic.recordings import draw_motion
@@ -70,8 +71,14 @@ def predictor():
 
 
 @pytest.fixture(scope="module")
-def result(predictor, batch):
-    return predict(predictor, Source(batch))
+def fitted(predictor, batch):
+    """Return the predictor that has learned what the whole recording says."""
+    return predictor.fit(Source(batch), 600)
+
+
+@pytest.fixture(scope="module")
+def result(fitted, batch):
+    return predict_rows(fitted, Source(batch))
 
 
 class Source:
@@ -86,11 +93,8 @@ class Source:
         return self.batch.rows(torch.from_numpy(np.asarray(rows)))
 
 
-def predict(predictor, source, rows=None, windows=None):
-    fitted = predictor.fit(source, 600)
-    if windows is not None:
-        fitted = replace(fitted, windows=windows)
-    return predict_rows(fitted, source, rows)
+def predict(predictor, source):
+    return predict_rows(predictor.fit(source, 600), source)
 
 
 def predict_rows(fitted, source, rows=None):
@@ -129,27 +133,28 @@ def test_true_positions_are_within_the_ellipsoids(result, truth):
     assert shares[1] > 0.75
 
 
-@pytest.mark.parametrize("shards", [3, 11])
-def test_any_shards_give_the_same_bytes(predictor, batch, shards):
+@pytest.mark.parametrize("shards", sizes.representatives([3], [11]))
+def test_any_shards_give_the_same_bytes(fitted, batch, shards):
     source = Source(batch)
-    fitted = replace(predictor.fit(source, 600), windows=Windows(length=50, overlap=25))
-    whole = predict_rows(fitted, source)
+    windowed = replace(fitted, windows=Windows(length=50, overlap=25))
+    whole = predict_rows(windowed, source)
     rows = np.array_split(np.arange(FRAMES), shards)
-    parts = [predict_rows(fitted, source, some) for some in rows]
+    parts = [predict_rows(windowed, source, some) for some in rows]
     points = torch.cat([part.points for part in parts])
     assert torch.equal(points, whole.points)
     assert torch.equal(torch.cat([part.state for part in parts]), whole.state)
 
 
-def test_the_border_of_a_window_does_not_show(predictor, batch, result):
-    windowed = predict(predictor, Source(batch), windows=Windows(length=40, overlap=50))
+def test_the_border_of_a_window_does_not_show(fitted, batch, result):
+    narrow = replace(fitted, windows=Windows(length=40, overlap=50))
+    windowed = predict_rows(narrow, Source(batch))
     assert float((windowed.points - result.points).norm(dim=-1).max()) < 0.05
 
 
-def test_one_view_supports_a_joint_that_is_observed_near_by(predictor, batch, truth):
+def test_one_view_supports_a_joint_that_is_observed_near_by(fitted, batch, truth):
     wrist = JOINT["right_wrist"]
     gap = range(60, 72)
-    part = predict(predictor, Source(hide(batch, gap, wrist, (1, 2, 3))))
+    part = predict_rows(fitted, Source(hide(batch, gap, wrist, (1, 2, 3))))
     states = part.state[list(gap), wrist]
     assert (states == State.SUPPORTED).all()
     assert part.views[list(gap), :, wrist].sum(-1).tolist() == [1] * len(gap)
@@ -159,11 +164,11 @@ def test_one_view_supports_a_joint_that_is_observed_near_by(predictor, batch, tr
     assert within > 1.5 * before
 
 
-def test_what_one_view_sees_for_long_is_as_uncertain_as_it_is_wrong(predictor, batch, truth):
+def test_what_one_view_sees_for_long_is_as_uncertain_as_it_is_wrong(fitted, batch, truth):
     """A bone fits at two depths along a ray, and an estimate that nothing contradicts is smooth."""
     gap = slice(30, 78)
     hidden = hide(batch, range(30, 78), slice(None), (1, 2, 3))
-    part = predict(predictor, Source(hidden))
+    part = predict_rows(fitted, Source(hidden))
     carried = part.state[gap] == State.SUPPORTED
     assert carried.float().mean() > 0.95
     variance = part.covariance[gap][carried][:, [0, 3, 5]].double()
@@ -172,7 +177,7 @@ def test_what_one_view_sees_for_long_is_as_uncertain_as_it_is_wrong(predictor, b
     assert (offset.norm(dim=-1) / variance.sum(-1).sqrt()).max() < 7
 
 
-def test_what_a_detector_guesses_with_little_confidence_spoils_nothing(predictor, batch, truth):
+def test_what_a_detector_guesses_with_little_confidence_spoils_nothing(fitted, batch, truth):
     """Half of the views take an arm for another, at first these, then those."""
     arm = [JOINT["left_elbow"], JOINT["left_wrist"]]
     key_points = batch.key_points.clone()
@@ -183,34 +188,34 @@ def test_what_a_detector_guesses_with_little_confidence_spoils_nothing(predictor
             key_points[frames, view, arm] += torch.tensor([120.0, 40.0])
             confidence[frames, view, arm] = 0.1
     guessed = replace(batch, key_points=key_points, confidence=confidence)
-    found = predict(predictor, Source(guessed))
+    found = predict_rows(fitted, Source(guessed))
     seen = batch.valid & (confidence > 0.5)
     assert error(found, truth, arm) < 2 * error(
-        predict(predictor, Source(replace(batch, valid=seen))), truth, arm
+        predict_rows(fitted, Source(replace(batch, valid=seen))), truth, arm
     )
 
 
-def test_what_no_view_sees_is_missing(predictor, batch):
+def test_what_no_view_sees_is_missing(fitted, batch):
     wrist = JOINT["right_wrist"]
     gap = list(range(60, 72))
-    part = predict(predictor, Source(hide(batch, gap, wrist, range(4))))
+    part = predict_rows(fitted, Source(hide(batch, gap, wrist, range(4))))
     assert (part.state[gap, wrist] == State.FEW_VIEWS).all()
     assert (part.state[:, JOINT["left_wrist"]] == State.OBSERVED).all()
 
 
-def test_one_view_far_from_an_observation_supports_nothing(predictor, batch):
+def test_one_view_far_from_an_observation_supports_nothing(fitted, batch):
     ankle = JOINT["left_ankle"]
-    part = predict(predictor, Source(hide(batch, range(40, 130), ankle, (0, 1, 2))))
+    part = predict_rows(fitted, Source(hide(batch, range(40, 130), ankle, (0, 1, 2))))
     reach = 25  # half a second
     supported = part.state[:, ankle] == State.SUPPORTED
     assert not supported[40 + reach :].any()
     assert supported[40 : 40 + reach - 2].all()
 
 
-def test_sides_that_a_view_exchanges_for_a_while_are_put_right(predictor, batch, result):
+def test_sides_that_a_view_exchanges_for_a_while_are_put_right(fitted, batch, result):
     flipped = batch.key_points.clone()
     flipped[50:70, 2] = flipped[50:70, 2][:, list(MIRROR)]
-    part = predict(predictor, Source(replace(batch, key_points=flipped)))
+    part = predict_rows(fitted, Source(replace(batch, key_points=flipped)))
     found = part.flipped[:, 2]
     assert found[52:68].all()
     assert not found[:48].any()
@@ -227,7 +232,7 @@ def test_a_cut_parts_the_recording(predictor, batch):
     assert float((part.points[:65] - first.points).norm(dim=-1).mean()) < 3
 
 
-def test_a_person_who_is_suddenly_elsewhere_is_followed(predictor, batch, truth):
+def test_a_person_who_is_suddenly_elsewhere_is_followed(fitted, batch, truth):
     """The rig moves instead: a cut that frame numbers do not show."""
     offset = torch.zeros(FRAMES, 3, dtype=torch.float64)
     offset[65:, 0] = 700.0
@@ -235,14 +240,14 @@ def test_a_person_who_is_suddenly_elsewhere_is_followed(predictor, batch, truth)
     moved = Cameras(
         cameras.K, cameras.R, cameras.t - torch.einsum("tvij,tj->tvi", cameras.R, offset)
     )
-    part = predict(predictor, Source(replace(batch, cameras=moved)))
+    part = predict_rows(fitted, Source(replace(batch, cameras=moved)))
     near = slice(60, 70)
     distance = (part.points - truth - offset[:, None])[near].norm(dim=-1)
     assert (part.state[near] == State.OBSERVED).all()
     assert float(distance.mean()) < 30
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", sizes.representatives([1, 3], [2]))
 def test_a_few_frames_are_enough(predictor, batch, truth, count):
     part = predict(predictor, Source(batch.rows(slice(0, count)), rate_hz=None))
     assert (part.state == State.OBSERVED).all()
@@ -261,7 +266,7 @@ def test_nan_and_absent_people_give_no_joint(predictor, batch):
     assert (part.state[10] == State.OBSERVED).all()
 
 
-@pytest.mark.parametrize("factor", [0.05, 1000.0])
+@pytest.mark.parametrize("factor", sizes.representatives([0.05], [1000.0]))
 def test_a_body_of_any_size_is_followed(predictor, batch, result, factor):
     """A mouse, or a person before cameras of a wrong unit."""
     cameras = batch.cameras

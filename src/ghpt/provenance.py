@@ -3,6 +3,7 @@
 import platform
 import subprocess
 import sys
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,8 +24,12 @@ def provenance(seed: int) -> dict[str, str | int]:
     }
 
 
+@cache
 def commit() -> str:
-    """Return the git commit of the source tree, with + if files differ from it; '' without one."""
+    """Return the git commit of the source tree, with + if files differ from it; '' without one.
+
+    It is that of the first call in a process, which is nearest to the code that runs.
+    """
     try:
         head = _git("rev-parse", "HEAD")
         # A command that is stopped here kills git, whose lock would then stay in the user's

@@ -297,6 +297,32 @@ def camera_json(folder: Path) -> Path:
     return path
 
 
+def camera_list(folder: Path) -> Path:
+    """Of intrinsics that are single numbers, with a quaternion and the camera in the world."""
+    cameras = []
+    for view in (0, 1):
+        K = fields(view)["intrinsicMat"]
+        numbers = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        pose = np.linalg.inv(np.vstack([np.eye(3, 4, k=0), [0, 0, 0, 1]]) + view * np.eye(4, k=3))
+        rotation = [{"c2w": pose.tolist()}, {"qvec": [1, 0, 0, 0], "t": [1, 2, 3]}][view]
+        cameras.append({"name": f"cam{view}", "distortion_model": "plumb_bob"} | numbers | rotation)
+    (folder / "rig.json").write_text(json.dumps(cameras))
+    return folder / "rig.json"
+
+
+def camera_yml(folder: Path) -> Path:
+    for view in (1, 0):
+        path = folder / f"{view}.yml"
+        values = {name: np.atleast_2d(value) for name, value in fields(view).items()}
+        values.pop("imageSize")
+        lines = []
+        for name, value in values.items():
+            numbers = value.ravel().tolist()
+            lines.append(f"{name}: {{rows: {len(value)}, cols: {value.shape[1]}, data: {numbers}}}")
+        path.write_text("%YAML:1.0\n---\nimage_width: 1920\n" + "\n".join(lines) + "\n")
+    return path
+
+
 def human36m(folder: Path) -> Path:
     rig = panoptic_rig((1, 2))
     intrinsics = {
@@ -523,6 +549,8 @@ FORMATS: dict[str, Format] = {
     ),
     "opencap": Format(opencap, read_cameras, mutate_records),
     "camera_json": Format(camera_json, read_cameras, mutate_json),
+    "camera_list": Format(camera_list, read_cameras, mutate_json),
+    "camera_yml": Format(camera_yml, read_cameras, mutate_text),
     "human36m": Format(human36m, lambda folder: read_cameras(folder / "cameras.json"), mutate_json),
     "colmap": Format(colmap, lambda folder: read_cameras(folder, unit_mm=1), mutate_records),
 }

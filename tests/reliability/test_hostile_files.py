@@ -32,13 +32,15 @@ FORMATS = (
     "colmap",
     "opencap",
     "camera_json",
+    "camera_list",
+    "camera_yml",
     "deeplabcut_csv",
     "sleap_csv",
 )
 HDF5 = ("sleap", "deeplabcut", "sleap_labels")
 """Read by h5py, which is an extra."""
 GROUPS = (FORMATS[:8], FORMATS[8:13], FORMATS[13:])
-TABLES = ("caliscope", "toml", "yaml", "yolo", "deeplabcut_csv", "sleap_csv")
+TABLES = ("caliscope", "toml", "yaml", "camera_yml", "yolo", "deeplabcut_csv", "sleap_csv")
 """Cut between two lines they are whole, and shorter."""
 
 

@@ -45,12 +45,12 @@ def test_a_text_of_any_encoding_is_read_or_named(encoding, tmp_path, record_row)
 
 
 @pytest.mark.parametrize("part", [";", "\t"])
-def test_decimal_commas_are_named(part, tmp_path, record_row):
+@pytest.mark.parametrize("form", ["caliscope", "deeplabcut_csv"])
+def test_decimal_commas_are_read(part, form, tmp_path, record_row):
     """What a spreadsheet of another country makes of the table."""
-    target = hostile.caliscope(tmp_path)
-    target.write_text(target.read_text().replace(",", part).replace(".", ","))
-    with pytest.raises(
-        GhptDataError, match=r"columns that commas do not part.*commas between the columns"
-    ):
-        hostile.FORMATS["caliscope"].read(tmp_path)
-    record_row("C6", f"columns parted by {part!r}, decimal commas: named", 1, 1)
+    target = hostile.FORMATS[form].write(tmp_path)
+    whole = hostile.FORMATS[form].read(tmp_path)
+    text = target.read_text().replace(",", "|").replace(".", ",").replace("|", part)
+    target.write_text(text)
+    assert hostile.same(hostile.FORMATS[form].read(tmp_path), whole)
+    record_row("C6", f"{form}, columns parted by {part!r}, decimal commas: as it was", 1, 1)

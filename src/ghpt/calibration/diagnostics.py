@@ -310,7 +310,7 @@ def _needed(evidence: Evidence, wanted: float) -> str:
     frames = evidence.frames_for(wanted)
     if frames is None:
         return f"however many frames like these leave ± {evidence.least_sd_deg:.1f}"
-    return f"± {wanted:g} takes about {frames} frames like these, and fewer of more motion"
+    return f"± {wanted:g} takes about {frames} frames like these"
 
 
 def _extent(pixels: Float[Tensor, "N 2"]) -> Float[Tensor, " 2"]:

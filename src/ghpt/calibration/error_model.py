@@ -31,6 +31,12 @@ of OpenPose and BlazePose on one recording.
 """
 _SIDE_DEGREES = 30.0
 """Turn of the body within which what depends on the side seen is forgotten (the same file)."""
+_LASTING = 0.8
+"""The variance of the errors that last, units of noise, which the ± of people who stand need: found
+with synthetic ones who wait, pose and give directions (scripts/rig_uncertainty_table.py).
+"""
+_KNOWN_AS = 2.0
+"""How much that counts: as so many moments of the residuals."""
 _WAVES = 32
 """Of a random function of the side seen."""
 _SECTORS = 12
@@ -171,12 +177,20 @@ class ErrorModel:
         return torch.tensordot(self.mixing, own, dims=1)
 
 
-def variances(seen: Float[Tensor, " M"], of_kinds: Float[Tensor, "M K"]) -> Float[Tensor, " K"]:
+def variances(
+    seen: Float[Tensor, " M"], of_kinds: Float[Tensor, "M K"], lasts: Bool[Tensor, " K"]
+) -> Float[Tensor, " K"]:
     """Return the variances >= 0 of the kinds whose moments together are nearest to the seen ones,
     relative to these.
+
+    ``lasts``: the kinds that last. Of people who do not turn residuals hardly show them, so their
+    sum is drawn to what it is of detectors in the field.
     """
     weight = 1.0 / seen.clamp(min=1e-12)
-    found, _ = nnls((of_kinds * weight[:, None]).numpy(), (seen * weight).numpy())
+    known = _KNOWN_AS * lasts.double()[None] / _LASTING
+    design = torch.cat((of_kinds * weight[:, None], known))
+    wanted = torch.cat((seen * weight, torch.full((1,), _KNOWN_AS, dtype=seen.dtype)))
+    found, _ = nnls(design.numpy(), wanted.numpy())
     return torch.from_numpy(found)
 
 

@@ -1,9 +1,9 @@
 """Focal lengths that nobody gave, from the people in view: one robust bundle adjustment over them,
 the extrinsics and the points, and what it is worth.
 
-The principal point stays at the image's centre. Views see pixels of a first guess of the focal
-length, ``u = (pixel - principal point) / f0``, and the model is ``u = f / f0 (1 + k1 s) p`` with
-``p = (x, y) / z`` in the camera and ``s = |p|^2``.
+Views see pixels of a first guess of the focal length, ``u = (pixel - image's centre) / f0``, and
+the model is ``u = f / f0 (1 + k1 s) p + c`` with ``p = (x, y) / z`` in the camera, ``s = |p|^2``
+and the principal point ``c``, which is known beforehand to lie near 0.
 """
 
 from __future__ import annotations
@@ -75,6 +75,8 @@ class Lenses:
     log_ratio: Float[Tensor, " V"]
     """Of f to f0."""
     k1: Float[Tensor, " V"]
+    c: Float[Tensor, "V 2"]
+    """The principal points, u."""
 
 
 @dataclass(frozen=True)
@@ -97,8 +99,9 @@ class FocalAdjustment:
     ``loss_scale``: of the Cauchy loss, in standard deviations of the key points. ``rounds``:
     adjustments, each with the noise that the one before has shown. ``iterations``: most steps of a
     round. ``draws``: of each kind of error, for the uncertainty. ``principal_point``: what the
-    principal points of all cameras may be off by alike, in the longer side of the image; it adds to
-    the uncertainty.
+    principal points of all cameras may be off by alike, in the longer side of the image; they are
+    estimated with that as prior knowledge, which counts ``prior_weight`` times because key points
+    are not as independent as their weights say.
     """
 
     loss_scale: float
@@ -106,6 +109,7 @@ class FocalAdjustment:
     iterations: int
     draws: int
     principal_point: float
+    prior_weight: float
 
     def __post_init__(self) -> None:
         check_positive(**vars(self))
@@ -121,12 +125,13 @@ class FocalAdjustment:
     ) -> FocalEstimate:
         """Return the focal lengths of all views; ``centre_std``: of their principal points, u."""
         chosen = _selection(len(seen.u), focal, with_k1)
+        prior = _prior(centre_std, self.prior_weight)
         noise = torch.ones(len(seen.u), dtype=torch.float64)
         state = start
         for _ in range(self.rounds):
             noise = self._noise(seen, state)
-            state = self._minimise(seen, state, noise, chosen)
-        std = self._std(seen, state, noise, chosen, centre_std)
+            state = self._minimise(seen, state, noise, chosen, prior)
+        std = self._std(seen, state, noise, chosen, centre_std, prior)
         return FocalEstimate(state.log_ratio.exp(), std, state.k1, state)
 
     def _noise(self, seen: View3D, state: Lenses) -> Float[Tensor, " V"]:
@@ -134,11 +139,19 @@ class FocalAdjustment:
         length = torch.where(front, residual.norm(dim=-1), torch.nan)
         return (length.nanmedian(-1).values / _SPREAD).nan_to_num(1.0).clamp(min=_LEAST)
 
-    def _cost(self, seen: View3D, state: Lenses, noise: Float[Tensor, " V"]) -> float:
+    def _cost(
+        self,
+        seen: View3D,
+        state: Lenses,
+        noise: Float[Tensor, " V"],
+        prior: Float[Tensor, "P P"],
+    ) -> float:
         residual, front = _residual(seen, state)
         square = (residual / noise[:, None, None]).square().sum(-1)
         square = torch.where(front, square, torch.where(seen.valid, 1e8, 0.0))
-        return float(torch.log1p(square / self.loss_scale**2).sum())
+        x = _prior_residual(state)
+        of_prior = x @ prior @ x / self.loss_scale**2
+        return float(torch.log1p(square / self.loss_scale**2).sum() + of_prior)
 
     def _minimise(
         self,
@@ -146,20 +159,21 @@ class FocalAdjustment:
         state: Lenses,
         noise: Float[Tensor, " V"],
         chosen: Float[Tensor, "P Q"],
+        prior: Float[Tensor, "P P"],
     ) -> Lenses:
         """Return the state of least cost near another, by Levenberg and Marquardt's steps."""
         damping = 1e-3
-        cost = self._cost(seen, state, noise)
+        cost = self._cost(seen, state, noise, prior)
         for _ in range(self.iterations):
             system = _linearise(seen, state, noise, self.loss_scale)
             matrix, gradient = system.reduce(torch.ones_like(seen.frame, dtype=torch.bool))
-            matrix = chosen.mT @ matrix @ chosen
-            gradient = chosen.mT @ gradient
+            matrix = chosen.mT @ (matrix + prior) @ chosen
+            gradient = chosen.mT @ (gradient + prior @ _prior_residual(state))
             while damping < _DAMPING[1]:
                 damped = matrix + damping * torch.diag(matrix.diagonal().clamp(min=_LEAST))
                 change = chosen @ torch.linalg.solve(damped, -gradient)
                 tried = system.step(state, change)
-                new_cost = self._cost(seen, tried, noise)
+                new_cost = self._cost(seen, tried, noise, prior)
                 if new_cost < cost:
                     break
                 damping *= 10
@@ -180,15 +194,16 @@ class FocalAdjustment:
         noise: Float[Tensor, " V"],
         chosen: Float[Tensor, "P Q"],
         centre_std: Float[Tensor, " V"],
+        prior: Float[Tensor, "P P"],
     ) -> Float[Tensor, " V"]:
         """Return relative standard deviations: what errors like the residuals do, and principal
-        points that are not at the centre.
+        points that are not where they were believed to be.
         """
         system = _linearise(seen, state, noise, self.loss_scale)
         views = len(seen.u)
         focal = torch.arange(views) * _PARAMETERS + _FOCAL
         matrix, _ = system.reduce(torch.ones_like(seen.frame, dtype=torch.bool))
-        inverse = chosen @ _inverse_of_scaled(chosen.mT @ matrix @ chosen) @ chosen.mT
+        inverse = chosen @ _inverse_of_scaled(chosen.mT @ (matrix + prior) @ chosen) @ chosen.mT
         cross = torch.einsum("vnri,vnrj->nvij", system.by_view, system.by_point).flatten(1, 2)
         length = system.residual.norm(dim=-1) / system.root.clamp(min=_LEAST)
         propagation = Propagation(
@@ -202,7 +217,7 @@ class FocalAdjustment:
         )
         steps, _ = error_steps(_error_model(seen, state, noise), propagation, self.draws)
         at_centre = torch.arange(views)[:, None] * _PARAMETERS + _CENTRE + torch.arange(2)
-        by_centre = (inverse @ matrix[:, at_centre.flatten()])[focal]
+        by_centre = (inverse @ prior[:, at_centre.flatten()])[focal]
         by_centre = by_centre * centre_std.repeat_interleave(2)
         common = by_centre.unflatten(1, (-1, 2)).sum(1)
         parts = (steps[focal], common, _OWN * by_centre)
@@ -258,7 +273,29 @@ def _selection(views: int, focal: FocalLengths, with_k1: bool) -> Float[Tensor, 
         own = eye[:, first + place]
         if is_estimated:
             columns.append(own if focal is FocalLengths.EACH else own.sum(-1, keepdim=True))
+    columns += [eye[:, first + _CENTRE], eye[:, first + _CENTRE + 1]]
     return torch.cat(columns, dim=-1)
+
+
+def _prior(centre_std: Float[Tensor, " V"], weight: float) -> Float[Tensor, "P P"]:
+    """Return the precision of what is known of the principal points beforehand, times a weight."""
+    views = len(centre_std)
+    alike = torch.ones(views, views, dtype=centre_std.dtype)
+    own = _OWN**2 * torch.eye(views, dtype=centre_std.dtype)
+    covariance = centre_std[:, None] * (alike + own) * centre_std
+    precision = weight * torch.linalg.inv(covariance)
+    prior = torch.zeros(views * _PARAMETERS, views * _PARAMETERS, dtype=centre_std.dtype)
+    for axis in (0, 1):
+        at = torch.arange(views) * _PARAMETERS + _CENTRE + axis
+        prior[at[:, None], at] = precision
+    return prior
+
+
+def _prior_residual(state: Lenses) -> Float[Tensor, " P"]:
+    """Return the parameters of all views that something is known of beforehand; 0 elsewhere."""
+    x = torch.zeros(len(state.c), _PARAMETERS, dtype=state.c.dtype)
+    x[:, _CENTRE:] = state.c
+    return x.flatten()
 
 
 def _project(
@@ -279,7 +316,7 @@ def _residual(seen: View3D, state: Lenses) -> tuple[Float[Tensor, "V N 2"], Bool
     _, p, front = _project(seen, state)
     s = p.square().sum(-1, keepdim=True)
     radial = 1 + state.k1[:, None, None] * s
-    predicted = state.log_ratio.exp()[:, None, None] * radial * p
+    predicted = state.log_ratio.exp()[:, None, None] * radial * p + state.c[:, None]
     return torch.where(front[..., None], predicted - seen.u, 0.0), front
 
 
@@ -327,6 +364,7 @@ class _System:
             points=state.points + moved,
             log_ratio=state.log_ratio + by_view[:, _FOCAL],
             k1=state.k1 + by_view[:, _K1],
+            c=state.c + by_view[:, _CENTRE:],
         )
 
 
@@ -406,7 +444,8 @@ def state_of(
 ) -> Lenses:
     """Return the state of a rig that was calibrated with the first guess."""
     nothing = torch.zeros(len(R), dtype=torch.float64)
-    return Lenses(R, camera_centre(R, t), points, nothing, nothing)
+    centre = torch.zeros(len(R), 2, dtype=torch.float64)
+    return Lenses(R, camera_centre(R, t), points, nothing, nothing, centre)
 
 
 def with_focal(K: Float[Tensor, "V 3 3"], ratio: Float[Tensor, " V"]) -> Float[Tensor, "V 3 3"]:

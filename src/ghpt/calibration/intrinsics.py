@@ -127,6 +127,7 @@ class IntrinsicsEstimation:
         distortion = cameras.distortion.clone()
         distortion[:, 0] = found.k1
         estimated = with_focal(K, found.ratio)
+        estimated[:, :2, 2] += K[:, :1, 0] * found.state.c
         text = self._text(cameras.names, estimated, found)
         errors = lens_errors(focal, found.std, centre_std / found.ratio)
         return EstimatedIntrinsics(estimated, distortion, found.std, errors, findings, text)
@@ -168,4 +169,4 @@ class IntrinsicsEstimation:
         lens = ""
         if self.k1:
             lens = f"; k1 {', '.join(f'{k1:.3f}' for k1 in found.k1.tolist())}"
-        return f"focal length, estimated: {focal}{lens}; the principal point is the image's centre"
+        return f"focal length, estimated: {focal}{lens}; principal points near the image's centre"

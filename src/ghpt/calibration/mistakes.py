@@ -276,8 +276,8 @@ IMAGE_TURNED = Mistake(
     "image_turned",
     "key points of {camera} are of images turned by {value:g} degrees (clockwise) against the "
     "calibration's",
-    "give the cameras of the turned images, which cameras.py writes, or detect again in images "
-    "that are turned back",
+    "give the cameras of the turned images, which the camera check writes, or detect again in "
+    "images that are turned back",
     undo=_turn,
     values=(90, 180, 270),
     needs_extrinsics=False,
@@ -451,7 +451,8 @@ LITTLE_MOTION = Mistake(
     "little_motion",
     "{used} frames are worth {independent:.0f} independent ones, and people turn by {turned:.0f} "
     "degrees: rotations are known to ± {value:.1f} degrees",
-    "let somebody walk through the whole volume and turn: {needed}",
+    "let somebody walk through the whole volume and turn for 20 s, which gives ± 0.5 or so: "
+    "{needed}",
     Severity.WARNING,
 )
 OUTSIDE_IMAGE = Mistake(

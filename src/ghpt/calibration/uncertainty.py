@@ -112,19 +112,22 @@ def error_steps(
 
     1. ``draws`` errors of each kind of the model, or more, are propagated to the parameters, and to
        the residuals that remain.
-    2. The variances of the kinds are those whose residuals have the moments of the true residuals.
+    2. The variances of the kinds are those whose residuals have the moments of the true residuals,
+       as far as these tell them (``variances``).
     3. Along an error the loss bends less than its weight says, which enlarges the steps.
     """
     steps = []
     moments = []
     lasts = []
+    lasting = []
     for kind in model.kinds(draws, _SEED):
         step, residual = propagation(kind.draws)
         moments.append(model.moments(residual[..., :draws], propagation.used).mean(-1))
         steps.append(step / step.shape[-1] ** 0.5)
         lasts.append(torch.full(step.shape[-1:], kind.lasts))
+        lasting.append(kind.lasts)
     seen = model.moments(propagation.residual[..., None], propagation.used)[:, 0]
-    variance = variances(seen, torch.stack(moments, dim=-1))
+    variance = variances(seen, torch.stack(moments, dim=-1), torch.tensor(lasting))
     sizes = variance.sqrt() / propagation.curvature
     scaled = [size * step for size, step in zip(sizes, steps, strict=True)]
     return torch.cat(scaled, dim=-1), torch.cat(lasts)

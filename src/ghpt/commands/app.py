@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 import __main__
 import ghpt
 from ghpt.commands.catalogue import load
-from ghpt.commands.display import as_started, until_reader_leaves
+from ghpt.commands.display import as_started, name_as_started, until_reader_leaves
 from ghpt.commands.jobs import (
     Job,
     Program,
@@ -45,7 +45,9 @@ from ghpt.commands.overrides import (
     check_overrides,
     compose,
     expand_home,
+    flags_first,
     parse_options,
+    put_options_first,
     rename_settings,
     spread_seeds,
 )
@@ -135,13 +137,14 @@ def _run(
 ) -> None:
     """Do what the command line asks for; jobs that end are added to ``ended``."""
     name = command if isinstance(command, str) else command.name
-    sys.argv[1:] = expand_home(rename_settings(sys.argv[1:]))
+    sys.argv[1:] = flags_first(expand_home(rename_settings(sys.argv[1:])))
     if name == "reproduce":
         sys.argv[1:] = spread_seeds(sys.argv[1:])
     if "--version" in sys.argv:
         print(f"ghpt {ghpt.__version__}")
         return
     arguments = parse_options(get_args_parser(), sys.argv[1:])
+    sys.argv[1:] = put_options_first(sys.argv[1:], arguments.overrides)
     check_search(arguments.overrides, bool(arguments.multirun))
     source = _source(conf, name, arguments)
     sweep = bool(arguments.multirun)
@@ -364,6 +367,8 @@ def _records(config: Any, output: Path) -> Iterator[None]:
     handler = logging.FileHandler(output / f"{hydra_config.job.name}.log", encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logging.root.addHandler(handler)
+    for each in logging.root.handlers:
+        each.addFilter(name_as_started)
     try:
         yield
     finally:

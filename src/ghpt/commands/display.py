@@ -1,5 +1,6 @@
 """How paths, settings and commands are said, so that a reader can type them."""
 
+import logging
 import os
 import re
 import sys
@@ -15,12 +16,16 @@ _SCRIPTS = re.compile(
 @contextmanager
 def until_reader_leaves() -> Iterator[None]:
     """End the program with status 1, and without a word, when nobody reads its output any more."""
+    said = logging.raiseExceptions
+    logging.raiseExceptions = False  # a line of the log that nobody reads would print a trace
     try:
         yield
         sys.stdout.flush()
     except BrokenPipeError:  # as `head` does when it has its lines
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(1)
+    finally:
+        logging.raiseExceptions = said
 
 
 def as_started(text: str) -> str:
@@ -31,6 +36,13 @@ def as_started(text: str) -> str:
     return _SCRIPTS.sub(r"ghpt \1", text) if sys.argv[0].startswith("ghpt ") else text
 
 
+def name_as_started(record: logging.LogRecord) -> bool:
+    """Apply `as_started` to a line of the log. Returns True: it is a filter that keeps all."""
+    record.msg = as_started(record.getMessage())
+    record.args = ()
+    return True
+
+
 def display_path(path: Path) -> str:
     """Return a path as short as it can be typed here."""
     relative = os.path.relpath(path)
@@ -39,5 +51,5 @@ def display_path(path: Path) -> str:
 
 def shell_override(key: str, value: object) -> str:
     """Return ``key=value`` as a shell and Hydra's grammar take it."""
-    text = f"{key}={value}"
-    return text if re.fullmatch(r"[\w=./+-]+", text) else f"\"{key}='{value}'\""
+    plain = re.fullmatch(r"[\w./+-]+", str(value))
+    return f"{key}={value}" if plain else f"\"{key}='{value}'\""

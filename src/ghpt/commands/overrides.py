@@ -146,14 +146,23 @@ def expand_home(words: Sequence[str]) -> list[str]:
     return expanded
 
 
+def flags_first(words: Sequence[str]) -> list[str]:
+    """Return the words with ``-m`` ahead: Hydra takes no setting that stands behind an option."""
+    flags = [word for word in words if word in _SWEEP]
+    return [*flags, *(word for word in words if word not in _SWEEP)]
+
+
 def parse_options(parser: argparse.ArgumentParser, words: Sequence[str]) -> argparse.Namespace:
-    """Return the options of a command line.
+    """Return the options of a command line, which may stand between settings.
 
     Raises GhptConfigError for one that Hydra does not have: a setting with dashes before it.
     """
-    arguments, unknown = parser.parse_known_args(words)
+    arguments, unknown = parser.parse_known_intermixed_args(words)
     for word in unknown:
         name, _, value = word.lstrip("-").partition("=")
+        if not word.startswith("-"):
+            hint = f"Put the options that begin with dashes before the settings: ... {word}"
+            raise GhptConfigError(word, "stands behind an option", hint)
         following = [*words[list(words).index(word) + 1 :], "..."][0]
         hint = f"Settings have no dashes: {name}={value or following}. --help shows all."
         raise GhptConfigError(word, "is no option", hint)
@@ -166,6 +175,14 @@ def _parse_all(words: Sequence[str], sweep: bool) -> list[Override]:
         for override in overrides:
             _check_single(override)
     return overrides
+
+
+def put_options_first(words: Sequence[str], overrides: Sequence[str]) -> list[str]:
+    """Return a command line whose settings stand behind its options, as Hydra wants them."""
+    options = list(words)
+    for override in overrides:
+        options.remove(override)
+    return [*options, *overrides]
 
 
 def _check_single(override: Override) -> None:
@@ -186,7 +203,9 @@ def _parse(word: str) -> Override:
     except HydraException:
         key, equals, value = word.partition("=")
         hint = "Such as data=cmu2 or 'data.cameras=[1,2]'; --help shows all settings."
-        if equals:
+        if equals and value.count("[") != value.count("]"):
+            hint = f"Write a list without spaces: {key}=[first,second]."
+        elif equals:
             hint = f"Quote the value: {shell_override(key, value)}."
         elif re.fullmatch(r"[A-Za-z_.]+", word):
             hint = f"Write {word}=VALUE. {hint}"

@@ -1,6 +1,6 @@
 """Testing on several people: told apart, triangulated and followed, beside the truth.
 
-The test needs no checkpoint: the estimators are the classical ones.
+The test needs no checkpoint: the estimators are the classical ones and the trajectory.
 """
 
 from __future__ import annotations
@@ -17,15 +17,16 @@ from ghpt.data.datasets.people import People
 from ghpt.errors import GhptConfigError, check
 from ghpt.extras import build_installed
 from ghpt.files import write_json
-from ghpt.models.people import PeopleScores, PeopleTriangulation, SceneScores
+from ghpt.models.estimators.trajectory.tested import TestedTrajectory
+from ghpt.models.people import TRAJECTORY, PeopleScores, PeopleTriangulation, SceneScores
 from ghpt.provenance import provenance
 from ghpt.report.markdown import write_markdown
 from ghpt.report.people import people_document, people_summary
 from ghpt.report.terminal import print_document
 
 _DATA = f"{People.__module__}.{People.__qualname__}"
-_HEADLINE = "adaptive_ransac"
-"""The estimator of `predict.py` without a checkpoint."""
+_OF_FRAMES = "adaptive_ransac"
+"""The estimator that is shown for each scene where the trajectory is left out."""
 _log = logging.getLogger(__name__)
 
 
@@ -41,7 +42,8 @@ class PeopleResult:
     @property
     def headline(self) -> str:
         """The name of the estimator that is shown for each scene."""
-        return _HEADLINE if _HEADLINE in self.scores else next(iter(self.scores))
+        wanted = [name for name in (TRAJECTORY, _OF_FRAMES) if name in self.scores]
+        return next(iter([*wanted, *self.scores]))
 
     @property
     def words(self) -> str:
@@ -76,6 +78,7 @@ def is_of_people(data: Target) -> bool:
 def test_people(
     data: Target,
     baselines: Target,
+    trajectory: Target | None,
     trainer: Target,
     ckpt: str | None,
     seed: int,
@@ -84,6 +87,7 @@ def test_people(
 ) -> PeopleResult:
     """Tell the people of each recording apart, triangulate them and compare them with the truth.
 
+    ``trajectory``: of each person's frames together; None: the ``baselines`` alone.
     Writes metrics.json and report.md into ``output`` and prints the tables.
     """
     if ckpt:
@@ -92,7 +96,8 @@ def test_people(
     check(len(baselines) > 0, "baselines", "is empty", "Leave one in.")
     estimators = build_installed(baselines, "baselines")
     recordings = build(data, "data")
-    module = PeopleTriangulation(estimators)
+    tested: TestedTrajectory | None = build(trajectory, "trajectory") if trajectory else None
+    module = PeopleTriangulation(estimators, tested.trajectory if tested else None)
     run = make_trainer(
         {**trainer, "accelerator": "cpu", "devices": 1},
         default_root_dir=output,

@@ -91,6 +91,7 @@ def test(settings: TestSettings, output: Path) -> TestResult | PeopleResult | No
         return test_people(
             settings.data,
             settings.baselines,
+            settings.trajectory,
             settings.trainer,
             settings.ckpt,
             settings.seed,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 
 import lightning as L
@@ -12,8 +12,13 @@ from ghpt.data.people.persons import Chosen, tell_apart
 from ghpt.data.synthetic.people import PeopleRecording
 from ghpt.metrics.people import PeopleError, Tracking
 from ghpt.models.estimators.classical import Estimator
+from ghpt.models.estimators.predictors import remove_outliers
+from ghpt.models.estimators.trajectory.estimator import Trajectory
 from ghpt.observations import Observations, PoseEstimate, Truth
 
+TRAJECTORY = "trajectory"
+"""The estimator of `predict.py`, by its name in the tables."""
+Estimate = Callable[[Observations], PoseEstimate]
 RECALL_MM = 150.0
 """Mean joint distance within which a person is recalled."""
 TRACKING_MM = 500.0
@@ -79,15 +84,19 @@ class _Scores:
 
 
 class PeopleTriangulation(L.LightningModule):
-    """Tests classical estimators on whole recordings of several people.
+    """Tests classical estimators, and the trajectory, on whole recordings of several people.
 
     A person-frame counts where two views or more detected the person.
     """
 
-    def __init__(self, estimators: Mapping[str, Estimator]) -> None:
+    def __init__(
+        self, estimators: Mapping[str, Estimator], trajectory: Trajectory | None = None
+    ) -> None:
         super().__init__()
         self.estimators = dict(estimators)
-        self.total = {name: _Scores() for name in estimators}
+        self.trajectory = trajectory
+        names = [*estimators] if trajectory is None else [TRAJECTORY, *estimators]
+        self.total = {name: _Scores() for name in names}
         self.scenes: list[SceneScores] = []
 
     def test_step(self, recording: PeopleRecording, index: int) -> None:
@@ -98,8 +107,11 @@ class PeopleTriangulation(L.LightningModule):
         points = torch.from_numpy(recording.truth)
         truth = Truth(points, visible[..., None].expand(points.shape[:-1]))
         scores = {}
-        for name, estimator in self.estimators.items():
-            estimate = estimate_people(recording, persons, estimator)
+        estimators: dict[str, Estimate] = dict(self.estimators)
+        if self.trajectory is not None:
+            estimators[TRAJECTORY] = _through_time(self.trajectory, recording)
+        for name in self.total:
+            estimate = estimate_people(recording, persons, estimators[name])
             own = _Scores()
             for each in (own, self.total[name]):
                 each.update(estimate, truth)
@@ -113,8 +125,19 @@ class PeopleTriangulation(L.LightningModule):
         return {name: total.compute() for name, total in self.total.items()}
 
 
+def _through_time(trajectory: Trajectory, recording: PeopleRecording) -> Estimate:
+    """Return what estimates one person's poses in all frames together."""
+
+    def estimate(batch: Observations) -> PoseEstimate:
+        clean = remove_outliers(batch)[0]
+        timed = trajectory.at_rate(clean, recording.detections.rate_hz)
+        return timed.fit_to(clean)(clean)
+
+    return estimate
+
+
 def estimate_people(
-    recording: PeopleRecording, persons: list[Chosen], estimator: Estimator
+    recording: PeopleRecording, persons: list[Chosen], estimator: Estimate
 ) -> PoseEstimate:
     """Return the poses [T E J] of the persons that were told apart."""
     frames = len(recording)

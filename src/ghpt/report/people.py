@@ -22,8 +22,9 @@ def people_document(
     """Return the report."""
     text = (
         "Synthetic people before cameras of Panoptic Studio. They are told apart, and each person "
-        "is triangulated by a classical estimator. A person-frame counts where two views or more "
-        "detected the person; a limb with an end that fewer detected counts as wrong."
+        "is triangulated by a classical estimator, or followed by the trajectory of all frames. A "
+        "person-frame counts where two views or more detected the person; a limb with an end that "
+        "the estimator does not give counts as wrong."
     )
     blocks: list[Block] = [Paragraph(text), *_tables(scenes, scores, headline)]
     for scene in scenes:

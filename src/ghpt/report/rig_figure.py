@@ -30,6 +30,8 @@ _PANELS = {"from above": (0, 1), "from the side": (0, 2)}
 _NAMED = "from above"
 """Where cameras do not hide each other."""
 _SKELETONS = 6
+_DOTS = 300
+"""Most dots that show where a person was."""
 _DEVIATIONS = 2.0
 """Standard deviations that an ellipse shows."""
 _MAGNIFICATIONS = (1, 10, 100)
@@ -215,7 +217,8 @@ def _draw_person(
     frames = np.flatnonzero(estimated.any(1))
     if not len(frames):
         return
-    middle = np.stack([np.median(points[t][estimated[t]], axis=0) for t in frames])
+    dotted = frames[:: -(-len(frames) // _DOTS)]
+    middle = np.stack([np.median(points[t][estimated[t]], axis=0) for t in dotted])
     axes.plot(*middle.T, ".", color=colour, markersize=1.5)
     spread = np.linspace(0, len(frames) - 1, min(_SKELETONS, len(frames)))
     for t in frames[spread.astype(int)]:

@@ -13,14 +13,18 @@ from jaxtyping import Float, Int
 from ghpt.data.formats.csv_tables import open_table, read_header, read_numbers
 from ghpt.data.formats.skeletons import SKELETONS, joints_of, recognise_beginning
 from ghpt.data.formats.source import Source
-from ghpt.data.people.detections import Detections
+from ghpt.data.people.detections import Detections, check_people
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
 _CAMERAS = ("port", "cam_id")
 """What the column of the camera's number is called, until 2025 and since."""
 _FRAME = "sync_index"
-_POINT = ("point_id", "img_loc_x", "img_loc_y")
+_POINTS = ("point_id", "keypoint_id")
+"""What the column of the point's number is called, until 2025 and since."""
+_PIXELS = ("img_loc_x", "img_loc_y")
+_PERSON = "object_id"
+"""The column of whose point it is, which a tracker of several people tells; since 2025."""
 _MOST_PORTS = 1000
 _WRITE = "It must be an xy_*.csv that caliscope wrote."
 _BODY = len(SKELETONS["mediapipe_33"])
@@ -43,11 +47,12 @@ def is_caliscope(text: str) -> bool:
     """
     header = text.splitlines()[0] if text else ""
     names = {name.strip().strip('"') for name in re.split("[,;\t]", header)}
-    return {_FRAME, *_POINT} <= names and not names.isdisjoint(_CAMERAS)
+    numbered = not names.isdisjoint(_CAMERAS) and not names.isdisjoint(_POINTS)
+    return {_FRAME, *_PIXELS} <= names and numbered
 
 
 def read_caliscope(source: Source) -> Detections:
-    """Return the one person of the table, in the views ``cam_<number>``.
+    """Return everybody in the table, in the views ``cam_<number>``.
 
     The frame numbers are ``sync_index``; there is no confidence in these files. What a point's
     number means depends on the tracker, which the file does not name: it is the skeleton of as many
@@ -62,31 +67,39 @@ def read_caliscope(source: Source) -> Detections:
     count = numbering.count
     table = table[numbering.joint >= 0]
     joint = numbering.joint[numbering.joint >= 0]
-    frame, port = table[:, :2].astype(np.int64).T
-    frames, row = np.unique(frame, return_inverse=True)
-    ports, view = np.unique(port, return_inverse=True)
+    frames, row = np.unique(table[:, 0].astype(np.int64), return_inverse=True)
+    ports, view = np.unique(table[:, 1].astype(np.int64), return_inverse=True)
     if len(ports) > _MOST_PORTS:
         raise GhptDataError(path, "port", f"names {len(ports)} cameras", _WRITE)
-    cell = (row * len(ports) + view) * count + joint
-    if len(np.unique(cell)) != len(cell):
+    objects, identity = np.unique(table[:, 5], return_inverse=True)
+    cell = (view * len(frames) + row) * len(objects) + identity
+    people, person = np.unique(cell, return_inverse=True)
+    image, identity = np.divmod(people, len(objects))
+    check_people(path, "", int(np.unique(image, return_counts=True)[1].max(initial=0)))
+    if len(np.unique(person * count + joint)) != len(joint):
         problem = "a point is there twice in a frame of a camera"
         raise GhptDataError(path, "point_id", problem, _WRITE)
-    shape = (len(frames), len(ports), count)
-    points = np.zeros((*shape, 2))
-    valid = np.zeros(shape, np.bool_)
-    points.reshape(-1, 2)[cell] = table[:, 3:5]
-    valid.reshape(-1)[cell] = True
-    people = valid.reshape(-1, count)
     name = numbering.skeleton
+    points = np.zeros((len(people), count, 2))
+    valid = np.zeros((len(people), count), np.bool_)
+    points[person, joint] = table[:, 3:5]
+    valid[person, joint] = True
     if name is None:
-        name = recognise_beginning(path, points.reshape(-1, count, 2), people)
+        name = recognise_beginning(path, points, valid)
     joints = joints_of(path, name)
     missing = len(joints) - count
-    points = np.pad(points, ((0, 0), (0, 0), (0, missing), (0, 0)))
-    valid = np.pad(valid, ((0, 0), (0, 0), (0, missing)))
-    views = tuple(f"cam_{port}" for port in ports)
-    key_points = KeyPoints(points, valid.astype(np.float64), valid)
-    return Detections.of_person(path, views, joints, frames, key_points)
+    points = np.pad(points, ((0, 0), (0, missing), (0, 0)))
+    valid = np.pad(valid, ((0, 0), (0, missing)))
+    return Detections(
+        path=str(path),
+        views=tuple(f"cam_{port}" for port in ports),
+        joints=joints,
+        frame=frames,
+        row=image % len(frames),
+        view=image // len(frames),
+        identity=identity if len(objects) > 1 else np.full(len(people), -1),
+        points=KeyPoints(points, valid.astype(np.float64), valid),
+    )
 
 
 @dataclass(frozen=True)
@@ -126,16 +139,23 @@ def _number_joints(path: Path, point: Float[np.ndarray, " N"], skeleton: str | N
     return _Numbering(joint, count, name)
 
 
-def _table(path: Path) -> Float[np.ndarray, "N 5"]:
+def _table(path: Path) -> Float[np.ndarray, "N 6"]:
+    """Return frame, camera, point, x, y and person of each row; the person is 0 where none is told.
+
+    Raises GhptDataError.
+    """
     try:
         with open_table(path) as handle:
-            header = read_header(path, handle)
+            header = read_header(handle)
             camera = next((name for name in _CAMERAS if name in header), _CAMERAS[0])
-            columns = [header.index(name) for name in (_FRAME, camera, *_POINT)]
-            table = read_numbers(handle, columns)
+            point = next((name for name in _POINTS if name in header), _POINTS[0])
+            names = [_FRAME, camera, point, *_PIXELS]
+            names += [_PERSON] if _PERSON in header else []
+            table = read_numbers(handle, [header.index(name) for name in names])
     except (ValueError, csv.Error) as error:
         raise GhptDataError(path, "", f"is damaged ({error})", _WRITE) from error
-    index = table[:, :3]
+    table = np.pad(table, ((0, 0), (0, 6 - table.shape[1])))
+    index = table[:, [0, 1, 2, 5]]
     index = index[np.isfinite(index)]
     whole = (index == np.round(index)).all()
     if not whole or not (np.abs(np.nan_to_num(table)) < _LARGEST_NUMBER).all():

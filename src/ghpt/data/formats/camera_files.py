@@ -41,6 +41,8 @@ _LARGEST_NUMBER = 1e15
 """No focal length or distance; its square would still be one, though."""
 _LENSES = (4, 5, 8, 12, 14)
 """How many coefficients OpenCV's lenses have; of 12 and 14, those after the eighth must be 0."""
+_ONE_EACH = ("OpenCap", "JSON", "YAML")
+"""Formats of a file for each camera."""
 _SUFFIXES = (".toml", ".json", ".yml", ".yaml", *SUFFIXES)
 """Of a file in a folder of cameras."""
 
@@ -72,7 +74,7 @@ def _read_file(path: Path, subject: Name) -> CameraContent:
         start = handle.read(256).lstrip(b"\xef\xbb\xbf \t\r\n")
     if path.suffix.lower() in SUFFIXES or start.startswith(b"\x80"):
         return read_camera_pickle(path)
-    if start.startswith(b"%YAML"):
+    if path.suffix.lower() in (".yml", ".yaml") or start.startswith(b"%YAML"):
         return read_opencv(path)
     if start.startswith((b"{", b"[", b"\xff\xfe{", b"\xfe\xff\0{")) and not _is_table(start):
         return read_camera_json(path, subject)
@@ -146,7 +148,7 @@ def _camera_set(path: Path, content: CameraContent) -> CameraSet:
     if not entries:
         raise GhptDataError(path, "", "holds 0 cameras", KNOWN_CAMERAS)
     check_view_count(path, len(entries))
-    if len(entries) == 1 and path.is_file() and content.format in ("OpenCap", "JSON"):
+    if len(entries) == 1 and path.is_file() and content.format in _ONE_EACH:
         hint = f"Name the folder of all: cameras={path.parent}"
         raise GhptDataError(path, "", "holds 1 camera", hint)
     names = tuple(entry.name for entry in entries)

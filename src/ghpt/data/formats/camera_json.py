@@ -7,32 +7,52 @@ from pathlib import Path
 from typing import Any
 
 from ghpt.data.formats.camera_entry import KNOWN_CAMERAS, CameraContent, CameraEntry
-from ghpt.data.formats.camera_fields import camera_from_fields, is_camera
+from ghpt.data.formats.camera_fields import camera_from_fields, cameras_by_name, is_camera
 from ghpt.data.formats.names import Name, chosen_name
 from ghpt.data.formats.validate import SMALL_JSON, check_view_count, read_json, read_name
 from ghpt.errors import GhptDataError
 
 _MM_PER_M = 1000.0
 _MM_PER_CM = 10.0
+_PANOPTIC = "distCoef"
+"""The field by which Panoptic's cameras are told from others in a list."""
 
 
 def read_camera_json(path: Path, subject: Name) -> CameraContent:
-    """Return the cameras of a JSON file. Raises GhptDataError."""
+    """Return the cameras of a JSON file: those of one, of several by name, or of a list.
+
+    Raises GhptDataError.
+    """
     content = read_json(path, SMALL_JSON)
+    if isinstance(content, list):
+        content = {"cameras": content}
     if not isinstance(content, dict):
         raise GhptDataError(path, "", "is not an object with cameras", KNOWN_CAMERAS)
+    if _is_human36m(content):
+        return CameraContent("Human3.6M", _human36m(path, content, subject), 1.0)
+    listed = content.get("cameras", content)
+    named = _named_cameras(listed)
+    if named:
+        check_view_count(path, len(named))
+        entries = [camera_from_fields(path, name, camera) for name, camera in named.items()]
+        return CameraContent("JSON", entries, _MM_PER_M, unit_known=False)
     if is_camera(content):
         entries = [camera_from_fields(path, path.stem, content)]
         return CameraContent("JSON", entries, _MM_PER_M, unit_known=False)
-    if "intrinsics" in content:
-        return CameraContent("Human3.6M", _human36m(path, content, subject), 1.0)
-    listed = content.get("cameras", content)
-    if isinstance(listed, dict) and any(is_camera(camera) for camera in listed.values()):
-        check_view_count(path, len(listed))
-        cameras = {name: camera for name, camera in listed.items() if is_camera(camera)}
-        entries = [camera_from_fields(path, name, camera) for name, camera in cameras.items()]
-        return CameraContent("JSON", entries, _MM_PER_M, unit_known=False)
     return CameraContent("Panoptic", _panoptic(path, content), _MM_PER_CM)
+
+
+def _is_human36m(content: Mapping[str, Any]) -> bool:
+    return isinstance(content.get("intrinsics"), dict) and not is_camera(content)
+
+
+def _named_cameras(listed: object) -> dict[str, Any]:
+    """Return cameras by name, or by their place in a list; none of a list of Panoptic's."""
+    if isinstance(listed, list):
+        if not all(map(is_camera, listed)) or any(_PANOPTIC in camera for camera in listed):
+            return {}
+        return {str(place): camera for place, camera in enumerate(listed)}
+    return cameras_by_name(listed) if isinstance(listed, dict) else {}
 
 
 def _human36m(path: Path, content: Mapping[str, Any], subject: Name) -> list[CameraEntry]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ghpt.data.formats.camera_entry import KNOWN_CAMERAS, CameraContent, CameraEntry
+from ghpt.data.formats.camera_fields import camera_from_lines, is_camera
 from ghpt.data.formats.validate import MOST_VIEWS, open_input, read_flag, read_name
 from ghpt.errors import GhptDataError
 
@@ -18,13 +19,16 @@ _DEEPEST = 100
 """Bytes of a TOML file; parts of a key in it, which cost their square to read."""
 _MOST_TABLES = 10 * MOST_VIEWS
 """In a TOML file, with the rows of matrices that begin a line."""
+_OTHER = "TOML"
+"""What cameras with other fields than the tools' are called."""
+_UNKNOWN_UNIT = ("aniposelib", _OTHER)
 _FIELDS = ("matrix", "distortions", "rotation", "translation")
 
 
 def read_toml(path: Path) -> CameraContent:
     """Return the cameras of a TOML file. Raises GhptDataError."""
     form, entries = _cameras(path)
-    return CameraContent(form, entries, _MM_PER_M, unit_known=form != "aniposelib")
+    return CameraContent(form, entries, _MM_PER_M, unit_known=form not in _UNKNOWN_UNIT)
 
 
 def _cameras(path: Path) -> tuple[str, list[CameraEntry]]:
@@ -33,11 +37,16 @@ def _cameras(path: Path) -> tuple[str, list[CameraEntry]]:
     numbered = isinstance(nested, dict)
     tables = nested if isinstance(nested, dict) else content
     entries = []
+    others = []
     for key, table in tables.items():
         if not isinstance(table, dict) or not any(field in table for field in _FIELDS):
+            if is_camera(table):
+                others.append(camera_from_lines(path, key, table))
             continue
         if not read_flag(path, f"{key}.ignore", table.get("ignore", False)):
             entries.append(_camera(path, key, table, numbered))
+    if others and not entries:
+        return _OTHER, others
     if numbered:
         return "caliscope", entries
     fisheye = any("fisheye" in table for table in tables.values() if isinstance(table, dict))

@@ -1,4 +1,6 @@
-"""Cameras in the yml files of OpenCV and EasyMocap: intri.yml, with extri.yml beside it."""
+"""Cameras in the yml files of OpenCV and EasyMocap: intri.yml, with extri.yml beside it; and a file
+for each camera, of OpenCV or ROS.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ghpt.data.formats.camera_entry import CameraContent, CameraEntry
-from ghpt.data.formats.opencv_yml import read_yml
+from ghpt.data.formats.camera_fields import camera_from_lines, is_camera
+from ghpt.data.formats.opencv_yml import Node, read_yml
 from ghpt.data.formats.validate import check_view_count
 from ghpt.errors import GhptDataError
 
@@ -15,11 +18,14 @@ _MM_PER_M = 1000.0
 
 def read_opencv(path: Path) -> CameraContent:
     """Return the cameras of a yml file. Raises GhptDataError."""
-    return CameraContent("OpenCV", _cameras(path), _MM_PER_M, unit_known=False)
+    content = read_yml(path)
+    if "names" not in content and is_camera(content):
+        entries = [camera_from_lines(path, path.stem, content)]
+        return CameraContent("YAML", entries, _MM_PER_M, unit_known=False)
+    return CameraContent("OpenCV", _cameras(path, content), _MM_PER_M, unit_known=False)
 
 
-def _cameras(path: Path) -> list[CameraEntry]:
-    intrinsic = read_yml(path)
+def _cameras(path: Path, intrinsic: Mapping[str, Node | None]) -> list[CameraEntry]:
     beside = path.with_name(path.name.replace("intri", "extri"))
     extrinsic = read_yml(beside) if beside != path and beside.is_file() else intrinsic
     names = intrinsic.get("names")

@@ -1,4 +1,8 @@
-"""CSV tables of numbers, opened with care: of any encoding, cut ones told, no endless lines."""
+"""CSV tables of numbers, opened with care: of any encoding, cut ones told, no endless lines.
+
+A spreadsheet of a country whose numbers have decimal commas saves semicolons or tabs between the
+columns; such a table is read as if it had commas there and points in its numbers.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +13,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Protocol
 
 import numpy as np
 from jaxtyping import Float
@@ -18,14 +23,30 @@ from ghpt.errors import GhptDataError
 
 _LARGEST = 2 << 30
 _LONGEST_LINE = 1 << 18
-_SPREADSHEET = (
-    "Save it with commas between the columns and points in the numbers "
-    "(a spreadsheet may have changed it)."
-)
+_SEPARATORS = ";\t"
+"""Between the columns of a spreadsheet's tables, where a comma may be a decimal one."""
+
+
+class Lines(Protocol):
+    """A table that is read line by line."""
+
+    def readline(self, size: int) -> str:
+        """Return the next line, or its first ``size`` characters; an empty text at the end."""
+
+
+class _Translated:
+    """Lines in which some characters stand for others."""
+
+    def __init__(self, lines: Lines, characters: dict[int, str]) -> None:
+        self.lines = lines
+        self.characters = characters
+
+    def readline(self, size: int) -> str:
+        return self.lines.readline(size).translate(self.characters)
 
 
 @contextmanager
-def open_table(path: Path) -> Iterator[io.TextIOBase]:
+def open_table(path: Path) -> Iterator[Lines]:
     """Open a table at its first line.
 
     Raises GhptDataError for one that is too large, or that ends within a line.
@@ -41,19 +62,23 @@ def open_table(path: Path) -> Iterator[io.TextIOBase]:
             raise GhptDataError(path, "", problem, "Copy it again.")
         raw.seek(0)
         with io.TextIOWrapper(raw, encoding=encoding, errors="replace", newline="") as handle:
-            yield handle
+            first = handle.readline(_LONGEST_LINE)
+            handle.seek(0)
+            separator = next((sign for sign in _SEPARATORS if sign in first), None)
+            if separator is None:
+                yield handle
+            else:
+                yield _Translated(handle, str.maketrans({",": ".", separator: ","}))
 
 
-def read_header(path: Path, handle: io.TextIOBase) -> list[str]:
-    """Return the names in the next line. Raises GhptDataError for a line without commas."""
+def read_header(handle: Lines) -> list[str]:
+    """Return the names in the next line."""
     line = handle.readline(_LONGEST_LINE)
-    if ";" in line or "\t" in line:
-        raise GhptDataError(path, "", "has columns that commas do not part", _SPREADSHEET)
     return [name.strip() for name in next(csv.reader([line]), [])]
 
 
 def read_numbers(
-    handle: io.TextIOBase,
+    handle: Lines,
     columns: Sequence[int],
     converters: Mapping[int, Callable[[str], float]] | None = None,
 ) -> Float[np.ndarray, "N C"]:
@@ -78,7 +103,7 @@ def read_numbers(
     return table.reshape(-1, len(columns))
 
 
-def _lines(handle: io.TextIOBase) -> Iterator[str]:
+def _lines(handle: Lines) -> Iterator[str]:
     while line := handle.readline(_LONGEST_LINE):
         if len(line) == _LONGEST_LINE:
             raise ValueError("a line of it does not end")

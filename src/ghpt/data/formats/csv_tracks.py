@@ -26,12 +26,12 @@ _EXPORT = "Export it again."
 
 def is_deeplabcut(text: str) -> bool:
     """Return whether a file that begins so is DeepLabCut's or LightningPose's."""
-    return text.startswith("scorer,")
+    return re.match("scorer[,;\t]", text) is not None
 
 
 def is_sleap_analysis(text: str) -> bool:
     """Return whether a file that begins so is SLEAP's analysis."""
-    return text.startswith(",".join(_SLEAP))
+    return re.match("[,;\t]".join(_SLEAP), text) is not None
 
 
 def read_deeplabcut_csv(source: Source) -> Detections:
@@ -53,9 +53,9 @@ def read_sleap_csv(source: Source) -> Detections:
 def _deeplabcut(file: Path) -> Tracks:
     try:
         with open_table(file) as handle:
-            levels = [read_header(file, handle)]
+            levels = [read_header(handle)]
             while levels[-1][:1] != ["coords"] and len(levels) < len(_HEADER):
-                levels.append(read_header(file, handle))
+                levels.append(read_header(handle))
             names = tuple(level[0] for level in levels if level)
             if names not in (_HEADER, (_HEADER[0], *_HEADER[2:])):
                 raise ValueError(f"its first rows are not {', '.join(_HEADER)}")
@@ -87,7 +87,7 @@ def _sleap(file: Path) -> Tracks:
 
     try:
         with open_table(file) as handle:
-            header = read_header(file, handle)
+            header = read_header(handle)
             joints = tuple(name[:-2] for name in header if name.endswith(".x"))
             place = [header.index(name) for name in _SLEAP]
             place += [header.index(f"{joint}.{of}") for joint in joints for of in _COORDINATES]

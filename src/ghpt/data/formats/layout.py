@@ -11,6 +11,7 @@ from __future__ import annotations
 import logging
 import os
 import re
+import unicodedata
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
@@ -125,6 +126,7 @@ def arrange_frames(
     tell more than both. The rest of the name and the folders tell view and session as `_assign`
     says. Raises GhptDataError.
     """
+    names = _compose(names)
     rest, frames = _frame_numbers(where, names)
     series: dict[tuple[tuple[str, ...], str, str], dict[int, int]] = defaultdict(dict)
     for index, name in enumerate(names):
@@ -156,7 +158,8 @@ def arrange_recordings(
 
     Raises GhptDataError.
     """
-    items = [_Item(_inner_folders(name), name.stem, str(name)) for name in names]
+    named = _compose(names)
+    items = [_Item(_inner_folders(name), name.stem, str(name)) for name in named]
     chosen = _assign(where, items, session)
     return tuple(sorted((item.view, index) for index, item in chosen.items()))
 
@@ -165,6 +168,17 @@ def frame_numbers(where: Path, names: Sequence[PurePath]) -> list[int]:
     """Return the frame numbers in the names of one view's images. Raises GhptDataError."""
     flat = [PurePath(name.name) for name in names]
     return _frame_numbers(where, flat)[1]
+
+
+def _compose(names: Sequence[PurePath]) -> list[PurePath]:
+    """Return the names with a letter and its accent as one character, as people type them.
+
+    macOS stores them apart.
+    """
+    return [
+        name if str(name).isascii() else PurePath(unicodedata.normalize("NFC", str(name)))
+        for name in names
+    ]
 
 
 def _is_hidden(name: str) -> bool:

@@ -28,6 +28,8 @@ from ghpt.errors import GhptDataError
 from ghpt.files import atomic_write
 
 _MOST_MEMBERS = 1000
+_OFFICE = frozenset(("[Content_Types].xml", "mimetype"))
+"""Of which one is in the archive that a spreadsheet is."""
 _LONGEST_NAMES = 1 << 20
 """Bytes of a list of texts."""
 
@@ -137,11 +139,25 @@ def _members(path: Path) -> set[str]:
         if (count := int.from_bytes(ending[6:8], "little")) > _MOST_MEMBERS:
             raise GhptDataError(path, "", f"holds {count} arrays or more", "Write it again.")
         with zipfile.ZipFile(path) as archive:
-            return {name.removesuffix(".npy") for name in archive.namelist()}
+            names = archive.namelist()
     except _DAMAGED as error:
         raise GhptDataError(
             path, "", f"is not a whole npz file ({error})", "Write it again."
         ) from error
+    _check_archive(path, names)
+    return {name.removesuffix(".npy") for name in names}
+
+
+def _check_archive(path: Path, names: Sequence[str]) -> None:
+    """Raise GhptDataError for an archive of files that are no arrays."""
+    if any(name.endswith(".npy") for name in names):
+        return
+    if _OFFICE.intersection(names):
+        hint = "Save each sheet as CSV, as the tool wrote it, and name the folder of these."
+        raise GhptDataError(path, "", "is a spreadsheet, not key points", hint)
+    listed = ", ".join(names[:3]) or "nothing"
+    hint = "Unpack it and name the folder."
+    raise GhptDataError(path, "", f"is an archive of files ({listed}), not of arrays", hint)
 
 
 def _texts(path: Path, field: str) -> tuple[str, ...]:

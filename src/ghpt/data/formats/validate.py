@@ -11,6 +11,7 @@ import codecs
 import io
 import json
 import math
+import unicodedata
 import warnings
 import zipfile
 import zlib
@@ -167,7 +168,7 @@ def read_flag(where: object, field: str, value: object) -> bool:
 def read_name(where: object, field: str, value: object) -> str:
     """Return a file's name of a camera, which may be a number. Raises GhptDataError."""
     if type(value) is int or (isinstance(value, str) and value.strip()):
-        return str(value)
+        return unicodedata.normalize("NFC", str(value))
     raise GhptDataError(where, field, f"is {value!r}, not a name", "Give each camera a name.")
 
 

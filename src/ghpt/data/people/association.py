@@ -36,7 +36,7 @@ _SEEDS = 48
 """Pairs of detections of a frame that are tried as bodies at once: those that agree best."""
 _ROUNDS = 8
 """How often seeds are sought among the detections that no body has taken."""
-_SAME = 0.04
+_SAME = 0.06
 """Bodies of a frame are one if the median distance of their joints is below this part of the
 height.
 """

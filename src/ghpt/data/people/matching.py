@@ -262,7 +262,7 @@ def _warn_of_unmatched(
         return
     for view, camera in pairs:
         if not cameras.is_posed(camera):
-            text = "%s: %s has no extrinsics: view %s is not used. Calibrate all (calibrate.py)."
+            text = "%s: %s has no extrinsics: view %s is not used. Calibrate all of them."
             _log.warning(text, cameras.path, cameras.names[camera], views[view])
 
 

@@ -94,7 +94,7 @@ def check_image_sizes(where: str, points: KeyPoints, cameras: CameraSet) -> None
             )
             hint = (
                 "Detect in images that are turned as the calibration's, or give the cameras of "
-                "the turned ones, which cameras.py writes."
+                "the turned ones, which the camera check writes."
             )
         raise GhptDataError(where, f"view {cameras.names[view]}", problem, hint)
 

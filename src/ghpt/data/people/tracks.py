@@ -5,8 +5,7 @@ What stays near is a track; tracks that can be one person's are joined.
 
 from __future__ import annotations
 
-from bisect import bisect
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -43,7 +42,19 @@ _LEAST_BONES = 4
 _SURE_VIEWS = 2.5
 """Mean number of views from which a track is no chance."""
 _JUMP = 0.1
-"""Heights by which no person moves from frame to frame on average."""
+"""Heights by which who does not go straight moves from frame to frame, at most, on average."""
+_REST = 0.06
+"""Deviation of where a body is in the next frame from where its way led, in heights."""
+_WANDER = 0.03
+"""By how much that grows in each frame in which the body is not seen."""
+_ANYWHERE = 3.0
+"""The largest."""
+_SAME_WORTH = 4.0
+"""What it is worth, as a logarithm of likelihood, that trackers call two tracks the same."""
+_LINKS = 64
+"""Tracks after a track's end that are thought of at once as its continuation."""
+_STRAIGHT = 0.75
+"""Change of the step from frame to frame, as a part of it, below which somebody goes straight."""
 _LEAST_FRAMES = 3
 """Of a person in a recording that moves: what is there for less is a chance of false detections."""
 
@@ -206,57 +217,34 @@ def _same_identity(
     return same.sum(-1) / known.sum(-1).clip(1)
 
 
-@dataclass
-class _Person:
-    """The tracks that were joined so far."""
-
-    bones: _Bones
-    starts: list[int] = field(default_factory=list)
-    """First frames of the tracks, rising; they are never there at once."""
-    tracks: list[_Track] = field(default_factory=list)
-    """In the order of time."""
-
-    def place(self, track: _Track) -> int | None:
-        """Return where a track belongs in time, None if another is there at that time."""
-        at = bisect(self.starts, track.first)
-        if at > 0 and self.tracks[at - 1].last >= track.first:
-            return None
-        if at < len(self.tracks) and self.tracks[at].first <= track.last:
-            return None
-        return at
-
-    def add(self, track: _Track, at: int) -> None:
-        self.starts.insert(at, track.first)
-        self.tracks.insert(at, track)
-        self.bones = self.bones.merge(track.bones)
-
-
 @dataclass(frozen=True)
 class _Bones:
     """Logarithmic lengths of the bones, with their precision (1 / variance), 0 where unknown."""
 
-    length: Float[np.ndarray, " B"]
-    precision: Float[np.ndarray, " B"]
+    length: Float[np.ndarray, "*N B"]
+    precision: Float[np.ndarray, "*N B"]
 
     def merge(self, other: _Bones) -> _Bones:
         total = self.precision + other.precision
         summed = self.precision * self.length + other.precision * other.length
         return _Bones(summed / np.maximum(total, 1e-12), total)
 
-    def difference(self, other: _Bones) -> float:
-        """Return by how many deviations the two are of different size; 0 where too few are known.
+    def take(self, at: Int[np.ndarray, " M"]) -> _Bones:
+        return _Bones(self.length[at], self.precision[at])
+
+    def difference(self, other: _Bones) -> Float[np.ndarray, "*N"]:
+        """Return by how many deviations they are of different size; 0 where too few are known.
 
         Sizes are compared by the mean difference of the logarithms, weighted by precision. Single
         bones are not: a detector errs by more from one side than people differ.
         """
         known = (self.precision > 0) & (other.precision > 0)
-        if known.sum() < _LEAST_BONES:
-            return 0.0
-        precision = 1 / (1 / self.precision[known] + 1 / other.precision[known])
-        difference = self.length[known] - other.length[known]
-        mean = (precision * difference).sum() / precision.sum()
-        variance = _SIZE_SPREAD**2 + 1 / precision.sum()
-        return float(abs(mean) / np.sqrt(variance))
+        variance = 1 / self.precision.clip(1e-12) + 1 / other.precision.clip(1e-12)
+        precision = np.where(known, 1 / variance, 0.0)
+        total = precision.sum(-1).clip(1e-12)
+        mean = (precision * (self.length - other.length)).sum(-1) / total
+        deviation = np.sqrt(_SIZE_SPREAD**2 + 1 / total)
+        return np.where(known.sum(-1) < _LEAST_BONES, 0.0, abs(mean) / deviation)
 
 
 @dataclass(frozen=True)
@@ -269,6 +257,11 @@ class _Track:
     last: int
     """Frames."""
     bones: _Bones
+
+    def join(self, later: _Track) -> _Track:
+        """Return the track that goes on as a later one."""
+        rows = np.concatenate([self.rows, later.rows])
+        return _Track(rows, self.first, later.last, self.bones.merge(later.bones))
 
 
 def _split_by(number: Int[np.ndarray, " G"]) -> list[Int[np.ndarray, " N"]]:
@@ -289,41 +282,26 @@ def join_tracks(
 ) -> list[Int[np.ndarray, "T V"]]:
     """Return the members [T V] of each person, the best first; -1 where there is none.
 
-    1. The tracks are taken by what their bodies are worth together, and each is joined to the
-       person whom it fits best: who is not there at the same time, has bones of the same lengths,
-       and can have come from where they were last. A track that fits nobody is a new person.
-    2. A track that only two views support is left out if it is short or jumps (`_is_chance`), and
-       who is there for fewer than ``_LEAST_FRAMES`` frames is nobody; unless most tracks are as
+    1. A track that only two views support is left out if it is short or jumps (`_is_chance`).
+    2. A track goes on as the later one that it can be and is likeliest to be (`_Links`), the
+       likeliest of all first: who has bones of the same lengths, and is where the way led.
+    3. Who is there for fewer than ``_LEAST_FRAMES`` frames is nobody; unless most tracks are as
        short: then the frames are no film, and nothing is said of where people come from.
-    3. Persons are ordered by what their bodies are worth together.
+    4. Persons are ordered by what their bodies are worth together.
     """
     rows_of_track = _split_by(track)
     counts = np.array([len(rows) for rows in rows_of_track])
     film = len(track) > 0 and bool(np.median(counts[track]) >= _LEAST_FRAMES)
-    total = np.bincount(track, worth) if len(track) else np.zeros(0)
-    tracks = _tracks(bodies, rows_of_track)
     views = (members >= 0).sum(1)
-    persons: list[_Person] = []
-    for number in np.argsort(-total, kind="stable"):
-        own = tracks[number]
-        if film and _is_chance(bodies, views, own):
-            continue
-        best = _Fit(_UNREACHABLE, -1, 0)
-        for index, person in enumerate(persons):
-            fit = _fit(bodies, person, own, film, index)
-            if fit is not None and fit.cost < best.cost:
-                best = fit
-        if best.person >= 0:
-            persons[best.person].add(own, best.place)
-        else:
-            persons.append(_Person(own.bones, [own.first], [own]))
+    tracks = _tracks(bodies, rows_of_track)
+    if film:
+        tracks = [each for each in tracks if not _is_chance(bodies, views, each)]
     found = []
-    for person in persons:
-        rows = np.concatenate([each.rows for each in person.tracks])
-        if len(rows) >= _LEAST_FRAMES or not film:
+    for person in _join(bodies, tracks, film):
+        if len(person.rows) >= _LEAST_FRAMES or not film:
             chosen = np.full((frames, members.shape[1]), -1)
-            chosen[bodies.frame[rows]] = members[rows]
-            found.append((float(worth[rows].sum()), chosen))
+            chosen[bodies.frame[person.rows]] = members[person.rows]
+            found.append((float(worth[person.rows].sum()), chosen))
     found.sort(key=lambda pair: -pair[0])
     return [chosen for _, chosen in found]
 
@@ -336,57 +314,116 @@ def _is_chance(
     """Return whether a track may be of detections that agree by chance.
 
     Two detections of nobody that lie on one another's epipolar lines make a body in space. It has
-    no third view, and no body near it in the next frame.
+    no third view, and no body near it in the next frame; where few frames are taken in a second, a
+    person moves as far, but goes on as they went.
     """
     rows = track.rows
     if views[rows].mean() >= _SURE_VIEWS:
         return False
     if len(rows) < _LEAST_FRAMES:
         return True
-    return bool(_distances(bodies, rows[:-1], rows[1:]).mean() > _JUMP)
+    if _distances(bodies, rows[:-1], rows[1:]).mean() <= _JUMP:
+        return False
+    frames = np.diff(bodies.frame[rows])[:, None]
+    step = _displacement(bodies, rows[:-1], rows[1:]) / frames
+    change = np.linalg.norm(np.diff(step, axis=0), axis=-1)
+    steady = change.mean() < _STRAIGHT * np.linalg.norm(step, axis=-1).mean()
+    return len(rows) < _STEADY or not steady
 
 
 @dataclass(frozen=True)
-class _Fit:
-    """Which person a track fits, and where in time."""
+class _Links:
+    """L pairs of tracks of which the second can be the first one's continuation."""
 
-    cost: float
-    person: int
-    place: int
+    cost: Float[np.ndarray, " L"]
+    """Minus the logarithm of how likely it is, but for a constant."""
+    first: Int[np.ndarray, " L"]
+    second: Int[np.ndarray, " L"]
 
 
-def _fit(
+def _join(bodies: Bodies, tracks: list[_Track], film: bool) -> list[_Track]:
+    """Return the tracks of people, joined of those that are one person's."""
+    while tracks:
+        tracks = sorted(tracks, key=lambda track: track.first)
+        links = _find_links(bodies, tracks, film)
+        joined = dict(enumerate(tracks))
+        head = list(range(len(tracks)))  # of what ends with each track
+        tail = list(range(len(tracks)))  # of what begins with each track
+        for at in np.argsort(links.cost, kind="stable"):
+            first = int(links.first[at])
+            second = int(links.second[at])
+            begin = head[first]
+            if tail[begin] != first or second not in joined:
+                continue
+            if joined[begin].bones.difference(joined[second].bones) > _OTHER_SIZE:
+                continue
+            joined[begin] = joined[begin].join(joined.pop(second))
+            tail[begin] = tail[second]
+            head[tail[begin]] = begin
+        if len(joined) == len(tracks):
+            break
+        tracks = list(joined.values())
+    return tracks
+
+
+def _find_links(bodies: Bodies, tracks: list[_Track], film: bool) -> _Links:
+    """Return the links of tracks, in the order of their first frames, to some that come next."""
+    starts = np.array([track.first for track in tracks])
+    next_one = np.searchsorted(starts, [track.last for track in tracks], side="right")
+    second = next_one[:, None] + np.arange(_LINKS)
+    first = np.arange(len(tracks))[:, None].repeat(_LINKS, 1)[second < len(tracks)]
+    second = second[second < len(tracks)]
+    bones = _Bones(
+        np.stack([track.bones.length for track in tracks]),
+        np.stack([track.bones.precision for track in tracks]),
+    )
+    size = bones.take(first).difference(bones.take(second))
+    cost = size**2 / 2
+    possible = size <= _OTHER_SIZE
+    if film:
+        ways = _ways(bodies, tracks, first, second)
+        possible &= ways < np.inf
+        cost += ways
+    return _Links(cost[possible], first[possible], second[possible])
+
+
+def _ways(
     bodies: Bodies,
-    person: _Person,
-    track: _Track,
-    film: bool,
-    index: int,
-) -> _Fit | None:
-    """Return how well a track fits a person; None where it cannot be theirs."""
-    place = person.place(track)
-    if place is None:
-        return None
-    cost = person.bones.difference(track.bones)
-    if cost > _OTHER_SIZE:
-        return None
-    if not film:
-        return _Fit(cost, index, place)
-    for before, after in _neighbours(person, track, place):
-        one = before.rows[-1:]
-        other = after.rows[:1]
-        gap = np.array([after.first - before.last])
-        distance = float(_distances(bodies, one, other)[0] / _reach(gap)[0])
-        if distance > 1:
-            return None
-        same = _same_identity(bodies.identity[one], bodies.identity[other])
-        cost += distance - float(same[0, 0])
-    return _Fit(cost, index, place)
+    tracks: list[_Track],
+    first: Int[np.ndarray, " L"],
+    second: Int[np.ndarray, " L"],
+) -> Float[np.ndarray, " L"]:
+    """Return minus the logarithm of how likely a track leads to another; inf where it cannot.
+
+    It is the density of a normal distribution over the floor around where the first would be had
+    both gone on as they went, whose deviation grows with the frames between.
+    """
+    end = np.array([track.rows[-1] for track in tracks])[first]
+    start = np.array([track.rows[0] for track in tracks])[second]
+    gap = bodies.frame[start] - bodies.frame[end]
+    leaving = np.stack([_velocity(bodies, track.rows[-_STEADY:]) for track in tracks])[first]
+    coming = np.stack([_velocity(bodies, track.rows[:_STEADY]) for track in tracks])[second]
+    frames = np.minimum(gap, _STEADY)[:, None]
+    moved = (leaving + coming) / 2 * frames
+    nearest = np.minimum(
+        _distances(bodies, end, start),
+        _distances(bodies, end, start, moved),
+    )
+    deviation = np.minimum(_REST + _WANDER * gap, _ANYWHERE)
+    same = np.array(
+        [
+            _same_identity(bodies.identity[[a]], bodies.identity[[b]])[0, 0]
+            for a, b in zip(end, start, strict=True)
+        ]
+    )
+    cost = (nearest / deviation) ** 2 / 2 + 2 * np.log(deviation) - _SAME_WORTH * same
+    return np.where(nearest <= _reach(gap), cost, np.inf)
 
 
-def _neighbours(person: _Person, track: _Track, place: int) -> list[tuple[_Track, _Track]]:
-    """Return the track with those before and after it, in the order of time."""
-    pairs = [(before, track) for before in person.tracks[max(place - 1, 0) : place]]
-    return pairs + [(track, after) for after in person.tracks[place : place + 1]]
+def _velocity(bodies: Bodies, rows: Int[np.ndarray, " N"]) -> Float[np.ndarray, " 3"]:
+    """Return by how much a body moves in a frame."""
+    frames = bodies.frame[rows[-1]] - bodies.frame[rows[0]]
+    return _displacement(bodies, rows[:1], rows[-1:])[0] / max(int(frames), 1)
 
 
 def _tracks(bodies: Bodies, rows_of_track: list[Int[np.ndarray, " N"]]) -> list[_Track]:

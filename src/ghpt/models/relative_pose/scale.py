@@ -92,7 +92,9 @@ def bone_scales(
     one, other = torch.tensor(BONES, device=points.device).T
     measured = (points[..., one, :] - points[..., other, :]).double().norm(dim=-1)
     both = estimated[..., one] & estimated[..., other] & torch.isfinite(measured)
-    middle = torch.where(both, measured, torch.nan).nanmedian(-2).values
+    shown = torch.where(both, measured, torch.nan)
+    shown = torch.nn.functional.pad(shown, (0, 0, 0, 1), value=torch.nan)  # of no poses, no median
+    middle = shown.nanmedian(-2).values
     known = torch.where(lengths > 0, lengths.double(), torch.nan).to(points.device)
     return torch.where(middle > 0, known / middle, torch.nan)
 

@@ -18,6 +18,8 @@ from typing import Any
 PACKAGE = "ghpt"
 PRESENTATION = "ghpt.report"
 """The package that shows numbers and decides none: it is not followed."""
+_ROOT = Path(__file__).resolve().parents[2]
+"""The package's folder."""
 LIBRARIES = ("torch", "numpy", "lightning")
 """Libraries that count with their versions."""
 
@@ -130,10 +132,16 @@ def _absolute(node: ast.ImportFrom, package: str) -> str:
 
 
 def data_files(file: Path) -> list[Path]:
-    """Return the files beside a module, other than Python's, whose names are texts of its code."""
-    texts = {node.value for node in ast.walk(_parse(file)) if isinstance(node, ast.Constant)}
+    """Return the data files of the package that the texts of a module's code name.
+
+    They are files beside it, other than Python's, and arrays in a folder of the package.
+    """
+    constants = (node.value for node in ast.walk(_parse(file)) if isinstance(node, ast.Constant))
+    texts = {text for text in constants if isinstance(text, str)}
     beside = (path for path in file.parent.iterdir() if path.suffix != ".py" and path.is_file())
-    return sorted(path for path in beside if path.name in texts)
+    folders = (_ROOT / text for text in texts if text.isidentifier())
+    arrays = [path for folder in folders for path in folder.glob("*.npz")]
+    return sorted([*arrays, *(path for path in beside if path.name in texts)])
 
 
 @functools.cache

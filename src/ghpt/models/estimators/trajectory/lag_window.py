@@ -30,7 +30,7 @@ _REACH = 3.0
 """Deviations that a Gaussian average reaches."""
 _SINGULAR = 1e-9
 """Of the trace of a normal matrix: what makes that of parallel rays solvable."""
-_LOST = 0.7
+_LOST = 1.5
 """Views more that fit a frame's own points than fit the trajectory: then it has lost them."""
 _LEAST_LOST = 3
 """Frames that tell this."""

@@ -116,9 +116,9 @@ class TrajectorySolver:
     joint says. A residual r weighs ``(1 + (r / (kernel x deviation))^2)^-2`` (Geman-McClure), with
     a kernel for each round: ``kernels`` without bones, then ``bone_kernels`` with them. The motion
     prior is adapted to the current estimate before every second round, and in the last one, when
-    what is wrong has little weight left and may no longer pull, with ``last_factor``. ``exchange`` and ``others``:
-    what views may do beside seeing the joints of the person; null: nothing. ``group``: joints that
-    are solved at once.
+    what is wrong has little weight left and may no longer pull, with ``last_factor``. ``exchange``
+    and ``others``: what views may do beside seeing the joints of the person; null: nothing.
+    ``group``: joints that are solved at once.
     """
 
     motion: MotionPrior
