@@ -203,7 +203,9 @@ def _parse(word: str) -> Override:
     except HydraException:
         key, equals, value = word.partition("=")
         hint = "Such as data=cmu2 or 'data.cameras=[1,2]'; --help shows all settings."
-        if equals:
+        if equals and value.count("[") != value.count("]"):
+            hint = f"Write a list without spaces: {key}=[first,second]."
+        elif equals:
             hint = f"Quote the value: {shell_override(key, value)}."
         elif re.fullmatch(r"[A-Za-z_.]+", word):
             hint = f"Write {word}=VALUE. {hint}"

@@ -20,6 +20,7 @@ _SETTINGS = ("skeleton", "session", "rate_hz", "format", "least_confidence")
 """Of which an error says something, whatever the format is."""
 _LOOKED_AT = 200
 """Files and folders of a folder that are looked at."""
+_OWN = "For a first try: python detect.py videos={folder} output=pose/. Or "
 _DETECT = (
     "Run a 2D detector first: OpenPose (openpose.bin --video {file} --write_json {view}_json), "
     "or MMPose (python demo/inferencer_demo.py {file} --pose2d body26 --pred-out-dir pose)."
@@ -39,7 +40,10 @@ def explain_key_points(
     media = _media(path)
     if media is not None:
         kind, file = media
-        hint = _DETECT.format(file=file.name, view=file.stem if kind == "videos" else "cam1")
+        is_video = kind == "videos"
+        hint = _DETECT.format(file=file.name, view=file.stem if is_video else "cam1")
+        if is_video:
+            hint = _OWN.format(folder=file.parent) + hint[0].lower() + hint[1:]
         return GhptDataError(path, "", f"holds {kind} ({file.name}), not key points", hint)
     form = _camera_format(path)
     if form is not None:
