@@ -60,14 +60,14 @@ class MotionPrior:
         check(self.least <= self.most, "least", "is above most", "Exchange them.")
 
     def initial(
-        self, start: Float[Tensor, "3 J T"], placed: Bool[Tensor, "J T"], axis: TimeAxis
+        self, start: Float[Tensor, "3 J T"], sure: Bool[Tensor, "J T"], axis: TimeAxis
     ) -> Float[Tensor, "J T"]:
         """Return the deviation of second differences before there is an estimate, mm.
 
-        ``start``: single frames' points where ``placed``. Where most joints jump, the recording has
+        ``start``: single frames' points, of which those count that are ``sure``. Where most joints jump, the recording has
         been cut or the person has been thrown: there the deviation is that jump.
         """
-        known = placed[:, :-2] & placed[:, 1:-1] & placed[:, 2:]
+        known = sure[:, :-2] & sure[:, 1:-1] & sure[:, 2:]
         inside = _inside(axis.joined)[1:-1] & known
         length = torch.linalg.vector_norm(start.diff(n=2, dim=-1), dim=0)
         jump = torch.zeros_like(axis.joined, dtype=torch.float64)
@@ -76,7 +76,7 @@ class MotionPrior:
         limit = _JUMP * float(usual.median()) if len(usual) else 0.0
         deviation = torch.full_like(jump, self.first * axis.scale**2)
         deviation = torch.where(jump > limit, torch.maximum(deviation, jump), deviation)
-        return deviation.expand(placed.shape).clone()
+        return deviation.expand(sure.shape).clone()
 
     def adapt(self, points: Float[Tensor, "3 J T"], axis: TimeAxis) -> Float[Tensor, "J T"]:
         """Return the deviation of second differences around each frame of an estimate, mm."""

@@ -41,6 +41,8 @@ _SURE = 0.5
 """Robust weight from which a key point agrees with the estimate beyond doubt."""
 _SURE_VIEWS = 3
 """So many of a joint's say where it is whatever bones say; two wrong ones may agree by chance."""
+_SURE_DEVIATIONS = 3.0
+"""Residual up to which a key point agrees with the start."""
 _USUAL = 0.75
 """Quantile of a joint's accelerations that are expected where they are not seen."""
 _START_DEVIATION = 10.0
@@ -183,7 +185,7 @@ class _Rounds:
         self.near = solver.bones.near(self.both_placed, frames.axis)
         self.tolerance = solver.tolerance
         self.given = body
-        self.deviation = solver.motion.initial(frames.start, frames.placed, frames.axis)
+        self.deviation = solver.motion.initial(frames.start, self._sure_start(), frames.axis)
         self.seen = frames.rows.used.any(0)
         self.crossed = frames.placed
         self.sure = torch.zeros_like(frames.placed)
@@ -271,6 +273,15 @@ class _Rounds:
             body.precision,
             self.frames.axis,
         )
+
+    def _sure_start(self) -> Bool[Tensor, "J T"]:
+        """Return which points of the start most of the joint's views agree with."""
+        frames = self.frames
+        residual = self.rows.residuals(frames.start)
+        noise = joint_noise(residual, self.rows.used, self.weight, self.solver.noise)
+        agrees = self.rows.used & (residual <= _SURE_DEVIATIONS * noise[:, None])
+        enough = self.rows.used.sum(0).clamp(max=_SURE_VIEWS)
+        return frames.placed & (agrees.sum(0) >= enough)
 
     def _join_start(self) -> Float[Tensor, "3 J T"]:
         """Return the start with what is missing in it carried over through time."""
