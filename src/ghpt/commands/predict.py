@@ -291,6 +291,7 @@ def _measures(result: PredictionResult) -> Measures:
         held_out_error=result.scales.all,
         view_errors=result.scales.views,
         rejected=rejected / placed if placed else 0.0,
+        completeness=result.coverage.completeness,
     )
 
 
