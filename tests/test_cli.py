@@ -105,7 +105,7 @@ def test_train_then_test_as_typed(command, tmp_path):
     log = events(tested)
     assert {tag.partition("/")[0] for tag in log.Tags()["scalars"]} == {"test"}
     assert log.Tags()["histograms"]
-    assert {"skeletons", "pose_prior/S0"} <= set(log.Tags()["images"])
+    assert {"visual/skeletons", "visual/pose_prior_S0"} <= set(log.Tags()["images"])
     assert "_hparams_/session_start_info" in log.summary_metadata
     metrics = json.loads((tested / "metrics.json").read_text())
     assert f"{metrics['selections']['weight']['mpjpe_relative']:.1f}" in table
