@@ -457,4 +457,4 @@ def test_the_option_of_a_sweep_may_stand_anywhere():
     words = ["data=cmu1,cmu2", "-m", "seed=1"]
     assert flags_first(words) == ["-m", "data=cmu1,cmu2", "seed=1"]
     arguments = parse_options(get_args_parser(), ["data=cmu1", "--cfg", "job", "seed=1"])
-    assert arguments.overrides == ["data=cmu1", "seed=1"]
+    assert (arguments.overrides, arguments.cfg) == (["data=cmu1", "seed=1"], "job")
