@@ -5,8 +5,8 @@ second error one detection in ten 100 pixels off. A point is one joint of one fr
 one hypothesis. pycolmap and the loop work point by point, so their speed is taken on fewer frames.
 ``pycolmap alone`` is its LO-RANSAC on cameras and arrays that are made beforehand: the fastest that
 it can be called from Python. ``predict`` is ``estimator=frame`` with states, covariances and
-exchanged sides. The second table divides the time of twice the frames, or views, by twice the time of one: 1
-is linear.
+exchanged sides. The second table divides the time of twice the frames, or views, by twice the time
+of one: 1 is linear.
 
 Settings: ``views=4,7,10,31`` ``frames=512`` ``loop_frames=64`` ``least=1`` (seconds for each
 figure).

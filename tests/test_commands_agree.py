@@ -25,7 +25,7 @@ from test_verdict import NAMES, RIG, late, pixels, points_file
 
 pytestmark = pytest.mark.usefixtures("blank_figures")
 
-OF_THE_RESULT = ("left_out_error", "few_views_agree", "rejected")
+OF_THE_RESULT = ("left_out_error", "few_views_agree", "rejected", "little_observed")
 """What predict.py says of its own result."""
 QUICK = ("camera_check.clean=0.004", "camera_check.frames=24", "camera_check.shift=12")
 Said = set[tuple[str, tuple[str, ...]]]

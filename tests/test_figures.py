@@ -150,7 +150,7 @@ def test_events_hold_the_numbers_of_metrics_json(tmp_path):
     assert scalar.value == pytest.approx(wanted, rel=1e-6)
     assert all(tag.startswith("test/") for tag in tags["scalars"])
     assert tags["tensors"] == ["report/text_summary"]
-    assert set(tags["images"]) == {"skeletons", "pose_prior/S9"}
+    assert set(tags["images"]) == {"visual/skeletons", "visual/pose_prior_S9"}
     assert set(tags["histograms"]) == {f"weights/{x}" for x in ("entropy", "max", "effective")}
     assert any(tag.startswith("_hparams_") for tag in events.summary_metadata)
 

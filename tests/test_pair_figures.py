@@ -102,7 +102,7 @@ def test_events_hold_the_numbers_of_metrics_json(tmp_path):
     assert scalar.value == pytest.approx(measured.selections["weight"].headline, rel=1e-6)
     assert all(tag.startswith("test/") for tag in tags["scalars"])
     assert tags["tensors"] == ["report/text_summary"]
-    assert set(tags["images"]) == {"rig"}
+    assert set(tags["images"]) == {"visual/rig"}
     assert set(tags["histograms"]) == {f"weights/{x}" for x in ("entropy", "max", "effective")}
     assert any(tag.startswith("_hparams_") for tag in events.summary_metadata)
 

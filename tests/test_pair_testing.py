@@ -73,7 +73,7 @@ def test_files_table_and_events(checkpoint, tmp_path, capsys):
     assert "synthetic toy" in " ".join((tmp_path / "report.md").read_text().split())
     assert f"{metrics['selections']['weight']['E_3D']:.1f} mm" in summary(result)
     tags = EventAccumulator(str(tmp_path), size_guidance={"images": 0}).Reload().Tags()
-    assert "rig" in tags["images"]
+    assert "visual/rig" in tags["images"]
     assert "test/weight" in tags["scalars"]
     assert not list(tmp_path.glob(".predictions*"))
 

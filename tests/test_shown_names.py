@@ -84,7 +84,12 @@ def prediction() -> PredictionResult:
         fill_frames=None,
         smooth_hz=None,
         coverage=Coverage(
-            3, {"observed": 1.0, "supported": 0.0, "filled": 0.0}, {BAD: 1.0}, {BAD: 2}, 1700.0
+            frames=3,
+            share={"observed": 1.0, "supported": 0.0, "filled": 0.0},
+            observed={BAD: 1.0},
+            completeness=1.0,
+            swapped={BAD: 2},
+            stature_mm=1700.0,
         ),
         scales=ScaledErrors(None, {}),
         unit_mm=1.0,

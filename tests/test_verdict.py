@@ -123,11 +123,14 @@ def test_a_good_recording_is_good(tmp_path):
     assert "**good**" in (tmp_path / "out" / "report.md").read_text()
 
 
-@pytest.mark.parametrize(("frames", "views"), [(10, 4), (160, 2)])
+@pytest.mark.parametrize(("frames", "views"), [(20, 4), (160, 2)])
 def test_little_to_go_by_is_no_alarm(frames, views, tmp_path):
     used = ",".join(NAMES[:views])
-    numbers = judged(tmp_path, pixels()[:frames, :views], None, f"views=[{used}]")
+    values = pixels()[:, :views].copy()
+    values[frames // 2 :] = np.nan
+    numbers = judged(tmp_path, values[:frames], None, f"views=[{used}]")
     assert numbers["verdict"]["level"] == "good"
+    assert numbers["completeness"] > 0.9
     assert any("left-out views" in text for text in numbers["verdict"]["undecidable"]) == (
         views == 2
     )
@@ -275,8 +278,9 @@ def said(
     error: float = 0.01,
     rejected: float = 0.0,
     unit_mm: float = 1000.0,
+    observed: float = 1.0,
 ):
-    measures = Measures(height, error, dict.fromkeys(NAMES, error), rejected)
+    measures = Measures(height, error, dict.fromkeys(NAMES, error), rejected, observed)
     commands = Commands("cameras", "calibrate", lambda **more: f"predict {more}")
     return judge()(measures, (), unit_mm, commands)
 
@@ -310,6 +314,15 @@ def test_left_out_errors_and_rejected_joints_decide():
         Level.LOOK,
         Level.DO_NOT_USE,
     ]
+    assert [said(observed=part).level for part in (0.6, 0.4)] == [Level.GOOD, Level.LOOK]
+
+
+def test_a_recording_with_hardly_any_key_points_is_not_good(tmp_path):
+    values = pixels(2.0).copy()
+    values[np.random.default_rng(0).random(values.shape[:-1]) > 0.1] = np.nan
+    numbers = judged(tmp_path, values)
+    assert codes(numbers)[-1] == "little_observed"
+    assert 0 < numbers["completeness"] < 0.1
 
 
 def test_a_unit_is_suggested_in_which_the_person_is_one():

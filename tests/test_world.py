@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ghpt.commands.prediction.world import choose_world
 from ghpt.errors import GhptConfigError
 from ghpt.geometry.similarity import Similarity
-from ghpt.geometry.upright import ANKLES, upright
+from ghpt.geometry.upright import ANKLES, centre_of_mass, upright
 from ghpt.skeleton import JOINT, JOINTS
 from predicting import walk
 from reconstructions import in_parts, random_reconstruction, rig
@@ -52,6 +52,24 @@ def test_the_floor_says_what_is_up_where_people_lean():
     """8 degrees forward over 6 m: the trunk alone would be off by as much."""
     points = leaning_walk(8.0, 6.0)
     assert tilt_deg(points, world_of(points)) < 2.5
+
+
+def test_who_bends_forward_on_one_spot_stands_over_their_feet():
+    """The trunk leans by 35 degrees, and the hips are as far behind as the balance asks."""
+    points = walk(120)[:1].double()
+    points[:, list(ANKLES), 2] = points[:, list(ANKLES), 2].mean()
+    aside = (points[0, JOINT["left_hip"]] - points[0, JOINT["right_hip"]])[:2]
+    ahead = torch.tensor([aside[1], -aside[0], 0.0]) / aside.norm()
+    legs = [JOINT[f"{side}_{part}"] for side in ("left", "right") for part in ("hip", "knee")]
+    upper = [j for j in range(len(JOINTS)) if j not in (*legs, *ANKLES, JOINT["pelvis"])]
+    height = points[:, upper, 2] - points[:, JOINT["pelvis"], 2, None]
+    points[:, upper] += np.tan(np.radians(35)) * height[..., None] * ahead
+    rest = [j for j in range(len(JOINTS)) if j not in ANKLES]
+    valid = torch.ones(1, len(JOINTS), dtype=torch.bool)
+    for _ in range(20):
+        centre, _ = centre_of_mass(points, valid)
+        points[:, rest] -= (centre - points[:, list(ANKLES)].mean(1) - 30 * ahead) @ ahead * ahead
+    assert tilt_deg(points, world_of(points)) < 3
 
 
 def test_feet_on_one_spot_do_not_turn_a_person_who_stands_straight():

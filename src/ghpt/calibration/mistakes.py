@@ -538,6 +538,11 @@ LEFT_OUT_ERROR = Mistake(
 FEW_VIEWS_AGREE = Mistake(
     "few_views_agree", "{agree} of {views} views agree with the others", "check the cameras"
 )
+LITTLE_OBSERVED = Mistake(
+    "little_observed",
+    "{value:.1%} of the joints are observed, from the first frame with one to the last",
+    "the report says which joints; take key points that are more complete",
+)
 REJECTED = Mistake(
     "rejected",
     "no two views explain {value:.1%} of the joints, which were rejected",

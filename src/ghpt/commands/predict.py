@@ -39,7 +39,7 @@ from ghpt.commands.prediction.statistics import (
     measure_coverage,
 )
 from ghpt.commands.prediction.verdict import Judge, Level, Measures
-from ghpt.commands.prediction.world import World, choose_world
+from ghpt.commands.prediction.world import Seen, World, choose_world
 from ghpt.config import build
 from ghpt.data.people.sequence import Sequence
 from ghpt.errors import GhptDataError, check
@@ -52,6 +52,7 @@ from ghpt.models.estimators.joint_means import JointMeans
 from ghpt.models.estimators.predictors import Estimate, Predictor
 from ghpt.models.estimators.trajectory.predictor import TrajectoryPredictor
 from ghpt.models.estimators.trajectory.priors import NOMINAL_RATE
+from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.provenance import provenance
 from ghpt.reconstruction import About, Reconstruction
 from ghpt.report.course import sample_course
@@ -102,7 +103,8 @@ def predict(settings: PredictSettings, output: Path) -> PredictionResult | None:
         folder = _person_folder(output, person)
         folder.mkdir(parents=True, exist_ok=True)
         shards = _person_folder(output / SHARDS, person)
-        found = _predict_person(settings, setup, sequence, world, folder, shards)
+        others = sequences[person + 1 :]
+        found = _predict_person(settings, setup, sequence, others, world, folder, shards)
         if found is not None:
             world = found.world
             results.append(_judge(settings, setup, sequence, found.result, person, output))
@@ -182,14 +184,15 @@ def _predict_person(
     settings: PredictSettings,
     setup: _Setup,
     sequence: Sequence,
+    others: list[Sequence],
     world: World | None,
     output: Path,
     folder: Path,
 ) -> _Predicted | None:
     """Predict one person and write their poses into ``output``, with shards in ``folder``.
 
-    ``world`` is that of the files, None where it is to be chosen by this person. Returns None in
-    the processes beside the first.
+    ``world`` is that of the files, None where it is to be chosen by this person and the ``others``.
+    Returns None in the processes beside the first.
     """
     estimator = setup.estimator
     gaps = Gaps(
@@ -227,7 +230,7 @@ def _predict_person(
             return None
         with apply_gaps(gaps, shards, len(sequence.skeleton), output) as key_points:
             own = _map_chunks(key_points, joints)
-            world = world or _choose_world(settings, sequence, about, own)
+            world = world or _choose_world(settings, sequence, others, about, own)
             chunks = _map_chunks(own, world.reconstruction)
             scene = _scene(settings, setup, world, sequence, shards, videos)
             _write_formats(settings, output, world, about, chunks, formats, scene)
@@ -288,6 +291,7 @@ def _measures(result: PredictionResult) -> Measures:
         held_out_error=result.scales.all,
         view_errors=result.scales.views,
         rejected=rejected / placed if placed else 0.0,
+        completeness=result.coverage.completeness,
     )
 
 
@@ -309,11 +313,25 @@ def _map_chunks(chunks: Chunks, function: Callable[[Reconstruction], Reconstruct
 
 
 def _choose_world(
-    settings: PredictSettings, sequence: Sequence, about: About, chunks: Chunks
+    settings: PredictSettings,
+    sequence: Sequence,
+    others: list[Sequence],
+    about: About,
+    chunks: Chunks,
 ) -> World:
     cameras = sequence.cameras.cameras
+    floor = settings.floor
     total = len(sequence)
-    return choose_world(settings.world, settings.floor, cameras, about.joints, chunks, total)
+    seen = (_see(settings, other) for other in others)
+    return choose_world(settings.world, floor, cameras, about.joints, chunks, total, seen)
+
+
+def _see(settings: PredictSettings, sequence: Sequence) -> Seen:
+    """Return the joints of a person in a few frames, each on its own."""
+    estimator: Estimator = build(settings.baselines["adaptive_ransac"], "baselines.adaptive_ransac")
+    poses = estimator(sequence.read(sequence.spread(MEASURED_FRAMES)))
+    joints = joints_of(settings, sequence.skeleton).average_points(poses)
+    return joints.points + sequence.origin, joints.estimated
 
 
 def _fit(estimator: PoseEstimator, sequence: Sequence, settings: PredictSettings) -> Predictor:

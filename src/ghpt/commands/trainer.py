@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import lightning as L
+import torch
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.pytorch.loggers import Logger, TensorBoardLogger
 
@@ -32,12 +33,23 @@ def make_trainer(settings: Mapping[str, Any], **ours: Any) -> L.Trainer:
     precision = built.get("precision", _PRECISIONS[0])
     hint = f"Existing: {', '.join(_PRECISIONS)}."
     check(precision in _PRECISIONS, "trainer.precision", f"is {precision!r}", hint)
+    accelerator = built.get("accelerator")
+    problem = f"is {accelerator}, and this machine has none that PyTorch can use"
+    check(_is_available(accelerator), "trainer.accelerator", problem, "Take trainer=cpu.")
     check_arguments(L.Trainer, built, "trainer")
     try:
         return L.Trainer(**built, **ours, use_distributed_sampler=False)
     except (TypeError, ValueError, MisconfigurationException) as error:
         hint = "See lightning.Trainer's arguments."
         raise GhptConfigError("trainer", str(error).rstrip(".!"), hint) from error
+
+
+def _is_available(accelerator: object) -> bool:
+    """Return whether a graphics processor that is asked for is there."""
+    nvidia = torch.cuda.is_available()
+    apple = torch.backends.mps.is_available()
+    there = {"gpu": nvidia or apple, "cuda": nvidia, "mps": apple}
+    return there.get(str(accelerator), True)
 
 
 def progress(shown: bool) -> list[L.Callback]:

@@ -14,7 +14,13 @@ from ghpt.report.pair_figures import rig_figure
 from ghpt.report.pair_tables import pair_report_document, pair_summary_document
 from ghpt.report.report import Report
 from ghpt.report.tables import title
-from ghpt.report.tensorboard import log_document, write_hyperparameters, write_parts, write_weights
+from ghpt.report.tensorboard import (
+    FIGURES,
+    log_document,
+    write_hyperparameters,
+    write_parts,
+    write_weights,
+)
 
 SHOWN = ("weight", "rig")
 """The estimates in the figure of the rig, where they are; the draw is chosen by the first."""
@@ -64,7 +70,7 @@ def _write_rig(
         estimates,
         heading,
     )
-    writer.add_image("rig", image(figure), 0, dataformats="HWC")
+    writer.add_image(f"{FIGURES}/rig", image(figure), 0, dataformats="HWC")
 
 
 def _concatenate(estimates: Sequence[RelativePoseEstimate]) -> RelativePoseEstimate:

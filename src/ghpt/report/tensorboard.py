@@ -38,6 +38,8 @@ SHOWN = ("weight", "most", "least", "random")
 """The poses beside the truth in the figure of a frame."""
 _FINAL = ("weight", "average", "frame_learned", "trajectory", "rig")
 """The estimates whose errors stand beside the hyper-parameters, where there are such."""
+FIGURES = "visual"
+"""The group of the figures' tags: TensorBoard sorts groups, and curves are to come first."""
 _SAMPLE = 50
 """Blocks of `_BLOCK` frames, evenly over the run, that histograms and the figure are made of."""
 _BLOCK = 1000
@@ -123,14 +125,15 @@ def _write_skeletons(
     up = up_axis(torch.cat(truth).double().numpy())
     true_pose = chunk.sample.as_truth().points[0].double().numpy()
     figure = skeletons(true_pose, poses, up, heading)
-    writer.add_image("skeletons", image(figure), 0, dataformats="HWC")
+    writer.add_image(f"{FIGURES}/skeletons", image(figure), 0, dataformats="HWC")
 
 
 def _write_pose_prior(writer: SummaryWriter, measured: PosesMeasured) -> None:
     first = next(iter(measured.selections.values()))
     for subject in first.pose_prior:
         figure = pose_prior_bars(pose_priors(measured, subject), subject, title(measured.run))
-        writer.add_image(f"pose_prior/{subject}", image(figure), 0, dataformats="HWC")
+        tag = f"{FIGURES}/pose_prior_{subject}"
+        writer.add_image(tag, image(figure), 0, dataformats="HWC")
 
 
 def log_document(writer: SummaryWriter, document: Document) -> None:

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from ghpt.calibration.comparison import BoneVariation, ViewErrors, bone_variations, view_errors
@@ -41,6 +41,10 @@ class Coverage:
     """Share of the joints in each state."""
     observed: dict[str, float]
     """Share of the frames in which each joint is observed."""
+    completeness: float
+    """Mean of ``observed`` over the body's joints that are observed at all, and over the frames
+    from the first with such a joint to the last; 0 without any.
+    """
     swapped: dict[str, int]
     """Number of the frames in which each view had left and right exchanged."""
     stature_mm: float | None
@@ -94,10 +98,13 @@ def measure_coverage(
     step = max(1, -(-total // MEASURED_FRAMES))
     points = []
     observed = []
+    body = [joints.index(name) for name in JOINTS if name in joints] or list(range(len(joints)))
+    present = []
     for chunk in chunks:
         measured = slice(-frames % step, None, step)
         points.append(chunk.points[measured].double())
         observed.append(chunk.state[measured] == State.OBSERVED)
+        present.append((chunk.state[:, body] == State.OBSERVED).any(1))
         frames += len(chunk)
         counts = [(chunk.state == state).sum(0) for state in FILE_STATES]
         states += torch.stack(counts, dim=1)
@@ -116,9 +123,21 @@ def measure_coverage(
         frames=frames,
         share=share,
         observed=dict(zip(joints, observed_share, strict=True)),
+        completeness=_completeness(states[body, State.OBSERVED], torch.cat(present)),
         swapped=dict(zip(views, flipped.tolist(), strict=True)),
         stature_mm=height or None,
     )
+
+
+def _completeness(counts: Int[Tensor, " J"], present: Bool[Tensor, " T"]) -> float:
+    """Return the share of joints that are observed. ``counts``: frames in which each joint is;
+    ``present``: frames in which any is.
+    """
+    frames = present.nonzero()[:, 0]
+    if not len(frames):
+        return 0.0
+    between = int(frames[-1] - frames[0]) + 1
+    return float(counts[counts > 0].double().mean()) / between
 
 
 @torch.no_grad()

@@ -13,6 +13,7 @@ from ghpt.calibration.mistakes import (
     FEW_VIEWS_AGREE,
     FRAME_RATE,
     LEFT_OUT_ERROR,
+    LITTLE_OBSERVED,
     OUT_OF_SYNC,
     REJECTED,
     size_finding,
@@ -48,6 +49,8 @@ class Measures:
     """Held out, or of reprojection where nothing can be; None where too little is seen."""
     rejected: float
     """The share of the joints with a position that no two views explain."""
+    completeness: float
+    """The share of the joints that are observed, see `Coverage.completeness`."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,7 @@ class Judge:
     ``error``, ``wrong``: held-out errors of all views to look at, and not to use. ``views``: least
     share of the views that agree, those with an error of at most ``astray``. ``rejected``,
     ``lost``: shares of the joints with a position that are rejected to look at, and not to use.
+    ``observed``: least share of the joints that are observed.
     """
 
     error: float
@@ -100,6 +104,7 @@ class Judge:
     views: float
     rejected: float
     lost: float
+    observed: float
 
     def __post_init__(self) -> None:
         check_positive(**vars(self))
@@ -124,6 +129,7 @@ class Judge:
             *self._error(measures, commands),
             *self._agreement(measures, commands),
             *self._check_rejected(measures.rejected, commands),
+            *self._check_observed(measures.completeness, commands),
         ]
         findings.sort(key=lambda finding: -_LEVELS[finding.severity])
         return Verdict(tuple(findings), tuple(_undecidable(measures)))
@@ -156,6 +162,11 @@ class Judge:
         if share > self.rejected:
             severity, limit = _grade(share, self.rejected, self.lost)
             found = REJECTED.finding((), share, limit, severity)
+            yield replace(found, command=commands.cameras)
+
+    def _check_observed(self, share: float, commands: Commands) -> Iterator[Finding]:
+        if share < self.observed:
+            found = LITTLE_OBSERVED.finding((), share, self.observed, Severity.WARNING)
             yield replace(found, command=commands.cameras)
 
 

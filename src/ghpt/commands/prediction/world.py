@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from ghpt.errors import check
@@ -18,6 +19,8 @@ from ghpt.models.relative_pose.scale import MEASURED_FRAMES
 from ghpt.reconstruction import About, Reconstruction, State, concatenate, select_frames
 from ghpt.skeleton import JOINTS
 
+Seen = tuple[Float[Tensor, "T J 3"], Bool[Tensor, "T J"]]
+"""Somebody's joints in some frames, and which of them are observed."""
 WORLDS = ("cameras", "people", "first")
 _WORDS = {
     "cameras": "the cameras' own",
@@ -84,10 +87,12 @@ def choose_world(
     joints: tuple[str, ...],
     chunks: Chunks,
     total: int,
+    others: Iterable[Seen] = (),
 ) -> World:
     """Return the world ``name``: ``cameras``, ``people`` or ``first``.
 
-    ``people`` is that of `upright`, on evenly spread frames of the ``total``. ``floor``: the joints
+    ``people`` is that of `upright`, on evenly spread frames of the ``total`` and of the
+    ``others``, more people with the same joints. ``floor``: the joints
     that stand on it; None: heels and toes where they are observed, else the ankles. Raises
     GhptConfigError for one that is no joint, or that is never observed.
     """
@@ -100,13 +105,16 @@ def choose_world(
     poses = _sample(chunks, total)
     observed = poses.state == State.OBSERVED
     feet = _feet(floor, joints, observed)
+    everybody = [(poses.points, observed), *others]
+    points = torch.cat([of_one for of_one, _ in everybody])
+    known = torch.cat([of_one for _, of_one in everybody])
     at = [joints.index(foot) for foot in feet]
     human = torch.tensor([joints.index(name) if name in joints else -1 for name in JOINTS])
     change = upright(
-        poses.points[:, human],
-        observed[:, human] & (human >= 0),
+        points[:, human],
+        known[:, human] & (human >= 0),
         cameras.to(torch.float64),
-        poses.points[:, at][observed[:, at]] if at else None,
+        points[:, at][known[:, at]] if at else None,
     )
     return World(name, change)
 

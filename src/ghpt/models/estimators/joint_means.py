@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from ghpt.observations import PoseEstimate
 from ghpt.reconstruction import Reconstruction, State
 from ghpt.skeleton import HUMAN36M, JOINTS, NamePair, Skeleton
 
@@ -39,6 +40,14 @@ class JointMeans:
         """Return the joints of a part of a reconstruction."""
         means = self._average(part)
         return part.with_joints(means).select_joints(self._places)
+
+    def average_points(self, poses: PoseEstimate) -> PoseEstimate:
+        """Return the joints of poses of key points, where all parts of a joint are estimated."""
+        weights = self._matrix
+        part = weights > 0
+        points = torch.where(poses.estimated[..., None], poses.points.double(), 0.0)
+        complete = (part & ~poses.estimated[:, None]).sum(-1) == 0
+        return PoseEstimate(weights @ points, complete & part.any(-1))
 
     @property
     def key_point_joints(self) -> tuple[tuple[int, int], ...]:

@@ -64,8 +64,9 @@ class MotionPrior:
     ) -> Float[Tensor, "J T"]:
         """Return the deviation of second differences before there is an estimate, mm.
 
-        ``start``: single frames' points, of which those count that are ``sure``. Where most joints jump, the recording has
-        been cut or the person has been thrown: there the deviation is that jump.
+        ``start``: single frames' points, of which those count that are ``sure``. Where most of
+        these jump, the recording has been cut or the person has been thrown: there the deviation is
+        that jump.
         """
         known = sure[:, :-2] & sure[:, 1:-1] & sure[:, 2:]
         inside = _inside(axis.joined)[1:-1] & known
