@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from ghpt.commands.display import shell_override
 from ghpt.data.formats.validate import read_npy
 from ghpt.errors import GhptCheckpointError, GhptDataError
 from ghpt.models.checkpoint import FIELD, FORMAT_VERSION, AtomicCheckpointIO, load_model
@@ -48,7 +49,8 @@ def main() -> None:
         convert(arguments.weights, arguments.output, arguments.truth, arguments.unit_mm)
     except (GhptCheckpointError, GhptDataError) as error:
         parser.exit(1, f"error: {error}\n")
-    print(f"Written: {arguments.output}. Test it: python test.py ckpt={arguments.output} data=h36m")
+    data = " ".join(data_settings(arguments.truth[0]))
+    print(f"Written: {arguments.output}. Test it: python test.py ckpt={arguments.output} {data}")
 
 
 def convert(weights: Path, output: Path, truth: list[Path], unit_mm: float = 1.0) -> None:
@@ -101,6 +103,13 @@ def convert(weights: Path, output: Path, truth: list[Path], unit_mm: float = 1.0
     output.parent.mkdir(parents=True, exist_ok=True)
     AtomicCheckpointIO().save_checkpoint(checkpoint, output)
     load_model(output)
+
+
+def data_settings(truth: Path) -> list[str]:
+    """Return the settings of the data set that a file of truth belongs to."""
+    if read_npy(truth, (None, None, 3), "f").shape[1] == len(JOINTS):
+        return ["data=h36m", shell_override("data.root", truth.resolve().parents[1])]
+    return ["data=cmu2", shell_override("data.root", truth.resolve().parent)]
 
 
 def read_layers(path: Path) -> list[tuple[torch.Tensor, torch.Tensor]]:

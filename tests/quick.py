@@ -1,6 +1,6 @@
 """What makes the tests quick and changes none of their results.
 
-1. Yaml is parsed by libyaml.
+1. Yaml is parsed by libyaml, and a file of the configuration once in a process.
 2. Hydra composes a configuration once in a process, which asks for it many hundred times: which
    files a command line chooses, and what they come to together, is remembered with the state of
    the files. Values are set in a copy each time, by Hydra itself.
@@ -21,7 +21,9 @@ import omegaconf._utils
 import yaml
 from hydra._internal import config_loader_impl
 from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
 from hydra._internal.defaults_list import DefaultsList
+from hydra.plugins.config_source import ConfigResult
 
 
 def make_quick() -> None:
@@ -29,6 +31,7 @@ def make_quick() -> None:
     if hasattr(yaml, "CSafeLoader"):
         loader = _loader()
         omegaconf._utils.get_yaml_loader = lambda: loader
+    FileConfigSource.load_config = _remembered_file
     config_loader_impl.create_defaults_list = _remembered_list
     ConfigLoaderImpl._compose_config_from_defaults_list = _remembered_composition
     os.fsync = lambda handle: None
@@ -40,10 +43,23 @@ def _loader() -> Any:
         return omegaconf._utils.get_yaml_loader()
 
 
+_files: dict[Any, bytes] = {}
 _lists: dict[Any, DefaultsList] = {}
 _compositions: dict[Any, bytes] = {}
+_load = FileConfigSource.load_config
 _list = config_loader_impl.create_defaults_list
 _compose = ConfigLoaderImpl._compose_config_from_defaults_list
+
+
+def _remembered_file(source: FileConfigSource, config_path: str) -> ConfigResult:
+    path = os.path.join(source.path, source._normalize_file_name(config_path))
+    if not os.path.exists(path):
+        return _load(source, config_path)
+    state = os.stat(path)
+    key = (source.provider, path, state.st_mtime_ns, state.st_size)
+    if key not in _files:
+        _files[key] = pickle.dumps(_load(source, config_path))
+    return pickle.loads(_files[key])
 
 
 def _remembered_list(

@@ -118,13 +118,16 @@ def test_a_tracker_s_points_are_told_by_their_number_and_bones(name, camera, tmp
         read_person(path, "mpi_15")
 
 
-def test_hands_come_behind_the_body_the_right_one_first(tmp_path):
-    rows = ["0,0,0,0,0,1,2,,", "0,0,0,0,100,3,4,,", "0,0,0,0,220,5,6,,", "0,1,0,0,0,1,2,,"]
+def test_hands_come_behind_the_body_the_right_one_first(tmp_path, caplog):
+    caplog.set_level("INFO")
+    face = "0,0,0,0,300,1,2,,"
+    rows = ["0,0,0,0,0,1,2,,", face, "0,0,0,0,100,3,4,,", "0,0,0,0,220,5,6,,", "0,1,0,0,0,1,2,,"]
     found = read_person(table(tmp_path, *rows))
     assert found.joints == SKELETONS["mediapipe_75"]
     assert found.key_points[0, 0, found.joints.index("right_hand_root")].tolist() == [3, 4]
     assert found.key_points[0, 0, found.joints.index("left_pinky_finger4")].tolist() == [5, 6]
     assert found.valid.sum() == 4
+    assert "1 points of face" in caplog.text
 
 
 def test_another_csv_is_not_taken_for_it(tmp_path):

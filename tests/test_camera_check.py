@@ -264,8 +264,9 @@ def test_a_repair_that_leaves_a_view_worse_than_the_others_is_said_and_not_made(
     pixels = spoilt.evidence.pixels.clone()
     pixels[-1] += 20 * torch.randn(pixels[-1].shape, dtype=pixels.dtype, generator=generator)
     noisy = replace(spoilt, evidence=replace(spoilt.evidence, pixels=pixels))
-    result = check(noisy)
+    result = check(BREAKAGES["rotation_transposed"].spoil(noisy))
     found = {finding.code: finding for finding in result.findings}
+    assert found["rotation_transposed"].mended, "of all cameras, this one too"
     assert found["moved"].cameras == (spoilt.evidence.names[-1],)
     assert not found["moved"].mended
     torch.testing.assert_close(result.setup.R, spoilt.setup.R)

@@ -5,25 +5,26 @@ goes on.
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PureWindowsPath
 
 import numpy as np
 import pytest
 import torch
 from hydra._internal.utils import get_args_parser
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 import children
 import ghpt.commands.test as testing
 import toys
 from ghpt.commands.display import as_started, shell_override
-from ghpt.commands.overrides import flags_first, parse_options
+from ghpt.commands.overrides import flags_first, parse_options, use_slashes
 from ghpt.commands.train import COMMAND
-from ghpt.errors import GhptConfigError
 from ghpt.models import callbacks
 from ghpt.models.checkpoint import read_checkpoint
 from ghpt.models.module import StochasticEstimator
@@ -267,6 +268,26 @@ def test_values_are_typed_as_shell_and_hydra_take_them():
     assert shell_override("ckpt", "runs/1_a-2.0/last.ckpt") == "ckpt=runs/1_a-2.0/last.ckpt"
     assert shell_override("output", "runs/a=b") == "\"output='runs/a=b'\""
     assert shell_override("ckpt", "a b/[1],x=2") == "\"ckpt='a b/[1],x=2'\""
+    for value in ("März", "o'brien/$x", 'it\'s "new"', "my data\\", "a\\'b"):
+        (word,) = shlex.split(shell_override("output", value))
+        assert OverridesParser.create().parse_override(word).value() == value
+
+
+WINDOWS_PATHS = {
+    r"C:\data\pose": "C:/data/pose",
+    "'C:\\my data\\'": "C:/my data/",
+    r"'D:\März (1)\b'": "D:/März (1)/b",
+    r"\\server\share\pose": "//server/share/pose",
+    r"..\pose": r"..\pose",
+}
+
+
+@pytest.mark.parametrize("typed", WINDOWS_PATHS)
+def test_paths_of_windows_come_through(typed):
+    (word,) = use_slashes([f"keypoints={typed}"])
+    value = str(OverridesParser.create().parse_override(word).value())
+    assert value == WINDOWS_PATHS[typed]
+    assert PureWindowsPath(value) == PureWindowsPath(typed.strip("'"))
 
 
 @contextmanager
@@ -435,5 +456,5 @@ def test_commands_are_named_as_the_program_was_started(monkeypatch, program, sai
 def test_the_option_of_a_sweep_may_stand_anywhere():
     words = ["data=cmu1,cmu2", "-m", "seed=1"]
     assert flags_first(words) == ["-m", "data=cmu1,cmu2", "seed=1"]
-    with pytest.raises(GhptConfigError, match="seed=1: stands behind an option"):
-        parse_options(get_args_parser(), ["data=cmu1", "--cfg", "job", "seed=1"])
+    arguments = parse_options(get_args_parser(), ["data=cmu1", "--cfg", "job", "seed=1"])
+    assert (arguments.overrides, arguments.cfg) == (["data=cmu1", "seed=1"], "job")

@@ -54,6 +54,10 @@ SMALL = {
 """What makes a command quick, where it does not say otherwise itself."""
 SMALL_PAIRS = ("model.problem.draws=1", "model.problem.frames=20")
 
+OF_THE_TRAJECTORY = PAGES if sizes.NIGHTLY else PAGES[:1]
+"""Pages on which predict.py estimates the trajectory where nothing else is said: by day README.md
+alone, since a trajectory costs a second and tests of its own try it.
+"""
 LAID_OUT = ("runs/cmu2", "runs/camera")
 """Trained models that every page may start from."""
 PLACEHOLDERS = {
@@ -130,6 +134,9 @@ class Page:
         if OWN_SCORERS & set(words):
             given.add("model.scorer.layers")
         more = SMALL[command.script] + (SMALL_PAIRS if "model=camera" in words else ())
+        is_alone = command.page not in OF_THE_TRAJECTORY and "ckpt" not in given
+        if command.script == "predict.py" and is_alone:
+            more += ("estimator=frame",)
         words += [word for word in more if word.split("=")[0] not in given]
         main, files = MAINS[command.script]
         output = next(

@@ -18,7 +18,8 @@ def data(points: int = 553, coordinates: int = 3) -> np.ndarray:
 
 @pytest.mark.parametrize("points", [33, 543, 553])
 @pytest.mark.parametrize("inside", ["", "session/output_data/raw_data"])
-def test_the_body_of_each_camera_is_read(points, inside, tmp_path):
+def test_the_body_of_each_camera_is_read(points, inside, tmp_path, caplog):
+    caplog.set_level("INFO")
     folder = tmp_path / inside
     folder.mkdir(parents=True, exist_ok=True)
     np.save(folder / NAME, data(points))
@@ -29,6 +30,7 @@ def test_the_body_of_each_camera_is_read(points, inside, tmp_path):
     rows = found.points.take(found.first())
     np.testing.assert_array_equal(rows.pixels[0, 2], data(points)[2, 0, :33, :2])
     assert np.argwhere(~rows.valid).tolist() == [[2, 1, 5]]
+    assert (f"of {points} points" in caplog.text) == (points > 33)
 
 
 def test_what_is_none_of_it_is_named(tmp_path):

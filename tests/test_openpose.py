@@ -310,6 +310,13 @@ def test_hands_are_left_out_for_a_skeleton_without_them(tmp_path):
     assert read_key_points(folder, "body_25_hands").joints == SKELETONS["body_25_hands"]
 
 
+def test_faces_are_left_out_and_said(tmp_path, caplog):
+    caplog.set_level("INFO")
+    folder = write_with_hands(tmp_path, [{"face_keypoints_2d": np.ones((70, 3))}])
+    assert read_key_points(folder).joints == SKELETONS["body_25"]
+    assert "faces are not read" in caplog.text
+
+
 def test_half_a_hand_is_named(tmp_path):
     folder = write_with_hands(tmp_path, [{"hand_left_keypoints_2d": HAND[:20]}])
     with pytest.raises(GhptDataError, match=r"hand_left_keypoints_2d: are 20 points, not 21"):

@@ -18,6 +18,7 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 import sizes
 from composed import cameras_settings, compose
 from ghpt.calibration.check.units import unit_for, unit_of
+from ghpt.calibration.findings import Finding, Severity
 from ghpt.commands.cameras import CamerasSettings, check_cameras
 from ghpt.commands.prediction.next_commands import commands_on, setting
 from ghpt.commands.prediction.verdict import Commands, Judge, Level, Measures
@@ -330,6 +331,17 @@ def test_a_unit_is_suggested_in_which_the_person_is_one():
     assert [unit_for(height) for height in (1.7, 170.0, 1700.0, 67.0)] == [1000.0, 10.0, 1.0, 25.4]
     assert 1100 < 4.2 * unit_for(4.2) < 2300
     assert [unit_of(height) for height in (1.7, 170.0, 1700.0, 17.0)] == [1000.0, 10.0, 1.0, None]
+
+
+@pytest.mark.parametrize(
+    ("suspects", "command"),
+    [(1, f"predict {{'views': {list(NAMES[1:])}}}"), (2, "calibrate")],
+)
+def test_cameras_are_left_out_where_more_stay(suspects, command):
+    mistake = Finding("moved", Severity.WARNING, "is off", NAMES[:suspects])
+    measures = Measures(1730.0, 0.01, dict.fromkeys(NAMES, 0.01), 0.0, 1.0)
+    commands = Commands("cameras", "calibrate", lambda **more: f"predict {more}")
+    assert judge()(measures, [mistake], 1000.0, commands).findings[0].command == command
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import argparse
 import logging
 import os
+import re
 import string
 import sys
 import warnings
@@ -50,6 +51,7 @@ from ghpt.commands.overrides import (
     put_options_first,
     rename_settings,
     spread_seeds,
+    use_slashes,
 )
 from ghpt.config import plain
 from ghpt.config import settings as typed_settings
@@ -137,7 +139,7 @@ def _run(
 ) -> None:
     """Do what the command line asks for; jobs that end are added to ``ended``."""
     name = command if isinstance(command, str) else command.name
-    sys.argv[1:] = flags_first(expand_home(rename_settings(sys.argv[1:])))
+    sys.argv[1:] = flags_first(use_slashes(expand_home(rename_settings(sys.argv[1:]))))
     if name == "reproduce":
         sys.argv[1:] = spread_seeds(sys.argv[1:])
     if "--version" in sys.argv:
@@ -158,6 +160,10 @@ def _run(
     if _is_single(arguments):
         _run_single(source, job, arguments.overrides)
         return
+    if sweep and (arguments.cfg or arguments.help):
+        option = "--cfg" if arguments.cfg else "--help"
+        hint = "Leave out -m, and give one value of each setting."
+        raise GhptConfigError(option, "shows one run, and -m asks for several", hint)
     overrides = check_overrides(source, arguments.overrides, sweep)
     if arguments.help:
         print(_help(source, arguments.overrides))
@@ -381,7 +387,7 @@ def _folder_names(overrides: Sequence[Override]) -> list[str]:
     fixed = ",".join(
         str(o.key_or_group)
         for o in overrides
-        if not o.is_sweep_override() or "/" in (o.input_line or "")
+        if not o.is_sweep_override() or re.search(r"[/\\:]", o.input_line or "")
     )
     return [f"hydra.job.config.override_dirname.exclude_keys=[{fixed}]"]
 

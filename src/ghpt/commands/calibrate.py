@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Sequence
 from pathlib import Path
 
 from ghpt.calibration.check.camera_check import CameraCheck
 from ghpt.calibration.comparison import explain, triangulate_recording
 from ghpt.calibration.findings import Finding, Severity
 from ghpt.calibration.millimetres import read_scale
-from ghpt.calibration.mistakes import SEVERAL_PEOPLE
+from ghpt.calibration.mistakes import (
+    FRAME_RATE,
+    NOTHING_LINKED,
+    OUT_OF_SYNC,
+    SEVERAL_PEOPLE,
+    UNLINKED,
+)
 from ghpt.calibration.rig import RigCalibration
 from ghpt.commands.app import Command
 from ghpt.commands.calibration.beside import check_reference, compare_halves, difference
@@ -20,7 +27,12 @@ from ghpt.commands.calibration.unknowns import in_one_time, with_intrinsics
 from ghpt.commands.catalogue import run_by_name
 from ghpt.commands.display import display_path
 from ghpt.commands.outputs import Files, check_apart, input_paths
-from ghpt.commands.prediction.next_commands import commands_on, prediction_by
+from ghpt.commands.prediction.next_commands import (
+    EXAMPLE_HEIGHT,
+    command_line,
+    given_settings,
+    prediction_by,
+)
 from ghpt.config import build
 from ghpt.errors import GhptDataError
 from ghpt.files import remove, sweep_temporaries
@@ -38,6 +50,8 @@ from ghpt.report.rig_files import (
 from ghpt.report.terminal import print_document
 
 _REPORTS = ("calibration.json", "report.md", "report.html", "rig.png", "rig.svg")
+_OF_TIME = (OUT_OF_SYNC.code, FRAME_RATE.code, UNLINKED.code, NOTHING_LINKED.code)
+"""Findings that cameras which did not start together may explain."""
 _log = logging.getLogger(__name__)
 
 
@@ -80,6 +94,7 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     rig = solution.rig
     reference = case.reference_cameras
     halves = compare_halves(case, solution, calibration, settings)
+    findings = _findings(case, solution, camera_check)
     result = CalibrationResult(
         data=case.sequence.title,
         source=case.sequence.source,
@@ -97,9 +112,9 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
         evidence=estimate.evidence,
         difference=difference(estimate, rig, reference, placed),
         explains=explain(halves, estimator),
-        findings=_findings(case, solution, camera_check),
+        findings=findings,
         provenance=provenance(settings.seed),
-        command=_next_command(settings, bool(usable), output),
+        command=_next_command(settings, bool(usable), findings, output),
     )
     points = change.points(estimate.points)
     estimated = estimate.estimated
@@ -119,11 +134,37 @@ def calibrate(settings: CalibrateSettings, output: Path) -> CalibrationResult:
     return result
 
 
-def _next_command(settings: CalibrateSettings, has_rig: bool, output: Path) -> str:
-    """Return what to type after the calibration: predict by the rig, or calibrate better."""
+def _next_command(
+    settings: CalibrateSettings, has_rig: bool, findings: Sequence[Finding], output: Path
+) -> str:
+    """Return what to type after the calibration: predict by the rig, or calibrate better, in one
+    time where the cameras' clocks may be to blame.
+    """
     if has_rig:
         return prediction_by(settings, output, cameras=output / "rig.toml")
-    return commands_on(settings, {}, output).calibrate
+    given = given_settings(settings) | _own_settings(settings)
+    if any(found.code in _OF_TIME for found in findings):
+        given["time"] = "estimate"
+    return command_line("calibrate.py", given, f"{display_path(output)}_calibrated")
+
+
+def _own_settings(settings: CalibrateSettings) -> dict[str, object]:
+    """Return what was given of the settings that calibrate.py alone has and that a next run needs;
+    a body height where no length was given.
+    """
+    scale = settings.scale
+    lengths = {
+        "scale.height": scale.height,
+        "scale.segments": scale.segments,
+        "scale.baseline": scale.baseline,
+    }
+    own: dict[str, object] = {key: value for key, value in lengths.items() if value is not None}
+    own = own or {"scale.height": EXAMPLE_HEIGHT}
+    if settings.image_size is not None:
+        own["image_size"] = settings.image_size
+    if settings.more_keypoints:
+        own["more_keypoints"] = settings.more_keypoints
+    return own
 
 
 def _raise_errors(result: CalibrationResult, report: str) -> None:

@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -49,7 +50,22 @@ def display_path(path: Path) -> str:
     return str(path) if relative.startswith("..") else relative
 
 
+def slash_path(text: str) -> str:
+    """Return a text with slashes if it is a path of Windows with a drive or a server, quoted or
+    not.
+
+    To Hydra a backslash before a quote, or before another one, is no letter of the path: a quoted
+    C:\\data\\ would not end. Windows takes both.
+    """
+    is_path = re.match(r"""["']?([A-Za-z]:\\|\\\\\w)""", text)
+    return text.replace("\\", "/") if is_path else text
+
+
 def shell_override(key: str, value: object) -> str:
     """Return ``key=value`` as a shell and Hydra's grammar take it."""
-    plain = re.fullmatch(r"[\w./+-]+", str(value))
-    return f"{key}={value}" if plain else f"\"{key}='{value}'\""
+    text = slash_path(str(value))
+    if re.fullmatch(r"[\w./+-]+", text, re.ASCII):
+        return f"{key}={text}"
+    quoted = re.sub(r"(\\*)('|$)", r"\1\1\2", text).replace("'", "\\'")
+    word = f"{key}='{quoted}'"
+    return shlex.quote(word) if re.search(r'[$"`!]|\\\\', word) else f'"{word}"'

@@ -19,7 +19,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 
-from ghpt.commands.display import shell_override
+from ghpt.commands.display import shell_override, slash_path
 from ghpt.config import suggest
 from ghpt.errors import GhptConfigError
 
@@ -144,6 +144,15 @@ def expand_home(words: Sequence[str]) -> list[str]:
         is_home = equals and re.match(r"~(/|\\|$)", value)
         expanded.append(f"{key}={Path(value).expanduser()}" if is_home else word)
     return expanded
+
+
+def use_slashes(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line, with slashes in the paths of Windows."""
+    changed = []
+    for word in words:
+        key, equals, value = word.partition("=")
+        changed.append(f"{key}{equals}{slash_path(value)}")
+    return changed
 
 
 def flags_first(words: Sequence[str]) -> list[str]:

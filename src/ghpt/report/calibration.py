@@ -10,6 +10,13 @@ from ghpt.calibration.comparison import Explanation, Quantiles
 from ghpt.calibration.findings import Finding
 from ghpt.calibration.independence import Evidence
 from ghpt.calibration.millimetres import RigScale
+from ghpt.calibration.mistakes import (
+    FLAT,
+    ILL_CONDITIONED,
+    NOT_CONVERGED,
+    PROPORTIONS,
+    UNLINKED,
+)
 from ghpt.models.relative_pose.scale import BONE_NAMES
 from ghpt.report.document import (
     Block,
@@ -26,6 +33,10 @@ from ghpt.report.tables import NONE
 
 _WANTED_DEG = 0.5
 """The standard deviation of a rotation that is asked for."""
+_UNDERMINING = tuple(
+    mistake.code for mistake in (UNLINKED, NOT_CONVERGED, ILL_CONDITIONED, FLAT, PROPORTIONS)
+)
+"""Findings with which a rig may be another than the ± allow for: they are of its neighbourhood."""
 Matrix = list[list[float]]
 _CAPTION = (
     "error: median reprojection; ±: standard deviation, for errors as the residuals show them"
@@ -178,7 +189,7 @@ def _rig_lines(result: CalibrationResult) -> list[Text]:
     """Return sentences on the rig as a whole."""
     lines: list[Text] = [f"Scale: {result.scale.text}."]
     if result.evidence is not None:
-        lines.append(_evidence_line(result.evidence))
+        lines.append(_evidence_line(result.evidence, result.findings))
     if result.intrinsics is not None:
         lines.append(f"Intrinsics: {result.intrinsics}.")
     if result.difference is not None:
@@ -196,11 +207,17 @@ def _rig_lines(result: CalibrationResult) -> list[Text]:
     return lines
 
 
-def _evidence_line(evidence: Evidence) -> str:
+def _evidence_line(evidence: Evidence, findings: Sequence[Finding]) -> str:
     """Return a sentence on what the recording is worth."""
     needed = evidence.frames_for(_WANTED_DEG)
     enough = f"That is enough for rotations to ± {_WANTED_DEG}°."
-    if needed is None:
+    undermining = next((found for found in findings if found.code in _UNDERMINING), None)
+    if undermining is not None:
+        enough = (
+            f"Whether that is enough for rotations to ± {_WANTED_DEG}° cannot be said "
+            f"({undermining.code}, see below)."
+        )
+    elif needed is None:
         enough = (
             f"For rotations to ± {_WANTED_DEG}° people must turn more: no number of frames like "
             "these is enough."

@@ -29,6 +29,10 @@ _PEOPLE = ("#888888", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 _PANELS = {"from above": (0, 1), "from the side": (0, 2)}
 _NAMED = "from above"
 """Where cameras do not hide each other."""
+_NAME_POINTS = 8
+"""The distance of a name from its camera, points."""
+_ASIDE = 0.4
+"""The part of that distance from which a name is written beside its camera, not across it."""
 _SKELETONS = 6
 _DOTS = 300
 """Most dots that show where a person was."""
@@ -105,8 +109,9 @@ def rig_figure(
             for centre, own in zip(centres, in_plane, strict=True):
                 _draw_ellipse(axes, centre, own, magnification)
         if view == _NAMED:
+            middle = centres.mean(0)
             for name, centre in zip(rig.names, centres, strict=True):
-                _write_name(axes, centre, name)
+                _write_name(axes, centre, centre - middle, name)
         _lay_out(axes, view, plane)
     handles = _legend(rig, magnification, None if other is None else reference_name)
     figure.legend(handles=handles, loc="outside lower center", ncols=3, frameon=False, fontsize=9)
@@ -131,14 +136,22 @@ def _magnification(covariance: Float[Tensor, "V 3 3"], length: float) -> int:
     return next(enough, _MAGNIFICATIONS[-1])
 
 
-def _write_name(axes: Axes, centre: Float[np.ndarray, " 2"], name: str) -> None:
+def _write_name(
+    axes: Axes, centre: Float[np.ndarray, " 2"], outward: Float[np.ndarray, " 2"], name: str
+) -> None:
+    """Write a camera's name on its far side from the others: its frustum is on the near one."""
+    distance = float(np.hypot(*outward))
+    x, y = outward / distance if distance else np.ones(2)
     axes.annotate(
         name,
         (float(centre[0]), float(centre[1])),
-        xytext=(5, 5),
+        xytext=(_NAME_POINTS * x, _NAME_POINTS * y),
         textcoords="offset points",
+        ha="left" if x > _ASIDE else "right" if x < -_ASIDE else "center",
+        va="bottom" if y > _ASIDE else "top" if y < -_ASIDE else "center",
         fontsize=8,
         parse_math=False,  # a dollar in a name begins no formula
+        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5},
     )
 
 
@@ -148,7 +161,7 @@ def _lay_out(axes: Axes, view: str, plane: tuple[int, int]) -> None:
     axes.set_title(view, fontsize=10)
     axes.grid(color="#E5E5E5", linewidth=0.6)
     axes.set_axisbelow(True)
-    axes.margins(0.12)
+    axes.margins(0.15)
     axes.spines[["top", "right"]].set_visible(False)
 
 

@@ -129,21 +129,23 @@ class CameraCheck:
         given_px = pixels_of(cache, setup, search.now.error)
         given_course_px = pixels_of(cache, setup, search.now.course)
         findings: list[Finding] = []
+        shared = setup
         for _ in range(self.rounds):
             best = search.best()
             if best is None:
                 break
             candidate, after = best
+            shared = _undo_shared(shared, candidate)
             findings.append(_undone(search, candidate, after))
             search = search.after(candidate, after)
         partly = self._partly_repaired(search, findings)
         if partly:
-            given_back = _restore_given(search.setup, setup, partly)
+            given_back = _restore_given(search.setup, shared, partly)
             search = Search(cache, given_back, self.thresholds)
             findings = [_as_unrepaired(found, partly, evidence.names) for found in findings]
-        named = self._ambiguous_moves(search, setup, findings, estimate)
+        named = self._ambiguous_moves(search, shared, findings, estimate)
         if named:
-            given_back = _restore_given(search.setup, setup, set(named))
+            given_back = _restore_given(search.setup, shared, set(named))
             search = Search(cache, given_back, self.thresholds)
             findings = [_as_one_of(found, named, evidence.names) for found in findings]
         findings += self._unrepaired_views(search, set(named))
@@ -202,7 +204,8 @@ class CameraCheck:
         which these are.
 
         A camera is held against the others as the file has them. Whether these are right only a
-        rig tells in which all cameras are free, as far as its ± allow.
+        rig tells in which all cameras are free, as far as its ± allow. ``given``: the file's
+        cameras with the mistakes that all of them share undone.
         """
         names = search.cache.evidence.names
         moves = {
@@ -289,6 +292,14 @@ def merge_steps(findings: list[Finding]) -> list[Finding]:
         told = old if found.code == MOVED.code and old.value > found.value else found
         result[earlier[0]] = replace(told, before_px=old.before_px, after_px=found.after_px)
     return result
+
+
+def _undo_shared(setup: Setup, candidate: Candidate) -> Setup:
+    """Return the setup with the candidate's mistake undone, if it is one of all cameras."""
+    undo = candidate.mistake.undo
+    if candidate.views or undo is None:
+        return setup
+    return undo(setup, tuple(range(len(setup))), candidate.value)
 
 
 def _restore_given(setup: Setup, given: Setup, views: set[int]) -> Setup:

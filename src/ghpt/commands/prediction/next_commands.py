@@ -12,7 +12,7 @@ from ghpt.commands.display import as_started, display_path, shell_override
 from ghpt.commands.inputs import InputSettings
 from ghpt.commands.prediction.verdict import Commands
 
-_HEIGHT = 1750
+EXAMPLE_HEIGHT = 1750
 """mm: stands for the person's own."""
 
 
@@ -27,7 +27,7 @@ def commands_on(inputs: InputSettings, own: Mapping[str, object], output: Path) 
     def predict(**more: Any) -> str:
         return command_line("predict.py", {**given, **own, **more}, f"{shown}_again")
 
-    scaled = given | {"scale.height": _HEIGHT}
+    scaled = given | {"scale.height": EXAMPLE_HEIGHT}
     return Commands(
         cameras=command_line("cameras.py", given, f"{shown}_checked"),
         calibrate=command_line("calibrate.py", scaled, f"{shown}_calibrated"),

@@ -215,7 +215,7 @@ def _command_against(mistake: Finding, cameras: tuple[str, ...], commands: Comma
     if mistake.mended:
         return commands.cameras
     others = [name for name in cameras if name not in mistake.cameras]
-    if mistake.cameras and len(others) >= 2:
+    if mistake.cameras and len(others) >= max(2, len(mistake.cameras) + 1):
         return commands.predict(views=others)
     return commands.calibrate
 

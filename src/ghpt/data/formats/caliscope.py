@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import logging
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from ghpt.data.people.detections import Detections, check_people
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
+_log = logging.getLogger(__name__)
 _CAMERAS = ("port", "cam_id")
 """What the column of the camera's number is called, until 2025 and since."""
 _FRAME = "sync_index"
@@ -65,6 +67,9 @@ def read_caliscope(source: Source) -> Detections:
     table = table[np.isfinite(table).all(1) & (table[:, 2] >= 0)]
     numbering = _number_joints(path, table[:, 2], source.skeleton)
     count = numbering.count
+    left_out = len(np.unique(table[numbering.joint < 0, 2]))
+    if left_out:
+        _log.info("%s: %d points of face or hands are not read.", path, left_out)
     table = table[numbering.joint >= 0]
     joint = numbering.joint[numbering.joint >= 0]
     frames, row = np.unique(table[:, 0].astype(np.int64), return_inverse=True)

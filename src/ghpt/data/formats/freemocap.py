@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from ghpt.data.people.detections import Detections, joints_for
 from ghpt.data.points import KeyPoints
 from ghpt.errors import GhptDataError
 
+_log = logging.getLogger(__name__)
 _NAME = re.compile(r".*2d[ _]?data.*\.npy", re.IGNORECASE)
 _FARTHEST = 1e6
 """Pixels."""
@@ -44,6 +46,8 @@ def read_freemocap(source: Source) -> Detections:
         hint = "It must be cameras x frames x points x 2 or 3 numbers."
         raise GhptDataError(path, "", problem, hint)
     if source.skeleton is None and count in _WITH_BODY:
+        if count > _BODY:
+            _log.info("%s: of %d points the body's %d are read.", path, count, _BODY)
         count = _BODY
     pixels = array[:, :, :count, :2].astype(np.float64).swapaxes(0, 1)
     valid = finite_points(pixels) & (np.abs(np.nan_to_num(pixels)) < _FARTHEST).all(-1)

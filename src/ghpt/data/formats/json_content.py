@@ -115,6 +115,12 @@ def has_hands(content: JsonContent) -> bool:
     return any(person.get(name) for person in people for name in _HANDS)
 
 
+def has_face(content: JsonContent) -> bool:
+    """Return whether the points of somebody's face are in a file of OpenPose's."""
+    people = chain.from_iterable(frame.people for frame in content.frames)
+    return any(person.get("face_keypoints_2d") for person in people)
+
+
 def _hand(path: Path, place: str, person: dict[str, Any], name: str) -> Float[np.ndarray, "21 3"]:
     points = joint_values(path, f"{place}.{name}", person.get(name) or [])
     if len(points) not in (0, HAND_POINTS):

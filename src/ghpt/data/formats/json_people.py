@@ -4,8 +4,9 @@ EasyMocap's.
 
 from __future__ import annotations
 
+import logging
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path, PurePath, PurePosixPath
@@ -18,6 +19,7 @@ from ghpt.data.formats.json_content import (
     JsonContent,
     JsonFrame,
     Key,
+    has_face,
     has_hands,
     looks_like_people,
     read_content,
@@ -46,6 +48,7 @@ from ghpt.data.people.detections import (
 )
 from ghpt.errors import GhptDataError
 
+_log = logging.getLogger(__name__)
 _LAYOUT = (
     "Put the files of each camera into a folder of its own, cam1/cam1_000000000012.json, or one "
     "file of a whole recording for each camera, cam1.json, into one folder."
@@ -53,7 +56,7 @@ _LAYOUT = (
 _WITH_HANDS = "_hands"
 """What the name of a skeleton with OpenPose's hands ends in."""
 _LOOKED_AT = 20
-"""Files that are looked at for hands."""
+"""Files that are looked at for hands and faces."""
 _MOST_DIGITS = 15
 """Of a frame number."""
 
@@ -72,9 +75,11 @@ def read_json_people(source: Source) -> Detections:
     if source.format not in (None, content.format, *_SAME.get(content.format, ())):
         problem = f"is not of {source.format}: it looks like {content.format}'s"
         raise GhptDataError(first, "", problem, f"Leave format= out, or format={content.format}.")
+    if not content.is_recording and _any_person(files, has_face):
+        _log.info("%s: the points of faces are not read.", source.path)
     if content.is_recording:
         found = _recordings(source, files)
-    elif _any_hands(files):
+    elif _any_person(files, has_hands):
         return _merge_with_hands(source, _frame_files(source, files, with_hands=True))
     else:
         found = _frame_files(source, files)
@@ -110,14 +115,14 @@ def _first(files: Sequence[Path]) -> tuple[Path, JsonContent]:
     return files[0], content
 
 
-def _any_hands(files: Sequence[Path]) -> bool:
-    """Return whether OpenPose was asked for hands: then the first people have them."""
-    return any(_holds_hands(file) for file in files[:_LOOKED_AT])
+def _any_person(files: Sequence[Path], has: Callable[[JsonContent], bool]) -> bool:
+    """Return whether OpenPose was asked for hands, or faces: then the first people have them."""
+    return any(_holds(file, has) for file in files[:_LOOKED_AT])
 
 
-def _holds_hands(file: Path) -> bool:
+def _holds(file: Path, has: Callable[[JsonContent], bool]) -> bool:
     try:
-        return has_hands(read_content(file, SMALL_JSON))
+        return has(read_content(file, SMALL_JSON))
     except GhptDataError:  # is said in its turn, after what is wrong with the files' names
         return False
 
