@@ -223,6 +223,7 @@ def test_nothing_is_said_of_an_ordinary_rig_and_its_c3d_has_no_origin(tmp_path, 
 def test_rerun_gets_positions_that_float32_holds(tmp_path, monkeypatch):
     rr = MagicMock()
     monkeypatch.setitem(sys.modules, "rerun", rr)
+    monkeypatch.setitem(sys.modules, "rerun.blueprint", rr.blueprint)
     origin = tuple(round(x / METRE) * METRE for x in OFFSETS["UTM"])
     made = random_reconstruction(5, views=4, missing=0.0)
     far = replace(made, points=made.points + torch.tensor(OFFSETS["UTM"], dtype=torch.float64))

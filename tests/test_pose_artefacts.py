@@ -50,6 +50,7 @@ def papers(name):
         "source": "synthetic",
         "split": "test",
         "provenance": {},
+        "frames": 100,
         "selections": {
             name: {
                 "mpjpe_relative": error,

@@ -341,7 +341,7 @@ def spoilt(folder: Path, kind: str) -> list[str]:
         ("unknown skeleton", "no known skeleton has 11 joints"),
         ("no extrinsics", r"are not there for cam_00, .*calibrate\.py"),
         ("no cameras", "cameras: is missing"),
-        ("camera checkpoint", r"is of a RelativePose: it estimates no poses.*model=pose"),
+        ("camera checkpoint", r"is of a RelativePose: it has no pool of poses.*model=pose"),
         ("no checkpoint", "there is no such file"),
         ("formats=[bvh]", "formats: there is no 'bvh'"),
         ("compare=[magic]", "compare: there is no 'magic'"),

@@ -251,7 +251,9 @@ def test_git_is_asked_without_its_lock(monkeypatch):
         return subprocess.CompletedProcess(command, 0, "abc\n", "")
 
     monkeypatch.setattr(origin.subprocess, "run", run)
+    origin.commit.cache_clear()
     origin.provenance(0)
+    origin.commit.cache_clear()
     statuses = [command for command in asked if "status" in command]
     assert statuses
     assert all("--no-optional-locks" in command for command in statuses)

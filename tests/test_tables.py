@@ -5,7 +5,8 @@ from rich.console import Console
 
 from ghpt.metrics.pose_prior import PARTS
 from ghpt.models.measured import Measured, TestRun
-from ghpt.models.pose.evaluation import NAMES, PoseMeans, PoseNumbers
+from ghpt.models.pose.evaluation import NAMES
+from ghpt.models.pose.numbers import PoseMeans, PoseNumbers
 from ghpt.paper import published as paper
 from ghpt.report.markdown import render_markdown
 from ghpt.report.tables import (

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from ghpt.models.aggregation import AGGREGATIONS
 from ghpt.models.measured import Measured, Number, TestRun
-from ghpt.models.pose.evaluation import PoseMeans, PoseNumbers
+from ghpt.models.pose.numbers import PoseMeans, PoseNumbers
 from ghpt.paper.published import QUANTITATIVE, QUANTITATIVE_MEAN, paper_value
 from ghpt.report.document import (
     Block,

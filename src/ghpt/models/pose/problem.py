@@ -18,8 +18,9 @@ from ghpt.geometry.subsets import random_subsets
 from ghpt.geometry.triangulation import triangulate, triangulate_subsets
 from ghpt.metrics.pose_error import joint_errors
 from ghpt.models.measured import Measured
-from ghpt.models.pose.evaluation import PoseNumbers, evaluate_poses
+from ghpt.models.pose.evaluation import evaluate_poses
 from ghpt.models.pose.features import bone_lengths, normalised_coordinates
+from ghpt.models.pose.numbers import PoseNumbers
 from ghpt.models.pose.schema import POSES, PosePredictions, PoseSample, PoseTables
 from ghpt.models.predictions import with_nan
 from ghpt.models.problem import (
